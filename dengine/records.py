@@ -1,0 +1,134 @@
+"""Frozen records that travel between the layers. They carry values and no behaviour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Action(StrEnum):
+    """What the cell does next. In exported files the position here is the integer, so zero is the safe one."""
+
+    VERIFY = "verify"
+    ACCEPT = "accept"
+    REJECT = "reject"
+
+
+class Reason(StrEnum):
+    """Why a decision is what it is. In exported files the position here is the integer."""
+
+    CERTAIN = "certain"  # the bound meets the policy
+    UNCERTAIN = "uncertain"  # it does not
+    NO_MODEL = "no_model"  # nothing was trained yet
+    AUDIT = "audit"  # certain, and verified all the same to watch the model
+    NOT_FINITE = "not_finite"  # a NaN or an infinity in the trace
+    CONSTANT = "constant"  # every sample of every channel the same: a dead sensor
+    SATURATED = "saturated"  # the trace touches the sensor's range, `TraceSpec.limit`
+    MODEL_ERROR = "model_error"  # the model raised; the cell went on
+
+
+class Source(StrEnum):
+    """Where a label came from."""
+
+    VERIFICATION = "verification"  # the model was uncertain, the expensive verification decided
+    AUDIT = "audit"  # the model was certain and was checked all the same
+    STOP = "stop"  # accepted, and the system stopped: a failure
+    CONFIRMED = "confirmed"  # accepted, and known to be fine
+
+
+class Outcome(StrEnum):
+    """What the cell knows after it went on without a check."""
+
+    STOPPED = "stopped"
+    CONFIRMED = "confirmed"
+    UNKNOWN = "unknown"  # silence is not a success
+
+
+@dataclass(frozen=True, slots=True)
+class TraceSpec:
+    """The contract of a trace.
+
+    samples : samples per channel.
+    rate_hz : sampling rate in hertz.
+    channels : number of channels; a one-channel trace may come as `(samples,)`.
+    unit : of the samples, for people only.
+    limit : the sensor's range in `unit`; a sample at or beyond ±limit is saturated. None: not checked.
+    """
+
+    samples: int
+    rate_hz: float = 500.0
+    channels: int = 1
+    unit: str = "N"
+    limit: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the engine decided on one trace, and on what evidence.
+
+    id : the decision's key in the store.
+    action : what to do.
+    predicted : what the model alone would have done; differs from `action` in an audit only.
+    lower, upper : bound on the success probability in the ball around the trace.
+    n_success, n_failure : labels counted in that ball.
+    embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
+    model_version : of the model that answered; 0 before the first retrain.
+    reason : why.
+    audit : verified although the model was certain.
+    propensity : probability with which this decision is verified: 1 for an uncertain one, else the audit rate.
+    """
+
+    id: str
+    action: Action
+    predicted: Action
+    lower: float
+    upper: float
+    n_success: int
+    n_failure: int
+    embedding: tuple[tuple[float, ...], ...] | None
+    model_version: int
+    reason: Reason
+    audit: bool
+    propensity: float
+
+
+@dataclass(frozen=True, slots=True)
+class RetrainReport:
+    """One retrain, from taking the data to the new version answering.
+
+    version : of the model that answers afterwards.
+    seconds : wall time of the whole retrain.
+    n_traces : labelled traces the candidate was given.
+    n_steps : optimiser steps taken (0 for closed-form and foreign reducers).
+    accepted : whether the candidate replaced the old version.
+    reason : why, in words.
+    """
+
+    version: int
+    seconds: float
+    n_traces: int
+    n_steps: int
+    accepted: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """One turn of the loop.
+
+    index : cycle number of this run, from 0.
+    decision : what the engine decided.
+    outcome : after an accept, what the cell found out; None otherwise.
+    success : the label that was reported; None where nothing was learned.
+    source : of that label.
+    decide_seconds : wall time of the decision.
+    retrain : the retrain this cycle set off or saw finish, if any.
+    """
+
+    index: int
+    decision: Decision
+    outcome: Outcome | None
+    success: bool | None
+    source: Source | None
+    decide_seconds: float
+    retrain: RetrainReport | None
