@@ -32,13 +32,13 @@ dengine_postgres_stop() {
 }
 
 dengine_postgres_start() {
-    local port before
+    local port
     dengine_postgres_bin=$(dengine_postgres_bin) || dengine_postgres_install || return 1
     dengine_postgres_bin=$(dengine_postgres_bin) || return 1
     dengine_postgres_dir=$(mktemp -d /tmp/dengine-postgres.XXXXXX) || return 1
-    before=$(trap -p EXIT | sed "s/^trap -- '//; s/' EXIT\$//; s/'\\\\''/'/g")
+    eval "set -- $(trap -p EXIT)"  # trap -- COMMAND EXIT, quoted by the shell; nothing where there is none
     # shellcheck disable=SC2064  # the earlier trap is meant to be read now
-    trap "dengine_postgres_stop; $before" EXIT
+    trap "dengine_postgres_stop; ${3:-}" EXIT
     [ "$(id -u)" != 0 ] || chown postgres "$dengine_postgres_dir"
     port=$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])') || return 1
     (
