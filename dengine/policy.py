@@ -1,0 +1,55 @@
+"""The user's two numbers, and what follows from them: a bound becomes an action."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .bounds import INTERVALS, Bounds, normal_quantile
+from .errors import SettingError
+from .records import Action
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """How certain the model must be before it may decide.
+
+    alpha : two-sided error level of the interval, in (0, 1).
+    lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
+    interval : a name in `INTERVALS`.
+    audit_rate : share of certain decisions that are verified all the same, in [0, 1); needed for a guarantee on rejects,
+        since a rejected part gives no feedback of its own.
+    Raises SettingError for a value out of its range.
+    """
+
+    alpha: float = 0.05
+    lower_bound: float = 0.95
+    interval: str = "wilson"
+    audit_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        normal_quantile(self.alpha)
+        if not 0.5 < self.lower_bound < 1.0:
+            raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
+        if self.interval not in INTERVALS:
+            raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {self.interval!r}.")
+        if not 0.0 <= self.audit_rate < 1.0:
+            raise SettingError(f"Expected 0 <= audit_rate < 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
+
+    def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
+        """(lower, upper) of the success probability, by the policy's interval and alpha."""
+        return INTERVALS[self.interval](n_success, n_failure, self.alpha)
+
+    def action(self, lower: float, upper: float) -> Action:
+        """What one bound allows."""
+        if lower >= self.lower_bound:
+            return Action.ACCEPT
+        return Action.REJECT if upper <= 1.0 - self.lower_bound else Action.VERIFY
+
+    def actions(self, lower: ArrayLike, upper: ArrayLike) -> NDArray[Any]:
+        """What each bound allows: an object array of `Action`, of the bounds' shape."""
+        certain = np.where(np.asarray(upper) <= 1.0 - self.lower_bound, Action.REJECT, Action.VERIFY)
+        return np.where(np.asarray(lower) >= self.lower_bound, Action.ACCEPT, certain).astype(object)

@@ -1,0 +1,125 @@
+"""A recipe: every setting of an engine, from and to TOML.
+
+    >>> Recipe.load("conv")               # by name, from a file, or as it is
+    >>> Recipe.load("my_cell.toml").to_toml()
+
+A run is its recipe, its data and its seed; nothing else changes what it decides.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from .errors import SettingError
+from .policy import Policy
+
+Params = Mapping[str, bool | int | float | str]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Every setting of an engine; the reducer checks its own part.
+
+    reducer : a name in `REDUCERS`.  params : the reducer's own settings.
+    policy : the user's two numbers, the interval, the audit rate.
+    radius, fraction, reject_fraction : the neighbourhood, as in `Neighbourhood`.
+    folds : K of honest counting, for a reducer that uses labels.
+    retrain_every : new labels between two retrains.
+    budget : seconds of wall time that a retrain may take in a live engine.
+    max_steps : optimiser steps a retrain at most. A replay stops on them alone, so that a seed repeats exactly.
+    window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
+    """
+
+    reducer: str = "conv"
+    params: Params = field(default_factory=dict)
+    policy: Policy = field(default_factory=Policy)
+    radius: float = 0.3
+    fraction: float | None = None
+    reject_fraction: float | None = None
+    folds: int = 2
+    retrain_every: int = 50
+    budget: float = 0.45
+    max_steps: int = 60
+    window: int = 10_000
+
+    def __post_init__(self) -> None:
+        for name, least in (("folds", 2), ("retrain_every", 1), ("max_steps", 0), ("window", 10)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
+        if not self.budget > 0.0:
+            raise SettingError(f"Expected budget > 0 seconds, got {self.budget!r}.")
+
+    @classmethod
+    def load(cls, recipe: Recipe | str | Path) -> Recipe:
+        """A recipe by its name in `RECIPES`, from a TOML file's path, or as it is."""
+        if isinstance(recipe, Recipe):
+            return recipe
+        if str(recipe) in RECIPES:
+            return RECIPES[str(recipe)]
+        path = Path(recipe)
+        if not path.is_file():
+            raise SettingError(f"Expected a recipe among {', '.join(RECIPES)}, or a TOML file; {recipe} is neither.")
+        return cls.from_toml(path.read_text(encoding="utf-8"), where=str(path))
+
+    @classmethod
+    def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
+        """Parse `to_toml`'s form; SettingError names an unknown key or a value out of range."""
+        try:
+            table = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SettingError(f"{where} is not TOML: {error}.") from error
+        known = {f.name for f in fields(cls)}
+        unknown = sorted(set(table) - known)
+        if unknown:
+            raise SettingError(f"{where} has an unknown key {', '.join(unknown)}; known are {', '.join(sorted(known))}.")
+        base = RECIPES.get(str(table.get("reducer", "conv")), cls())
+        policy = table.pop("policy", {})
+        try:
+            return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
+        except TypeError as error:
+            raise SettingError(f"{where}: {error}.") from error
+
+    def to_toml(self) -> str:
+        """The recipe as TOML; a fixed radius is written as fraction = "none"."""
+        plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("params", "policy")}
+        policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
+        tables = {"": plain, "policy": policy, "params": dict(self.params)}
+        return "\n".join(_table(name, values) for name, values in tables.items() if values or not name)
+
+    def with_policy(self, **changes: Any) -> Recipe:
+        """The same with another alpha, lower_bound, interval or audit_rate."""
+        return replace(self, policy=replace(self.policy, **changes))
+
+
+def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: None if value == "none" else value for key, value in table.items()}
+
+
+def _table(name: str, values: Mapping[str, Any]) -> str:
+    head = [f"[{name}]"] if name else []
+    return "\n".join(head + [f"{key} = {_value(value)}" for key, value in values.items()]) + "\n"
+
+
+def _value(value: Any) -> str:
+    if value is None:
+        return '"none"'
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    return repr(value)
+
+
+RECIPES: dict[str, Recipe] = {
+    "conv": Recipe("conv"),
+    "umap": Recipe("umap"),
+    "pca": Recipe("pca"),
+    # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored.
+    "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9)),
+}
