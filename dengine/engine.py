@@ -15,7 +15,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import asdict, replace
 from typing import Any, Self
 
@@ -25,8 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import __version__
 from .cells.base import Cell
-from .classifier import WilsonRadiusClassifier
 from .errors import ReportError, StoreError
+from .factory import model_of, recipe_of
 from .folds import audited
 from .foreign import ForeignModel
 from .judge import script
@@ -34,14 +34,14 @@ from .policy import Policy
 from .prediction import Judgement, Model, ModelPrediction
 from .recipe import Recipe
 from .records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, Source, TraceSpec
-from .reducers import make_reducer
-from .retraining import AnyModel, Candidate, Limits, Window, train_candidate
+from .resuming import resume
+from .retraining import Limits, Retrainer, Trained
 from .store import Store, StoredDecision, open_store
 from .traces import REASONS, TraceGate, as_trace, spec_of
+from .window import AnyModel, Window
 
 log = logging.getLogger("dengine")
 NOTHING_KNOWN = Judgement(Action.VERIFY, 0.0, 1.0, 0, 0, None)
-FIRST_RESERVE = 0.2  # seconds kept for the first retrain's tail, before one was measured
 
 
 class DataEngine:
@@ -79,17 +79,17 @@ class DataEngine:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         torch.set_num_threads(1)
-        self.recipe = recipe or _recipe_of(reducer, policy, radius, folds, retrain_every, budget)
-        self.policy, self.seed, self.executor, self.replaying, self.clock = (
-            self.recipe.policy, seed, executor, replaying, clock,
-        )  # fmt: skip
+        self.recipe = recipe or recipe_of(reducer, policy, radius, folds, retrain_every, budget)
+        self.policy = self.recipe.policy
+        self.seed = seed
+        self.clock = clock
         self.version = 0
         self.new_labels = 0
         self._template = ForeignModel(model) if model is not None else model_of(self.recipe, seed)
         self._model: AnyModel | None = None
         self._window = Window(self.recipe.window)
-        self._pending: Future[Candidate] | None = None
-        self._reserve = FIRST_RESERVE
+        limits = Limits(None if replaying else self.recipe.budget, self.recipe.max_steps)
+        self._retrainer = Retrainer(self._window, limits, executor, clock)
         self._run, self._count = uuid.uuid4().hex[:12], 0
         self.store = open_store(store)
         if self.store.settings():
@@ -122,7 +122,8 @@ class DataEngine:
         engine.store = store
         if "trace" in settings:
             engine._agree_on(TraceSpec(**json.loads(settings["trace"])), save=False)
-        engine._resume()
+        resumed = resume(store, engine._template, engine._window)
+        engine._model, engine.version, engine.new_labels = resumed.model, resumed.version, resumed.new_labels
         return engine
 
     # ------------------------------------------------------------------------------------------------- decide
@@ -218,62 +219,40 @@ class DataEngine:
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
         self._collect(wait=True)
-        begin = self.clock()
-        data = self._window.snapshot()
         self.new_labels = 0
-        return self._finish(train_candidate(*self._order(data)), data.seq, begin)
+        return self._swap(self._retrainer.train(self._model or self._template))
 
     def _retrain_if_due(self) -> RetrainReport | None:
-        if self.new_labels < self.recipe.retrain_every or self._pending is not None:
+        if self.new_labels < self.recipe.retrain_every or self._retrainer.busy:
             return None
-        if self.executor is None:
+        if self._retrainer.executor is None:
             return self.retrain()
-        data = self._window.snapshot()
         self.new_labels = 0
-        self._pending_seq = data.seq
-        self._pending = self.executor.submit(_train_beside, *self._order(data))
+        self._retrainer.start(self._model or self._template)
         return None
 
-    def _order(self, data: Any) -> tuple[Any, ...]:
-        answering = self._model or self._template
-        budget = None if self.replaying else self.recipe.budget
-        limits = Limits(budget, self.recipe.max_steps, self._reserve)
-        return answering.successor(), answering.report, data, limits
-
-    def _collect(self, wait: bool = False) -> RetrainReport | None:
+    def _collect(self, wait: bool = False) -> None:
         """Swap in what an executor has finished."""
-        if self._pending is None or not (wait or self._pending.done()):
-            return None
-        pending, self._pending = self._pending, None
-        begin = self.clock()
-        try:
-            candidate = pending.result()
-        except Exception as error:  # the worker died: recorded, and the old version goes on answering
-            log.exception("a retrain in the executor failed")
-            candidate = Candidate(None, f"{type(error).__name__}: {error}", 0, 0.0, 0.0)
-        self.last_retrain = self._finish(candidate, self._pending_seq, begin - candidate.seconds)
-        return self.last_retrain
+        trained = self._retrainer.finished(wait)
+        if trained is not None:
+            self.last_retrain = self._swap(trained)
 
-    def _finish(self, candidate: Candidate, seq: NDArray[np.int64], begin: float) -> RetrainReport:
-        model, last_seq = candidate.model, int(seq[-1]) if len(seq) else 0
+    def _swap(self, trained: Trained) -> RetrainReport:
+        model, seq = trained.candidate.model, trained.seq
         if model is not None:
-            self._catch_up(model, last_seq)
+            self._window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
             self._model, self.version = model, self.version + 1  # one reference is swapped
-            self._reserve = 0.05 + 1.2 * candidate.tail
         report = RetrainReport(
-            self.version, self.clock() - begin, len(seq), candidate.n_steps, model is not None, candidate.reason
+            version=self.version,
+            seconds=trained.elapsed(),
+            n_traces=len(seq),
+            n_steps=trained.candidate.n_steps,
+            accepted=model is not None,
+            reason=trained.candidate.reason,
         )
         state = None if model is None else model.get_state() | {"trained_on": seq}
         self.store.put_version(report, self._window.newest_seq, state)
-        return replace(report, seconds=self.clock() - begin)
-
-    def _catch_up(self, model: AnyModel, last_seq: int) -> None:
-        """Labels that came in while the candidate was trained are in the new version."""
-        data = self._window.snapshot() if self._window.newest_seq > last_seq else None
-        if data is not None:
-            for i in np.flatnonzero(data.seq > last_seq):
-                hash_ = int(data.hashes[i])
-                model.hold(model.place(data.traces[i], hash_), int(data.labels[i]), hash_)
+        return replace(report, seconds=trained.elapsed())
 
     # ------------------------------------------------------------------------------------------------- run
 
@@ -335,66 +314,6 @@ class DataEngine:
         if self.trace is not None:
             settings["trace"] = json.dumps(asdict(self.trace))
         self.store.save_settings(settings)
-
-    def _resume(self) -> None:
-        labelled = self.store.labelled(self.recipe.window)
-        self._window.extend(labelled)
-        version = self.store.last_version()
-        self.new_labels = int((labelled.seq > version.last_seq).sum()) if version else len(labelled.seq)
-        if version is None:
-            return
-        self.version = version.version
-        self._model = self._restored(version.state)
-        points = self.store.points_since(version.last_seq, version.version)
-        stored = dict(zip(points.seq.tolist(), points.points, strict=True))
-        for i in np.flatnonzero(labelled.seq > version.last_seq):
-            hash_ = int(labelled.hashes[i])
-            point = stored.get(int(labelled.seq[i]))
-            point = self._model.place(labelled.traces[i], hash_) if point is None else point
-            self._model.hold(point, int(labelled.labels[i]), hash_)
-
-    def _restored(self, state: dict[str, NDArray[Any]]) -> AnyModel:
-        model = self._template.successor()
-        if isinstance(model, ModelPrediction) and any(name.startswith("reducer.") for name in state):
-            return model.set_state(state)
-        # A reducer without a state of its own is refitted on the very traces it was fitted on.
-        seq = state["trained_on"]
-        data = self.store.labelled(self._window.newest_seq - int(seq[0]) + 1)
-        kept = np.isin(data.seq, seq)
-        model.fit(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
-        return model.set_state(state) if isinstance(model, ModelPrediction) else model
-
-
-def model_of(recipe: Recipe, seed: int) -> ModelPrediction:
-    """The untrained model that a recipe describes."""
-    classifier = WilsonRadiusClassifier(
-        recipe.radius,
-        recipe.policy.alpha,
-        recipe.policy.lower_bound,
-        recipe.policy.interval,
-        recipe.fraction,
-        recipe.reject_fraction,
-        recipe.window,
-    )
-    own = {"folds": recipe.folds} if recipe.reducer in CROSS_FITTING else {}
-    return ModelPrediction(make_reducer(recipe.reducer, seed=seed, **own, **recipe.params), classifier, recipe.folds)
-
-
-CROSS_FITTING = ("conv",)
-
-
-def _train_beside(*order: Any) -> Candidate:
-    torch.set_num_threads(1)  # per thread, and first thing in each
-    return train_candidate(*order)
-
-
-def _recipe_of(reducer: str, policy: Policy | None, *settings: Any) -> Recipe:
-    named = dict(zip(("radius", "folds", "retrain_every", "budget"), settings, strict=True))
-    changes = {name: value for name, value in named.items() if value is not None}
-    if "radius" in changes:
-        changes |= {"fraction": None, "reject_fraction": None}  # a radius that was asked for is the one that counts
-    base = Recipe.load(reducer)
-    return replace(base, policy=policy or base.policy, **changes)
 
 
 def _source_of(known: StoredDecision, success: bool) -> Source:

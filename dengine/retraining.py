@@ -2,75 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from .errors import DengineError
-from .foreign import ForeignModel
 from .prediction import ModelPrediction
 from .reducers.base import FitReport, StopRule
 from .store import Labelled
+from .window import AnyModel, Window
 
-AnyModel = ModelPrediction | ForeignModel
+log = logging.getLogger("dengine")
+SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
+MARGIN = 1.2  # the tail grows a little with each retrain
 WORSE = 1.5  # a held-out loss this many times the answering version's drops the candidate
-
-
-class Window:
-    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store."""
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self.total = 0
-        self._traces: NDArray[np.float32] | None = None
-        self._labels = np.zeros(0, dtype=np.int8)
-        self._hashes = np.zeros(0, dtype=np.int64)
-        self._seq = np.zeros(0, dtype=np.int64)
-
-    def __len__(self) -> int:
-        return min(self.total, self.capacity)
-
-    @property
-    def newest_seq(self) -> int:
-        """Sequence number of the newest label; 0 before the first."""
-        return int(self._seq[(self.total - 1) % self.capacity]) if self.total else 0
-
-    def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
-        """Take in one labelled trace (C, T); on a full window it takes the oldest one's place."""
-        self._grow(trace)
-        assert self._traces is not None  # for the type checker: _grow made it
-        slot = self.total % self.capacity
-        self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
-        self.total += 1
-
-    def extend(self, labelled: Labelled) -> None:
-        """Take in many, oldest first."""
-        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
-            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
-
-    def snapshot(self) -> Labelled:
-        """What is held, oldest first. Nobody writes to these arrays afterwards."""
-        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
-        order = (np.arange(n) + first) % self.capacity
-        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces[order]
-        return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
-
-    def _grow(self, trace: NDArray[np.float32]) -> None:
-        # Doubled as needed: a full window of 10,000 x 1000 samples is 40 MB, and most cells start with none.
-        room = 0 if self._traces is None else len(self._traces)
-        if self.total < room or room == self.capacity:
-            return
-        size = min(self.capacity, max(64, 2 * room))
-        grown = np.zeros((size, *trace.shape), dtype=np.float32)
-        if self._traces is not None:
-            grown[:room] = self._traces
-        self._traces = grown
-        self._labels = np.concatenate([self._labels, np.zeros(size - room, dtype=np.int8)])
-        self._hashes, self._seq = (
-            np.concatenate([a, np.zeros(size - room, dtype=np.int64)]) for a in (self._hashes, self._seq)
-        )
 
 
 @dataclass(frozen=True)
@@ -79,12 +31,13 @@ class Limits:
 
     budget : seconds of wall time for the whole; None: no clock is read.
     max_steps : optimiser steps; None: no limit.
-    reserve : seconds kept for what follows the last step: re-embedding, scripting, the swap.
+    reserve : seconds kept for what follows the last step: re-embedding, scripting, the swap. The default serves until
+        a tail was measured.
     """
 
     budget: float | None = None
     max_steps: int | None = None
-    reserve: float = 0.0
+    reserve: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -101,6 +54,80 @@ class Candidate:
     tail: float
 
 
+@dataclass(frozen=True)
+class Trained:
+    """A candidate, the labels it was trained on, and when that began."""
+
+    candidate: Candidate
+    seq: NDArray[np.int64]
+    begin: float
+    clock: Callable[[], float]
+
+    def elapsed(self) -> float:
+        """Seconds since the data were taken, without the time a finished candidate waited for the cell."""
+        return self.clock() - self.begin
+
+
+class Retrainer:
+    """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step."""
+
+    def __init__(
+        self, window: Window, limits: Limits, executor: Executor | None, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
+        self.window = window
+        self.limits = limits
+        self.executor = executor
+        self.clock = clock
+        self._pending: tuple[Future[Candidate], NDArray[np.int64]] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a retrain is under way beside the cell, or waits to be swapped in."""
+        return self._pending is not None
+
+    def train(self, answering: AnyModel) -> Trained:
+        """Train in line."""
+        begin = self.clock()
+        data = self.window.snapshot()
+        return self._note(Trained(train_candidate(*self._order(answering, data)), data.seq, begin, self.clock))
+
+    def start(self, answering: AnyModel) -> None:
+        """Train beside the cell."""
+        assert self.executor is not None  # the caller asked; for the type checker
+        data = self.window.snapshot()
+        self._pending = (self.executor.submit(_train_beside, *self._order(answering, data)), data.seq)
+
+    def finished(self, wait: bool = False) -> Trained | None:
+        """What was trained beside the cell, once it is done."""
+        if self._pending is None or not (wait or self._pending[0].done()):
+            return None
+        (future, seq), self._pending = self._pending, None
+        try:
+            candidate = future.result()
+        except Exception as error:  # the worker died: recorded, and the old version goes on answering
+            log.exception("a retrain in the executor failed")
+            candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
+        return self._note(Trained(candidate, seq, self.clock() - candidate.seconds, self.clock))
+
+    def _order(self, answering: AnyModel, data: Labelled) -> tuple[AnyModel, FitReport, Labelled, Limits]:
+        return answering.successor(), answering.report, data, self.limits
+
+    def _note(self, trained: Trained) -> Trained:
+        if trained.candidate.model is not None:
+            self.limits = replace(self.limits, reserve=SWAP_SECONDS + MARGIN * trained.candidate.tail)
+        return trained
+
+
+def _train_beside(*order: Any) -> Candidate:
+    torch.set_num_threads(1)  # per thread, and first thing in each
+    return train_candidate(*order)
+
+
+def _dropped(error: Exception) -> str:
+    lines = str(error).splitlines() or [""]
+    return f"dropped: {type(error).__name__}: {lines[0]}"
+
+
 def train_candidate(successor: AnyModel, previous: FitReport, data: Labelled, limits: Limits) -> Candidate:
     """Train a successor on the data; a plain function of plain arguments, so that any executor can run it."""
     begin = time.perf_counter()
@@ -112,7 +139,7 @@ def train_candidate(successor: AnyModel, previous: FitReport, data: Labelled, li
     except DengineError as error:
         reason = f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell: it is recorded
-        reason = f"dropped: {type(error).__name__}: {str(error).splitlines()[0]}"
+        reason = _dropped(error)
     end = time.perf_counter()
     accepted = reason == "accepted"
     tail = end - (stop.asked_at or begin)

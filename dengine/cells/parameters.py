@@ -67,10 +67,10 @@ class CellParameters:
     length_sd_mm: float = 0.08
     clearance_mm: Range = (0.10, 0.45)
     chamfer_mm: Range = (0.8, 2.0)
-    friction: Range = (0.10, 0.40)
+    friction: Range = (0.10, 0.38)
     extra_length_mm: Range = (0.5, 6.0)
     extra_width_mm: Range = (0.2, 1.2)
-    debris_mm: Range = (0.2, 7.0)
+    debris_mm: Range = (0.2, 8.0)
 
     gap_mm: Range = (3.5, 5.5)
     delay_s: Range = (0.0, 0.10)
@@ -84,7 +84,7 @@ class CellParameters:
     missed_grasp: float = 0.03
     weak_grip: float = 0.07
     debris: float = 0.045
-    wrong_part: float = 0.03
+    wrong_part: float = 0.025
 
     noise_n: Range = (0.15, 0.60)
     ripple_n: Range = (0.0, 0.5)

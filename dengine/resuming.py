@@ -1,0 +1,56 @@
+"""Going on with a store: the same version, the same decisions, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .prediction import ModelPrediction
+from .store import Labelled, ModelVersion, Store
+from .window import AnyModel, Window
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """Where an engine stood: the model that answered (None: no retrain yet), its version, labels since the last retrain."""
+
+    model: AnyModel | None
+    version: int
+    new_labels: int
+
+
+def resume(store: Store, template: AnyModel, window: Window) -> Resumed:
+    """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
+    labelled = store.labelled(window.capacity)
+    window.extend(labelled)
+    version = store.last_version()
+    if version is None:
+        return Resumed(None, 0, len(labelled.seq))
+    model = _restored(store, template, version.state, window.newest_seq)
+    _hold_since(model, store, version, labelled)
+    return Resumed(model, version.version, int((labelled.seq > version.last_seq).sum()))
+
+
+def _restored(store: Store, template: AnyModel, state: Mapping[str, NDArray[Any]], newest: int) -> AnyModel:
+    model = template.successor()
+    if isinstance(model, ModelPrediction) and any(name.startswith("reducer.") for name in state):
+        return model.set_state(state)
+    # A reducer without a state of its own is refitted on the very traces it was fitted on.
+    trained_on = state["trained_on"]
+    data = store.labelled(newest - int(trained_on[0]) + 1)
+    kept = np.isin(data.seq, trained_on)
+    model.fit(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
+    return model.set_state(state) if isinstance(model, ModelPrediction) else model
+
+
+def _hold_since(model: AnyModel, store: Store, version: ModelVersion, labelled: Labelled) -> None:
+    added = store.points_since(version.last_seq, version.version)
+    points = dict(zip(added.seq.tolist(), added.points, strict=True))
+    for i in np.flatnonzero(labelled.seq > version.last_seq):
+        hash_ = int(labelled.hashes[i])
+        point = points.get(int(labelled.seq[i]))  # unknown: its decision was answered by an earlier version
+        model.hold(model.place(labelled.traces[i], hash_) if point is None else point, int(labelled.labels[i]), hash_)
