@@ -227,6 +227,8 @@ def test_the_sensor_draw_does_not_touch_the_world() -> None:
         (lambda: SimulatedCell(cycles=0), "at least 1"),
         (lambda: simulate(0), "at least 1"),
         (lambda: simulate(1, channels="y"), "z, all"),
+        (lambda: push(good(), time_step_s=0.0007), "divides 2 ms"),
+        (lambda: push(good(chamfer_mm=0.0)), "above zero"),
     ],
 )
 def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None:
