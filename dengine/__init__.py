@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from .datasets import Dataset, load_dataset
     from .engine import DataEngine
     from .errors import DengineError, TraceError
+    from .export import export_torchscript
+    from .exported import load_exported
     from .experiments.grid import run_grid
     from .experiments.replay import Replay, replay
     from .policy import Policy
@@ -49,6 +51,8 @@ _WHERE = {
     "datasets": ("Dataset", "load_dataset"),
     "engine": ("DataEngine",),
     "errors": ("DengineError", "TraceError"),
+    "export": ("export_torchscript",),
+    "exported": ("load_exported",),
     "experiments.grid": ("run_grid",),
     "experiments.replay": ("Replay", "replay"),
     "policy": ("Policy",),
@@ -86,8 +90,10 @@ __all__ = [
     "WilsonRadiusClassifier",
     "binomial_interval",
     "clopper_pearson_interval",
+    "export_torchscript",
     "jeffreys_interval",
     "load_dataset",
+    "load_exported",
     "make_reducer",
     "replay",
     "run_grid",
