@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from .datasets import Dataset, load_dataset
     from .engine import DataEngine
     from .errors import DengineError, TraceError
-    from .export import export_torchscript
-    from .exported import load_exported
     from .experiments.grid import run_grid
     from .experiments.replay import Replay, replay
+    from .export import export_torchscript
+    from .exported import load_exported
     from .policy import Policy
     from .prediction import ModelPrediction
     from .recipe import Recipe

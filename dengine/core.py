@@ -20,7 +20,7 @@ class Core(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, encoder: nn.Module, scale: Tensor, judge: nn.Module) -> None:
+    def __init__(self, encoder: nn.Module, scale: Tensor, judge: Judge) -> None:
         super().__init__()
         self.encoder = encoder
         self.register_buffer("scale", scale[:, None])
@@ -31,6 +31,16 @@ class Core(nn.Module):
         """(C, T) one trace -> (K, d), scaled."""
         z: Tensor = self.encoder(x.unsqueeze(0))[0] / self.scale
         return z
+
+    @torch.jit.export
+    def hold(self, x: Tensor, label: float, space: int) -> None:
+        """Make one labelled trace (C, T) a reference of `space`."""
+        self.judge.ring.put(self.embed(x)[space], label, space)
+
+    @torch.jit.export
+    def held(self) -> int:
+        """References held."""
+        return self.judge.ring.size()
 
     def forward(self, x: Tensor) -> Judged:
         """(C, T) one trace -> action, lower, upper, n_success, n_failure, scaled embedding (K, d)."""

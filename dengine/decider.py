@@ -7,6 +7,7 @@ audits' coin. Positions: actions 0 verify, 1 accept, 2 reject; reasons as in `Re
 import torch
 from torch import Tensor, nn
 
+from .core import Core
 from .folds import COIN_BITS, MIX, audit_salt
 from .records import Reason, TraceSpec
 from .traces import TraceGate
@@ -25,7 +26,7 @@ class Decider(nn.Module):
     first whatever its label. It does not retrain the encoder.
     """
 
-    def __init__(self, spec: TraceSpec, core: nn.Module, n_spaces: int, dim: int, audit_rate: float, seed: int) -> None:
+    def __init__(self, spec: TraceSpec, core: Core, n_spaces: int, dim: int, audit_rate: float, seed: int) -> None:
         super().__init__()
         self.gate = TraceGate(spec)
         self.core = core
@@ -56,7 +57,7 @@ class Decider(nn.Module):
         return action, reason, lower, upper, n_success, n_failure, z
 
     def forward(self, traces: Tensor) -> Many:
-        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure, each (B,), embedding (B, K, d)."""
+        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure, all (B,), embedding (B, K, d)."""
         batch = traces.unsqueeze(0) if traces.dim() == 1 else traces
         n = batch.size(0)
         whole = torch.zeros(n, 4, dtype=torch.int64)
@@ -74,11 +75,9 @@ class Decider(nn.Module):
         """Add one verified trace to the references; returns how many are held. A faulty trace is not learned from."""
         x = self.as_trace(trace)
         fault, content = self.gate(x)
-        ring = self.core.judge.ring
         if fault == 0:
-            space = self.toss(content) % self.n_spaces
-            ring.put(self.core.embed(x)[space], 1.0 if success else 0.0, space)
-        return ring.size()
+            self.core.hold(x, 1.0 if success else 0.0, self.toss(content) % self.n_spaces)
+        return self.core.held()
 
     def as_trace(self, trace: Tensor) -> Tensor:
         """(C, T) float32; raises for another shape, which is a caller's bug."""
@@ -91,4 +90,4 @@ class Decider(nn.Module):
         """`folds.toss` of one hash: 64-bit integers that wrap around."""
         h = (content ^ (content >> 32)) * self.mix
         h = (h ^ (h >> 32)) * self.mix
-        return (h >> self.shift) & self.mask
+        return int((h >> self.shift) & self.mask)

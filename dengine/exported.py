@@ -85,7 +85,7 @@ def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
     metadata = _metadata(content, target)
     torch.set_num_threads(1)
     try:
-        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()
+        module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except RuntimeError as error:
         raise ExportError(
             f"{target} has its checksum but is no loadable TorchScript: {str(error).splitlines()[0]}."
