@@ -87,6 +87,7 @@ class DataEngine:
         self.new_labels = 0
         self._template = ForeignModel(model) if model is not None else model_of(self.recipe, seed)
         self._model: AnyModel | None = None
+        self._news: RetrainReport | None = None  # the newest retrain, until a cycle has told of it
         self._window = Window(self.recipe.window)
         limits = Limits(None if replaying else self.recipe.budget, self.recipe.max_steps)
         self._retrainer = Retrainer(self._window, limits, executor, clock)
@@ -194,7 +195,7 @@ class DataEngine:
             model.hold(point, int(success), known.content_hash)
         self._window.add(known.trace, int(success), known.content_hash, seq)
         self.new_labels += 1
-        return self._retrain_if_due()
+        return self.start_retrain() if self.new_labels >= self.recipe.retrain_every else None
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None) -> StoredDecision:
         if trace is None or success:
@@ -222,20 +223,26 @@ class DataEngine:
         self.new_labels = 0
         return self._swap(self._retrainer.train(self._model or self._template))
 
-    def _retrain_if_due(self) -> RetrainReport | None:
-        if self.new_labels < self.recipe.retrain_every or self._retrainer.busy:
-            return None
+    @property
+    def retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or waits to be swapped in."""
+        return self._retrainer.busy
+
+    def start_retrain(self) -> RetrainReport | None:
+        """Retrain in the executor while the cell goes on; without one in line, as `retrain`, which returns its report."""
+        self._collect()
         if self._retrainer.executor is None:
             return self.retrain()
-        self.new_labels = 0
-        self._retrainer.start(self._model or self._template)
+        if not self._retrainer.busy:
+            self.new_labels = 0
+            self._retrainer.start(self._model or self._template)
         return None
 
     def _collect(self, wait: bool = False) -> None:
         """Swap in what an executor has finished."""
         trained = self._retrainer.finished(wait)
         if trained is not None:
-            self.last_retrain = self._swap(trained)
+            self._swap(trained)
 
     def _swap(self, trained: Trained) -> RetrainReport:
         model, seq = trained.candidate.model, trained.seq
@@ -252,7 +259,8 @@ class DataEngine:
         )
         state = None if model is None else model.get_state() | {"trained_on": seq}
         self.store.put_version(report, self._window.newest_seq, state)
-        return replace(report, seconds=trained.elapsed())
+        self._news = replace(report, seconds=trained.elapsed())
+        return self._news
 
     # ------------------------------------------------------------------------------------------------- run
 
@@ -279,10 +287,10 @@ class DataEngine:
             success = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}.get(outcome)  # silence is not a success
         else:
             cell.reject()
-        if success is None:
-            return Cycle(index, decision, outcome, None, None, seconds, None)
-        retrain = self.report(decision.id, success)
-        source = _source(decision.action, decision.audit, success)
+        source = None if success is None else _source(decision.action, decision.audit, success)
+        if success is not None:
+            self.report(decision.id, success)
+        retrain, self._news = self._news, None
         return Cycle(index, decision, outcome, success, source, seconds, retrain)
 
     # ------------------------------------------------------------------------------------------------- state

@@ -1,0 +1,170 @@
+"""How a retrain grows with the store: it must not.
+
+    python training/benchmark_scale.py --sizes 1503,10000,100000,1000000 --out out/
+
+Fills SQLite stores with labelled traces (the bundled ones, each with fresh sensor noise; 4 GB at a million), opens an
+engine on each, and times opening, retraining, reporting and deciding. UMAP's fit stands beside it up to --umap-most
+traces. What certainty costs: the same fresh parts judged by models whose window is smaller and larger.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Source, load_dataset, make_reducer
+from dengine.factory import model_of
+from dengine.folds import content_hash
+from dengine.traces import as_traces
+
+CHUNK = 5000
+BUDGET = 0.45
+
+
+def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """n labelled traces (n, C, T): bundled ones with 0.2 units of fresh sensor noise."""
+    rows = rng.integers(len(data), size=n)
+    X = as_traces(data.X[rows])
+    return X + rng.normal(0.0, 0.2, X.shape).astype(np.float32), data.y[rows]
+
+
+def fill(engine: DataEngine, data: Dataset, n: int) -> None:
+    """Put n labelled traces into the engine's store, in bulk."""
+    rng = np.random.default_rng(0)
+    engine.decide(noisy(data, 1, rng)[0][0])  # the first trace sets the contract
+    for start in track(range(0, n, CHUNK), description=f"{n:,} traces"):
+        X, y = noisy(data, min(CHUNK, n - start), rng)
+        decisions = [_verified(f"import-{start + i}") for i in range(len(X))]
+        engine.store.put_labelled(decisions, X, content_hash(X), y, Source.VERIFICATION)
+
+
+def _verified(name: str) -> Decision:
+    return Decision(name, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+
+
+def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path) -> dict[str, Any]:
+    """Times of one store of n labelled traces, in seconds."""
+    path = folder / f"{n}.db"
+    with DataEngine.from_recipe(recipe, store=path) as engine:
+        fill(engine, data, n)
+    begin = time.perf_counter()
+    engine = DataEngine.open(path)
+    opened = time.perf_counter() - begin
+    retrains = [engine.retrain().seconds for _ in range(repeats)]
+    fresh, _ = noisy(data, 300, np.random.default_rng(1))
+    decide, report = [], []
+    for x in fresh:
+        begin = time.perf_counter()
+        decision = engine.decide(x)
+        decide.append(time.perf_counter() - begin)
+        if decision.action is Action.VERIFY:
+            begin = time.perf_counter()
+            engine.report(decision.id, True)
+            report.append(time.perf_counter() - begin)
+    engine.close()
+    size = path.stat().st_size / 1e9
+    path.unlink()
+    return {
+        "traces": n,
+        "store_gb": size,
+        "open_s": opened,
+        "retrain_p50_s": np.median(retrains),
+        "retrain_max_s": np.max(retrains),
+        "decide_p50_ms": 1e3 * np.median(decide),
+        "decide_p99_ms": 1e3 * np.quantile(decide, 0.99),
+        "report_p50_ms": 1e3 * np.median(report) if report else np.nan,
+    }
+
+
+def measure_umap(data: Dataset, sizes: list[int]) -> dict[int, float]:
+    """UMAP's fit, in seconds, by number of traces; a first one compiles."""
+    rng = np.random.default_rng(0)
+    make_reducer("umap").fit(noisy(data, 200, rng)[0].reshape(200, -1))
+    seconds = {}
+    for n in sizes:
+        X = noisy(data, n, rng)[0].reshape(n, -1)
+        begin = time.perf_counter()
+        make_reducer("umap").fit(X)
+        seconds[n] = time.perf_counter() - begin
+    return seconds
+
+
+def measure_certainty(data: Dataset, recipe: Recipe, windows: list[int], seed: int = 0) -> list[dict[str, Any]]:
+    """Certain share and error of fresh parts by models trained on ever larger windows of one long stream.
+
+    Reference parts and fresh parts come from disjoint halves of the data.
+    """
+    order = np.random.default_rng(seed).permutation(len(data))
+    half = len(data) // 2
+    known = Dataset(data.X[order[:half]], data.y[order[:half]])
+    fresh = Dataset(data.X[order[half:]], data.y[order[half:]])
+    X, y = noisy(known, max(windows), np.random.default_rng(seed))
+    rows = []
+    for n in windows:
+        model = model_of(recipe, seed).fit(X[-n:], y[-n:])
+        actions = model.decide(fresh.X)
+        accepted = actions == Action.ACCEPT
+        wrong = (accepted & (fresh.y == 0)) | ((actions == Action.REJECT) & (fresh.y == 1))
+        certain = actions != Action.VERIFY
+        share = wrong.sum() / max(1, certain.sum())
+        rows.append({"window": n, "certain_fraction": certain.mean(), "accepted": accepted.sum(), "wrong_fraction": share})
+    return rows
+
+
+def show(stores: pd.DataFrame, umap: dict[int, float], certainty: pd.DataFrame, out: Path) -> None:
+    """Tables on the screen, CSVs and picture in `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    stores.assign(umap_fit_s=stores["traces"].map(umap)).to_csv(out / "benchmark_scale.csv", index=False)
+    certainty.to_csv(out / "benchmark_scale_certainty.csv", index=False)
+    for frame, title in ((stores, "Times against store size"), (certainty, "Certainty against window")):
+        table = Table(*frame.columns, title=title)
+        for values in frame.itertuples(index=False):
+            table.add_row(*(f"{v:,}" if isinstance(v, int | np.integer) else f"{v:.3g}" for v in values))
+        Console().print(table)
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(stores["traces"], stores["retrain_max_s"], "o-", label="conv retrain, worst")
+    axes.plot(stores["traces"], stores["retrain_p50_s"], "o:", label="conv retrain, median")
+    if umap:
+        axes.plot(list(umap), list(umap.values()), "s--", label="UMAP fit")
+    axes.axhline(BUDGET, color="0.4", linewidth=1, label="budget 0.45 s")
+    axes.set(xscale="log", yscale="log", xlabel="labelled traces in the store", ylabel="wall time (s)")
+    axes.set_title("A retrain does not grow with the store")
+    axes.legend()
+    figure.savefig(out / "benchmark_scale.png", dpi=150)
+
+
+def main() -> None:
+    """Parse, measure, show."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default="insertion")
+    parser.add_argument("--samples", type=int)
+    parser.add_argument("--recipe", default="conv")
+    parser.add_argument("--sizes", default="1503,10000,100000,1000000")
+    parser.add_argument("--umap-most", type=int, default=4000)
+    parser.add_argument("--repeats", type=int, default=5, help="retrains at each size")
+    parser.add_argument("--folder", type=Path, help="where the stores are built; a temporary one by default")
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    args = parser.parse_args()
+    data = load_dataset(args.data, args.samples)
+    recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
+    sizes = [int(n) for n in args.sizes.split(",")]
+    with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+        stores = [measure_store(data, recipe, n, args.repeats, Path(folder)) for n in sizes]
+    umap = measure_umap(data, [n for n in sizes if n <= args.umap_most])
+    certainty = measure_certainty(data, recipe, [1000, 2500, 5000, 10_000, 20_000])
+    show(pd.DataFrame(stores), umap, pd.DataFrame(certainty), args.out)
+
+
+if __name__ == "__main__":
+    main()
