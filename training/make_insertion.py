@@ -118,12 +118,13 @@ def ambiguity(data: Dataset, heights_mm: NDArray[np.float32], wrong: NDArray[np.
     seated = np.abs(heights_mm)
     tolerance = CellParameters().height_tolerance_mm
     zones = {
-        f"{tolerance:g} to 1.5 mm off their seat": (seated > tolerance) & (seated <= 1.5),
+        f"{tolerance:g} to 1.5 mm off the seat": (seated > tolerance) & (seated <= 1.5),
         f"1.5 to {NEAR_MM:g} mm off": (seated > 1.5) & (seated <= NEAR_MM),
         "further off": seated > NEAR_MM,
         "seated": seated <= tolerance,
     }
-    return "; ".join(f"of {inside.sum()} {name} {100 * wrong[inside].mean():.1f} %" for name, inside in zones.items())
+    rows = [f"| {name} | {inside.sum()} | {100 * wrong[inside].mean():.1f} % |" for name, inside in zones.items()]
+    return "\n".join(["| final height | parts | the forest errs on |", "| --- | --- | --- |", *rows])
 
 
 CARD = """# `insertion`: {n} simulated peg insertions
@@ -140,7 +141,8 @@ paper that the method comes from ({successes} successes, {failures} failures); i
 
 The nominal `SimulatedCell` ran until it had {successes} successes and {failures} failures, which took {cycles} cycles;
 the first ones of each label were kept, in the order of their cycles. Trace *i* of a seed depends on (seed, cycle) alone,
-not on the number of processes. The label is the final height alone: a success rests within ±{tolerance} mm of its seat.
+not on the number of processes; another MuJoCo or processor may differ in the last digits. The label is the final height
+alone: a success rests within ±{tolerance} mm of its seat.
 
 A gripper holds a square part (16 mm wide, 40 mm long) by dry friction, on a wrist of six springs, and pushes it down
 into a chamfered hole 12 mm deep, at a set speed, until it reaches its target or the force limit. A force sensor between
@@ -174,16 +176,19 @@ Five folds, shuffled, three times (mean ± standard deviation over the three):
 
 {hardness}
 
-The undecided zone is physical, no label was flipped. The forest errs on this share of the parts: {ambiguity}.
+The undecided zone is physical, no label was flipped:
+
+{ambiguity}
+
 Short wrong parts go in like right ones and only the height tells; a part on a chip one millimetre thick meets the
-bottom hardly earlier than a part that was gripped one millimetre lower.
+bottom hardly earlier than a part that was gripped one millimetre lower; a part that drags along the wall seats or sticks.
 
 ![Final heights](insertion_heights.png)
 
 ## No shortcut
 
-Accuracy of a random forest that sees one thing only, five folds. Above the line of the first contact nothing is known
-about the outcome; the last two rows are physics, and are meant to tell something:
+Accuracy of a random forest that sees one thing only, five folds. What comes before the first contact tells nothing of
+the outcome. The last two rows are physics, and may tell something:
 
 {shortcuts}
 

@@ -1,0 +1,101 @@
+"""The bundled simulated data set is what its card says: counts, difficulty, and no shortcut."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.model_selection import StratifiedKFold, cross_val_score
+from sklearn.neighbors import KNeighborsClassifier
+
+BEFORE_CONTACT = 80  # samples
+DATA = files("dengine") / "data"
+CAUSES = {"missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "wrong_part"}
+
+
+@pytest.fixture(scope="module")
+def stored() -> dict[str, np.ndarray]:
+    with (DATA / "insertion.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+@pytest.fixture(scope="module")
+def traces(stored: dict[str, np.ndarray]) -> np.ndarray:
+    return (stored["X"] * stored["scale"]).astype(np.float32)
+
+
+def accuracy(X: np.ndarray, y: np.ndarray, model: object, folds: int = 5) -> float:
+    shuffled = StratifiedKFold(folds, shuffle=True, random_state=0)
+    return float(cross_val_score(model, X, y, cv=shuffled).mean())
+
+
+def test_the_counts_are_those_of_the_paper(stored: dict[str, np.ndarray]) -> None:
+    assert stored["X"].shape == (1503, 1000)
+    assert stored["X"].dtype == np.int16
+    assert (stored["y"] == 1).sum() == 803
+    assert (stored["y"] == 0).sum() == 700
+
+
+def test_it_is_small_and_says_that_it_is_simulated(stored: dict[str, np.ndarray]) -> None:
+    assert len((DATA / "insertion.npz").read_bytes()) <= 4e6
+    assert bool(stored["simulated"])
+    assert "**Simulated.**" in (DATA / "insertion.md").read_text(encoding="utf-8")
+
+
+def test_labels_are_the_height_alone(stored: dict[str, np.ndarray]) -> None:
+    np.testing.assert_array_equal(stored["y"] == 1, np.abs(stored["height_mm"]) <= 0.5)
+
+
+def test_every_failure_has_a_cause_and_every_cause_its_failures(stored: dict[str, np.ndarray]) -> None:
+    np.testing.assert_array_equal(stored["cause"] == "none", stored["y"] == 1)
+    names, counts = np.unique(stored["cause"][stored["y"] == 0], return_counts=True)
+    assert set(names) == CAUSES
+    assert counts.min() >= 20
+
+
+def test_no_trace_comes_twice_or_is_broken(traces: np.ndarray) -> None:
+    assert len(np.unique(traces, axis=0)) == len(traces)
+    assert np.isfinite(traces).all()
+    assert (traces.std(axis=1) > 0).all()
+
+
+def test_the_forces_are_those_of_real_insertions(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
+    plateau = traces[:, -100:].mean(axis=1)
+    rim, success = stored["cause"] == "rim_contact", stored["y"] == 1
+    assert np.mean((plateau[rim] > 22) & (plateau[rim] < 68)) > 0.97
+    assert np.mean((plateau[success] > 7) & (plateau[success] < 60)) > 0.95
+    middle = traces[:, 400:500].mean(axis=1)  # 0.8 to 1.0 s: on the rim by now, or still on the way down
+    assert np.median(middle[rim]) > 20
+    assert np.median(middle[success]) < 5
+
+
+def test_the_nearest_neighbour_is_right_in_92_to_96_percent(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
+    assert 0.92 <= accuracy(traces, stored["y"], KNeighborsClassifier(1)) <= 0.96
+
+
+def test_a_forest_is_right_in_94_to_97_percent(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
+    every_fifth = traces[:, ::5]  # as good as all samples, and five times faster
+    forest = RandomForestClassifier(100, random_state=0)
+    assert 0.94 <= accuracy(every_fifth, stored["y"], forest) <= 0.97
+
+
+@pytest.mark.parametrize("what", ["offset", "noise", "held", "samples"])
+def test_nothing_before_contact_tells_the_outcome(stored: dict[str, np.ndarray], traces: np.ndarray, what: str) -> None:
+    before = traces[:, :BEFORE_CONTACT]
+    features = {
+        "offset": before.mean(axis=1, keepdims=True),
+        "noise": np.diff(before).std(axis=1, keepdims=True),
+        "held": (np.diff(before) == 0).sum(axis=1, keepdims=True),
+        "samples": before[:, ::4],
+    }
+    forest = RandomForestClassifier(100, random_state=0)
+    assert accuracy(features[what], stored["y"], forest) < 0.58  # the majority is 0.534
+
+
+def test_the_sensor_was_drawn_apart_from_the_outcome(stored: dict[str, np.ndarray]) -> None:
+    names = stored["condition_names"].tolist()
+    sensor = ["noise_n", "ripple_n", "ripple_hz", "bias_n", "drift_n", "step_n", "dropped_share", "delay_s"]
+    drawn = stored["conditions"][:, [names.index(name) for name in sensor]]
+    assert accuracy(drawn, stored["y"], RandomForestClassifier(100, random_state=0)) < 0.58
