@@ -11,9 +11,9 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from .judge import Judge, Neighbourhood, make_judge
+from .judge import Judge, make_judge
 from .neighbors import Counts, RadiusIndex
-from .policy import Policy
+from .policy import Neighbourhood, Policy
 from .records import Action
 
 ACTIONS = tuple(Action)

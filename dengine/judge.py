@@ -1,45 +1,18 @@
 """From an embedding to an action: count, bound, decide. It scripts: the engine and the exported file share it."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from .bounds import INTERVALS, normal_quantile
-from .errors import SettingError
 from .neighbors import ReferenceRing
-from .policy import Policy
+from .policy import Neighbourhood, Policy
 from .records import Action
 
 SCRIPTED_INTERVALS = ("wilson", "binomial")
 VERIFY, ACCEPT, REJECT = (list(Action).index(a) for a in (Action.VERIFY, Action.ACCEPT, Action.REJECT))
-
-
-@dataclass(frozen=True, slots=True)
-class Neighbourhood:
-    """Which references count for a query; chosen without looking at any label.
-
-    radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
-    fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
-    reject_fraction : a second, smaller share that a rejection is judged by; None: the same ball for both. Successes and
-        failures rarely come in equal numbers, and a ball wide enough to certify the many blurs the few.
-    """
-
-    radius: float = 0.3
-    fraction: float | None = None
-    reject_fraction: float | None = None
-
-    def __post_init__(self) -> None:
-        if not (self.radius > 0.0 and math.isfinite(self.radius)):
-            raise SettingError(f"Expected a finite radius > 0, got {self.radius!r}.")
-        for name in ("fraction", "reject_fraction"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value <= 1.0:
-                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {value!r}.")
-        if self.reject_fraction is not None and self.fraction is None:
-            raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")
 
 
 class Judge(nn.Module):

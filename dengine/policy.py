@@ -1,8 +1,10 @@
-"""The user's two numbers, and what follows from them: a bound becomes an action."""
+"""The user's two numbers, and what follows from them: which neighbours count, and how a bound becomes an action."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -53,3 +55,28 @@ class Policy:
         """What each bound allows: an object array of `Action`, of the bounds' shape."""
         certain = np.where(np.asarray(upper) <= 1.0 - self.lower_bound, Action.REJECT, Action.VERIFY)
         return np.where(np.asarray(lower) >= self.lower_bound, Action.ACCEPT, certain).astype(object)
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbourhood:
+    """Which references count for a query; chosen without looking at any label.
+
+    radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
+    fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
+    reject_fraction : a second, smaller share that a rejection is judged by; None: the same ball for both. Successes and
+        failures rarely come in equal numbers, and a ball wide enough to certify the many blurs the few.
+    """
+
+    radius: float = 0.3
+    fraction: float | None = None
+    reject_fraction: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.radius, Real) and self.radius > 0.0 and math.isfinite(self.radius)):
+            raise SettingError(f"Expected a finite radius > 0, got {self.radius!r}.")
+        for name in ("fraction", "reject_fraction"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, Real) and 0.0 < value <= 1.0):
+                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {value!r}.")
+        if self.reject_fraction is not None and self.fraction is None:
+            raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")

@@ -14,8 +14,10 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .errors import SettingError
-from .policy import Policy
+from .policy import Neighbourhood, Policy
 
 Params = Mapping[str, bool | int | float | str]
 
@@ -53,6 +55,9 @@ class Recipe:
                 raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
         if not self.budget > 0.0:
             raise SettingError(f"Expected budget > 0 seconds, got {self.budget!r}.")
+        if not isinstance(self.params, Mapping):
+            raise SettingError(f"Expected params to be a table of the reducer's settings, got {self.params!r}.")
+        Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
 
     @classmethod
     def load(cls, recipe: Recipe | str | Path) -> Recipe:
@@ -89,7 +94,8 @@ class Recipe:
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("params", "policy")}
         policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
         tables = {"": plain, "policy": policy, "params": dict(self.params)}
-        return "\n".join(_table(name, values) for name, values in tables.items() if values or not name)
+        # An empty [params] is written too: left out, it would mean those of the reducer's own recipe.
+        return "\n".join(_table(name, values) for name, values in tables.items())
 
     def with_policy(self, **changes: Any) -> Recipe:
         """The same with another alpha, lower_bound, interval or audit_rate."""
@@ -108,12 +114,18 @@ def _table(name: str, values: Mapping[str, Any]) -> str:
 def _value(value: Any) -> str:
     if value is None:
         return '"none"'
-    if isinstance(value, bool):
-        return str(value).lower()
+    if isinstance(value, bool | np.bool_):
+        return str(bool(value)).lower()
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    return repr(value)
+        return '"' + "".join(_escaped(c) for c in value) + '"'
+    # A NumPy number's repr names its type, which is not TOML.
+    return repr(int(value)) if isinstance(value, int | np.integer) else repr(float(value))
+
+
+def _escaped(character: str) -> str:
+    if character in '\\"' or character < " " or character == "\x7f":
+        return f"\\u{ord(character):04X}"
+    return character
 
 
 RECIPES: dict[str, Recipe] = {

@@ -1,0 +1,22 @@
+"""Write models/recipes/NAME.toml from the defaults in the code; a test keeps the two equal.
+
+python training/write_recipes.py
+"""
+
+from pathlib import Path
+
+from dengine.recipe import RECIPES
+
+FOLDER = Path(__file__).resolve().parents[1] / "models" / "recipes"
+
+
+def write_recipes(folder: Path) -> None:
+    """One file for each of `RECIPES`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, recipe in RECIPES.items():
+        head = f"# {name}: the defaults of the code. Written by training/write_recipes.py; copy it to change it.\n"
+        (folder / f"{name}.toml").write_text(head + recipe.to_toml(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_recipes(FOLDER)
