@@ -1,0 +1,58 @@
+"""Data that many tests share: small, synthetic, insertion-like; the real set where it is at hand."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import Dataset
+
+REPO = Path(__file__).resolve().parents[1]
+SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
+
+
+def insertion_like(
+    n: int = 200, samples: int = 100, channels: int = 1, *, seed: int = 0, failures: float = 0.2, noise: float = 0.5
+) -> Dataset:
+    """n traces of two shapes: a success bottoms late, a failure meets the rim early and stays on a plateau (newtons)."""
+    rng = np.random.default_rng(seed)
+    y = (rng.random(n) >= failures).astype(np.int8)
+    t = np.linspace(0.0, 1.0, samples)[None, None, :]
+    onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
+    height = rng.normal(20.0, 2.0, (n, channels, 1))
+    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, noise, (n, channels, samples))
+    X = X.astype(np.float32)
+    return Dataset(X[:, 0] if channels == 1 else X, y, name="insertion-like")
+
+
+@pytest.fixture(scope="session")
+def make_data() -> Callable[..., Dataset]:
+    return insertion_like
+
+
+@pytest.fixture(scope="session")
+def data() -> Dataset:
+    return insertion_like(200)
+
+
+@pytest.fixture(scope="session")
+def repo() -> Path:
+    return REPO
+
+
+@pytest.fixture(scope="session")
+def screw_driving() -> Path:
+    if not SCREW_DRIVING.is_file():
+        pytest.skip(f"the real screw-driving set is not at {SCREW_DRIVING}")
+    return SCREW_DRIVING
+
+
+@pytest.fixture(scope="session")
+def proof_repeats() -> int:
+    """Repeats of a statistical test: few in `make test`, many in `make proof`."""
+    return int(os.environ.get("DENGINE_PROOF_REPEATS", "2"))

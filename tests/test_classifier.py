@@ -1,0 +1,165 @@
+"""The estimator: scikit-learn's own checks, the empty ball, and one bound whoever computes it."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.neighbors import RadiusNeighborsClassifier
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from dengine import INTERVALS, Action, Policy, WilsonRadiusClassifier
+from dengine.errors import SettingError
+from dengine.judge import SCRIPTED_INTERVALS, make_judge, script
+from dengine.neighbors import ReferenceRing
+from dengine.policy import Neighbourhood
+
+
+@parametrize_with_checks(
+    [
+        WilsonRadiusClassifier(),
+        WilsonRadiusClassifier(fraction=0.1, reject_fraction=0.05),
+        WilsonRadiusClassifier(interval="jeffreys"),
+    ]
+)
+def test_scikit_learns_estimator_checks_pass(estimator, check) -> None:
+    check(estimator)
+
+
+def blobs(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    y = (rng.random(n) < 0.7).astype(int)
+    return (rng.normal(0, 0.4, (n, 2)) + np.where(y, 1.0, -1.0)[:, None]).astype(np.float32), y
+
+
+# --------------------------------------------------------------------------------------------------- decisions
+
+
+@pytest.mark.parametrize("settings_", [{}, {"interval": "binomial"}, {"interval": "jeffreys"}, {"alpha": 0.9}])
+def test_an_empty_ball_abstains_in_decide_and_never_in_predict(settings_) -> None:
+    Z, y = blobs()
+    model = WilsonRadiusClassifier(radius=0.5, **settings_).fit(Z, y)
+    far = np.full((3, 2), 50.0)
+    assert list(model.decide(far)) == [Action.VERIFY] * 3
+    np.testing.assert_array_equal(model.predict_interval(far), [[0.0] * 3, [1.0] * 3])
+    np.testing.assert_array_equal(model.predict_proba(far), np.full((3, 2), 0.5))
+    assert set(model.predict(far)) <= {0, 1}
+
+
+@pytest.mark.parametrize("interval", INTERVALS)
+@pytest.mark.parametrize("shares", [{}, {"fraction": 0.2}, {"fraction": 0.3, "reject_fraction": 0.05}])
+def test_decisions_follow_from_the_interval_and_the_interval_from_the_counts(interval: str, shares) -> None:
+    Z, y = blobs()
+    queries = np.random.default_rng(1).uniform(-2, 2, (100, 2))
+    model = WilsonRadiusClassifier(0.4, alpha=0.1, lower_bound=0.9, interval=interval, **shares).fit(Z, y)
+    policy = Policy(0.1, 0.9, interval)
+    lower, upper = model.predict_interval(queries)
+    np.testing.assert_allclose((lower, upper), policy.bound(*model.count(queries)), atol=1e-12)
+    decisions = model.decide(queries)
+    assert list(decisions) == list(policy.actions(lower, upper))
+    assert set(decisions) == set(Action)
+
+
+def test_the_clean_sides_are_decided_and_the_middle_is_verified() -> None:
+    Z, y = blobs()
+    model = WilsonRadiusClassifier(radius=0.5, alpha=0.1, lower_bound=0.9).fit(Z, y)
+    assert list(model.decide([[1.0, 1.0], [-1.0, -1.0], [0.0, 0.0]])) == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
+
+
+def test_the_narrow_ball_may_reject_where_the_wide_one_cannot() -> None:
+    rng = np.random.default_rng(0)
+    Z = np.concatenate([rng.normal(0, 0.1, (40, 2)), rng.normal(3, 0.1, (360, 2))])
+    y = np.repeat([0, 1], [40, 360])
+    one_ball = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9, fraction=0.5).fit(Z, y)
+    two_balls = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9, fraction=0.5, reject_fraction=0.08).fit(Z, y)
+    assert one_ball.decide([[0.0, 0.0]])[0] is Action.VERIFY
+    assert two_balls.decide([[0.0, 0.0]])[0] is Action.REJECT
+    assert tuple(int(c[0]) for c in two_balls.count([[0.0, 0.0]])) == (0, 32)
+
+
+def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
+    Z, y = blobs()
+    queries = Z[:100] + 0.01
+    ours = WilsonRadiusClassifier(radius=0.5).fit(Z, y)
+    theirs = RadiusNeighborsClassifier(radius=0.5).fit(Z, y)
+    np.testing.assert_allclose(ours.predict_proba(queries), theirs.predict_proba(queries), atol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------- one bound
+
+
+@pytest.mark.parametrize("interval", SCRIPTED_INTERVALS)
+@pytest.mark.parametrize("alpha", [0.01, 0.05, 0.1, 0.5])
+def test_the_scripted_bound_is_the_interval_to_twelve_digits(interval: str, alpha: float) -> None:
+    judge = script(make_judge(ReferenceRing(2, 4), Neighbourhood(), Policy(alpha, 0.9, interval)))
+    counts = [(s, f) for s in (0, 1, 2, 25, 95, 1000, 9999) for f in (0, 1, 5, 100, 9999)]
+    scripted = np.array([judge.bound(s, f) for s, f in counts])
+    n_s, n_f = np.array(counts).T
+    np.testing.assert_allclose(scripted.T, INTERVALS[interval](n_s, n_f, alpha), rtol=0, atol=1e-12)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 200), st.integers(0, 200), st.floats(0.001, 0.9))
+def test_counts_of_references_become_the_wilson_interval(n_s: int, n_f: int, alpha: float) -> None:
+    if n_s + n_f == 0:
+        return
+    model = WilsonRadiusClassifier(alpha=alpha)
+    model.partial_fit(np.zeros((n_s + n_f, 2)), np.repeat([1, 0], [n_s, n_f]), classes=[0, 1])
+    lower, upper = model.predict_interval([[0.0, 0.0]])
+    assert (lower[0], upper[0]) == pytest.approx(INTERVALS["wilson"](n_s, n_f, alpha), abs=1e-12)
+
+
+@pytest.mark.parametrize("shares", [{}, {"fraction": 0.2}, {"fraction": 0.3, "reject_fraction": 0.05}])
+def test_the_scripted_judge_equals_the_eager_one(shares) -> None:
+    Z, y = blobs()
+    model = WilsonRadiusClassifier(radius=0.4, alpha=0.1, lower_bound=0.9, **shares).fit(Z, y)
+    scripted = script(model.new_judge(model.index_))
+    queries = torch.rand(60, 1, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
+    assert [scripted(q) for q in queries] == [model.judge_(q) for q in queries]
+
+
+# ---------------------------------------------------------------------------------------------------- learning
+
+
+def test_learning_in_parts_is_learning_at_once() -> None:
+    Z, y = blobs()
+    whole = WilsonRadiusClassifier().fit(Z, y)
+    parts = WilsonRadiusClassifier()
+    for start in range(0, len(Z), 37):
+        parts.partial_fit(Z[start : start + 37], y[start : start + 37], classes=[0, 1])
+    np.testing.assert_array_equal(parts.count(Z), whole.count(Z))
+
+
+def test_fit_forgets_what_was_held() -> None:
+    Z, y = blobs()
+    model = WilsonRadiusClassifier(radius=100.0).fit(Z, y).fit(Z[:10], y[:10])
+    assert sum(int(c[0]) for c in model.count(Z[:1])) == 10
+
+
+def test_beyond_capacity_the_oldest_leave_whatever_their_label() -> None:
+    Z, y = blobs()
+    model = WilsonRadiusClassifier(radius=100.0, capacity=50).fit(Z, y)
+    assert tuple(int(c[0]) for c in model.count(Z[:1])) == (y[-50:].sum(), 50 - y[-50:].sum())
+
+
+@pytest.mark.parametrize(("label", "counts"), [(1, (5, 0)), (0, (0, 5))])
+def test_labels_of_one_class_count_as_what_they_are(label: int, counts: tuple[int, int]) -> None:
+    model = WilsonRadiusClassifier(radius=9.0).fit(np.zeros((5, 2)), np.full(5, label))
+    assert tuple(int(c[0]) for c in model.count([[0.0, 0.0]])) == counts
+
+
+def test_a_label_outside_the_two_classes_is_refused() -> None:
+    with pytest.raises(ValueError, match="binary"):
+        WilsonRadiusClassifier().fit(np.zeros((3, 2)), [0, 1, 2])
+    model = WilsonRadiusClassifier().fit(np.zeros((2, 2)), [0, 1])
+    with pytest.raises(ValueError, match="Expected labels among"):
+        model.partial_fit(np.zeros((1, 2)), [2])
+
+
+@pytest.mark.parametrize(
+    "settings_",
+    [{"radius": 0.0}, {"radius": np.inf}, {"fraction": 0.0}, {"fraction": 1.1}, {"reject_fraction": 0.1}, {"alpha": 2.0}],
+)
+def test_settings_out_of_range_are_setting_errors(settings_) -> None:
+    with pytest.raises(SettingError):
+        WilsonRadiusClassifier(**settings_).fit(np.zeros((2, 2)), [0, 1])

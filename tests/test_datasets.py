@@ -1,0 +1,112 @@
+"""Labelled traces: files, arrays, names, and what is wrong with them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import DengineError, load_dataset
+from dengine.datasets import Dataset, make_dataset
+from dengine.errors import DataError
+
+
+@pytest.fixture
+def saved(tmp_path: Path):
+    def save(**arrays) -> Path:
+        path = tmp_path / "recorded.npz"
+        np.savez(path, **arrays)
+        return path
+
+    return save
+
+
+def test_a_file_gives_back_what_was_saved(saved, data: Dataset) -> None:
+    loaded = load_dataset(saved(X=data.X, y=data.y))
+    np.testing.assert_array_equal(loaded.X, data.X)
+    np.testing.assert_array_equal(loaded.y, data.y)
+    assert (loaded.X.dtype, loaded.y.dtype) == (np.float32, np.int8)
+    assert (loaded.name, len(loaded)) == ("recorded", 200)
+
+
+def test_quantised_traces_are_scaled_back(saved) -> None:
+    X = np.arange(12, dtype=np.int16).reshape(3, 4)
+    loaded = load_dataset(saved(X=X, y=[1, 0, 1], scale=0.25, rate_hz=200.0, unit="mN", cause=["", "rim", ""]))
+    np.testing.assert_array_equal(loaded.X, X / 4)
+    assert (loaded.rate_hz, loaded.unit, loaded.cause.tolist()) == (200.0, "mN", ["", "rim", ""])
+
+
+def test_arrays_a_path_as_text_and_a_dataset_are_taken_alike(saved, data: Dataset) -> None:
+    path = saved(X=data.X, y=data.y)
+    for source in ((data.X, data.y), path, str(path), data):
+        np.testing.assert_array_equal(load_dataset(source).X, data.X)
+    assert load_dataset(data) is data
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_cut_keeps_the_first_samples_of_every_channel(make_data, channels: int) -> None:
+    data = make_data(10, samples=80, channels=channels)
+    cut = load_dataset(data, samples=30)
+    np.testing.assert_array_equal(cut.X, data.X[..., :30])
+    assert data.X.shape[-1] == 80
+    for samples in (0, 81):
+        with pytest.raises(DataError, match="Expected 1 to 80 samples"):
+            data.cut(samples)
+
+
+@pytest.mark.parametrize(
+    ("X", "y", "message"),
+    [
+        (np.zeros((3, 4)), [0, 1], r"got X \(3, 4\) and y \(2,\)"),
+        (np.zeros(4), [0, 1, 0, 1], "Expected X"),
+        (np.zeros((2, 4)), [0, 2], "Expected labels 1 .success. and 0"),
+        (np.zeros((2, 4)), [0, np.nan], "Expected labels"),
+        (np.zeros((0, 4)), [], "at least one trace"),
+    ],
+)
+def test_parts_that_do_not_fit_together_are_named(X, y, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        make_dataset(X, y)
+
+
+def test_a_file_without_x_and_y_says_what_it_has(saved) -> None:
+    with pytest.raises(DataError, match=r"Expected arrays X and y in .*found forces"):
+        load_dataset(saved(forces=np.zeros(3)))
+
+
+def test_a_file_with_pickled_objects_is_never_loaded(saved) -> None:
+    with pytest.raises(DataError, match="Cannot read"):
+        load_dataset(saved(X=np.array([[None]], dtype=object), y=[1]))
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 broken"])
+def test_a_damaged_file_is_a_data_error(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "damaged.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="Cannot read"):
+        load_dataset(path)
+
+
+def test_a_truncated_file_is_a_data_error(saved, data: Dataset) -> None:
+    path = saved(X=data.X, y=data.y)
+    path.write_bytes(path.read_bytes()[:-400])
+    with pytest.raises(DataError, match="Cannot read"):
+        load_dataset(path)
+
+
+def test_an_unknown_name_lists_the_known_ones() -> None:
+    with pytest.raises(DengineError, match=r"Expected a data set among insertion, or an \.npz file; insertoin is neither"):
+        load_dataset("insertoin")
+
+
+def test_the_bundled_set_is_labelled_insertions() -> None:
+    data = load_dataset("insertion")
+    assert (data.X.shape, data.name, data.rate_hz, data.unit) == ((1503, 1000), "insertion", 500.0, "N")
+    assert np.isfinite(data.X).all()
+    assert 0.5 < data.y.mean() < 0.99
+
+
+def test_the_real_set_is_read(screw_driving: Path) -> None:
+    data = load_dataset(screw_driving, samples=400)
+    assert data.X.shape[-1] == 400
+    assert set(np.unique(data.y)) == {0, 1}
+    assert np.isfinite(data.X).all()

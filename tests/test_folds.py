@@ -1,0 +1,150 @@
+"""The permanent hash: of content alone, the same everywhere, for ever."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy import stats
+
+from dengine import TraceSpec
+from dengine.folds import audited, content_fold, content_hash, fold_of, hash_weights, toss
+from dengine.judge import script
+from dengine.traces import TraceGate
+
+any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
+traces = hnp.arrays(np.float32, hnp.array_shapes(min_dims=2, max_dims=2, min_side=1, max_side=12), elements=any_float32)
+
+
+def noise(n: int, samples: int = 50, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, 10, (n, samples)).astype(np.float32)
+
+
+# ----------------------------------------------------------------------------------------------------- golden
+
+
+def golden_traces() -> dict[str, np.ndarray]:
+    ramp = np.arange(1000, dtype=np.float32) / 8
+    odd = np.array([0.5, np.nan, -np.inf, np.inf, -1.25, 3e38, -3e38, 1e-20, -0.0], dtype=np.float32)
+    return {"zeros": np.zeros(1000, np.float32), "ramp": ramp, "falling": -ramp[::-1].copy(), "odd": odd,
+            "two channels": np.stack([ramp[:152], ramp[152:304]])}  # fmt: skip
+
+
+GOLDEN = {  # (hash, toss, fold of 2, fold of 5): a store, a controller and an exported file rely on every one
+    "zeros": (0, 0, 0, 0),
+    "ramp": (8548868241147854848, 1036997479, 1, 4),
+    "falling": (8255207352831803392, 100986282, 0, 2),
+    "odd": (-1704657004933038080, 40023773, 1, 3),
+    "two channels": (-6115420420893392896, 790665473, 1, 3),
+}
+GOLDEN_WEIGHTS = [-2152535657050944081, 7960286522194355701]
+
+
+@pytest.mark.parametrize("name", golden_traces())
+def test_the_hash_of_a_trace_never_changes(name: str) -> None:
+    h = content_hash(golden_traces()[name][None])
+    assert (int(h[0]), int(toss(h)[0]), int(fold_of(h, 2)[0]), int(fold_of(h, 5)[0])) == GOLDEN[name]
+
+
+def test_the_weights_never_change_and_are_odd() -> None:
+    weights = hash_weights(4000)
+    assert (weights & 1 == 1).all()
+    assert len(np.unique(weights)) == 4000
+    assert weights[:2].tolist() == GOLDEN_WEIGHTS
+    np.testing.assert_array_equal(hash_weights(152), weights[:152])
+
+
+# -------------------------------------------------------------------------------------------- content, nothing else
+
+
+@given(st.randoms(use_true_random=False))
+def test_a_hash_depends_neither_on_order_nor_on_company(random) -> None:
+    X = noise(40)
+    order = list(range(40))
+    random.shuffle(order)
+    np.testing.assert_array_equal(content_hash(X[order]), content_hash(X)[order])
+    assert content_hash(X[7:8])[0] == content_hash(X)[7]
+
+
+def test_many_traces_hash_as_they_do_one_by_one() -> None:
+    X = noise(600, 20)  # more than one block of 256
+    one_by_one = np.array([content_hash(x[None])[0] for x in X])
+    np.testing.assert_array_equal(content_hash(X), one_by_one)
+
+
+def test_duplicates_share_their_fold() -> None:
+    X = noise(50)
+    for folds in (2, 3, 7):
+        np.testing.assert_array_equal(content_fold(np.concatenate([X, X]), folds), np.tile(content_fold(X, folds), 2))
+
+
+def test_dtype_and_layout_do_not_change_a_hash() -> None:
+    X = np.round(noise(20)).astype(np.int16)
+    expected = content_hash(X.astype(np.float32))
+    np.testing.assert_array_equal(content_hash(X), expected)
+    np.testing.assert_array_equal(content_hash(X.astype(np.float64)), expected)
+    np.testing.assert_array_equal(content_hash(np.asfortranarray(X)), expected)
+    np.testing.assert_array_equal(content_hash(X[:, None, :]), expected)
+
+
+def test_one_sample_more_or_less_or_moved_is_another_hash() -> None:
+    x = noise(1)[0]
+    shifted, changed = np.roll(x, 1), x.copy()
+    changed[20] += 0.01
+    hashes = {int(content_hash(v[None])[0]) for v in (x, shifted, changed, x[:-1])}
+    assert len(hashes) == 4
+
+
+def test_noise_traces_do_not_collide() -> None:
+    assert len(np.unique(content_hash(noise(5000, 20)))) == 5000
+
+
+# -------------------------------------------------------------------------------------------------- TorchScript
+
+
+@given(traces)
+def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> None:
+    gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0]))
+    assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
+
+
+@pytest.mark.parametrize("name", golden_traces())
+def test_the_compiled_gate_hashes_as_numpy_does(name: str) -> None:
+    x = np.atleast_2d(golden_traces()[name])
+    gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
+    assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
+
+
+# ------------------------------------------------------------------------------------------------ fair and separate
+
+
+@pytest.mark.parametrize("folds", [2, 3, 5, 10])
+def test_folds_are_balanced(folds: int) -> None:
+    sizes = np.bincount(content_fold(noise(10_000, 20), folds), minlength=folds)
+    assert stats.chisquare(sizes).pvalue > 1e-4
+
+
+def test_folds_of_traces_that_differ_in_one_sample_are_balanced() -> None:
+    X = np.tile(noise(1, 30), (4000, 1))
+    X[:, 3] = np.arange(4000) / 1024
+    assert stats.chisquare(np.bincount(content_fold(X, 2), minlength=2)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.25, 0.5])
+def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None:
+    h = content_hash(noise(20_000, 20))
+    coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
+    assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
+    assert stats.chi2_contingency([[np.sum((coin == c) & (fold == k)) for k in (0, 1)] for c in (0, 1)]).pvalue > 1e-4
+
+
+def test_engines_of_different_seeds_audit_different_traces() -> None:
+    h = content_hash(noise(20_000, 20))
+    one, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
+    assert stats.binomtest(int((one == other).sum()), len(h), 0.5).pvalue > 1e-4
+    np.testing.assert_array_equal(one, audited(h, 0.5, seed=1))
+
+
+def test_an_audit_rate_of_zero_audits_nothing() -> None:
+    assert not audited(content_hash(noise(1000, 20)), 0.0, seed=0).any()

@@ -1,0 +1,92 @@
+"""The user's two numbers: a bound becomes an action."""
+
+import math
+from dataclasses import FrozenInstanceError
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dengine import INTERVALS, Action, Policy
+from dengine.errors import SettingError
+
+unit = st.floats(0.0, 1.0)
+policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "action"),
+    [
+        (0.90, 1.00, Action.ACCEPT),
+        (0.899, 1.00, Action.VERIFY),
+        (0.00, 1.00, Action.VERIFY),
+        (0.00, 0.125, Action.VERIFY),
+        (0.00, 0.05, Action.REJECT),
+    ],
+)
+def test_accept_from_the_lower_bound_on_and_reject_from_its_complement_down(lower, upper, action) -> None:
+    assert Policy(lower_bound=0.9).action(lower, upper) is action
+
+
+def test_both_thresholds_are_met_with_equality() -> None:
+    policy = Policy(lower_bound=0.75)  # exact in binary, so is its complement
+    assert policy.action(0.75, 1.0) is Action.ACCEPT
+    assert policy.action(0.0, 0.25) is Action.REJECT
+
+
+@given(policies, st.lists(st.tuples(unit, unit), max_size=8))
+def test_actions_of_arrays_are_the_actions_one_by_one(policy: Policy, bounds: list[tuple[float, float]]) -> None:
+    pairs = np.sort(np.array(bounds, dtype=float).reshape(-1, 2), axis=1)
+    actions = policy.actions(pairs[:, 0], pairs[:, 1])
+    assert actions.dtype == object
+    assert list(actions) == [policy.action(lower, upper) for lower, upper in pairs]
+
+
+@given(policies, unit, unit)
+def test_swapping_success_and_failure_swaps_accept_and_reject(policy: Policy, a: float, b: float) -> None:
+    lower, upper = min(a, b), max(a, b)
+    if min(abs(lower - policy.lower_bound), abs(upper - (1 - policy.lower_bound))) < 1e-9:
+        return  # rounding may decide the very edge
+    swapped = {Action.ACCEPT: Action.REJECT, Action.REJECT: Action.ACCEPT, Action.VERIFY: Action.VERIFY}
+    assert policy.action(1.0 - upper, 1.0 - lower) is swapped[policy.action(lower, upper)]
+
+
+@given(policies)
+def test_without_evidence_every_policy_verifies(policy: Policy) -> None:
+    assert policy.action(*policy.bound(0, 0)) is Action.VERIFY
+
+
+@pytest.mark.parametrize("name", INTERVALS)
+def test_a_policy_bounds_by_the_interval_it_names(name: str) -> None:
+    assert Policy(alpha=0.2, interval=name).bound(19, 1) == INTERVALS[name](19, 1, 0.2)
+
+
+@given(policies, st.integers(0, 300), st.integers(0, 300))
+def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n_s: int, n_f: int) -> None:
+    strict = Policy(policy.alpha / 2, (policy.lower_bound + 1) / 2)
+    action = strict.action(*strict.bound(n_s, n_f))
+    assert action in (Action.VERIFY, policy.action(*policy.bound(n_s, n_f)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"alpha": 0.0}, "0 < alpha < 1"),
+        ({"alpha": math.nan}, "0 < alpha < 1"),
+        ({"lower_bound": 0.5}, r"0\.5 < lower_bound < 1"),
+        ({"lower_bound": 1.0}, r"0\.5 < lower_bound < 1"),
+        ({"lower_bound": math.nan}, r"0\.5 < lower_bound < 1"),
+        ({"interval": "wald"}, "wilson, binomial, clopper_pearson, jeffreys"),
+        ({"audit_rate": 1.0}, "audit_rate"),
+        ({"audit_rate": -0.1}, "audit_rate"),
+    ],
+)
+def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        Policy(**settings)  # type: ignore[arg-type]
+
+
+def test_a_policy_cannot_be_changed_under_an_engine() -> None:
+    with pytest.raises(FrozenInstanceError):
+        Policy().alpha = 0.5  # type: ignore[misc]

@@ -1,0 +1,131 @@
+"""Every setting of an engine, from and to TOML."""
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dengine import INTERVALS, Policy, Recipe
+from dengine.errors import SettingError
+from dengine.recipe import RECIPES
+
+shares = st.one_of(
+    st.just((None, None)),
+    st.tuples(st.floats(0.001, 1.0), st.one_of(st.none(), st.floats(0.001, 1.0))),
+)
+values = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text())
+
+
+@st.composite
+def recipes(draw) -> Recipe:
+    fraction, reject_fraction = draw(shares)
+    return Recipe(
+        reducer=draw(st.sampled_from([*RECIPES, "pca", "other"])),
+        params=draw(st.dictionaries(st.from_regex(r"\A[a-z_]{1,12}\Z"), values, max_size=4)),
+        policy=Policy(
+            draw(st.floats(1e-6, 0.999)),
+            draw(st.floats(0.500001, 0.9999)),
+            draw(st.sampled_from(list(INTERVALS))),
+            draw(st.floats(0.0, 0.999)),
+        ),
+        radius=draw(st.floats(1e-6, 1e6)),
+        fraction=fraction,
+        reject_fraction=reject_fraction,
+        folds=draw(st.integers(2, 10)),
+        retrain_every=draw(st.integers(1, 10_000)),
+        budget=draw(st.floats(1e-3, 1e3)),
+        max_steps=draw(st.integers(0, 10_000)),
+        window=draw(st.integers(10, 10**7)),
+    )
+
+
+@given(recipes())
+def test_toml_gives_back_the_recipe(recipe: Recipe) -> None:
+    assert Recipe.from_toml(recipe.to_toml()) == recipe
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_recipe_without_params_stays_without_them_whatever_its_base_has(name: str) -> None:
+    bare = replace(RECIPES[name], params={})
+    assert Recipe.from_toml(bare.to_toml()) == bare
+
+
+def test_numpy_numbers_are_written_as_plain_ones() -> None:
+    recipe = Recipe("pca", {"dim": np.int64(3)}, Policy(np.float64(0.1), np.float64(0.9)), radius=np.float32(0.5))
+    assert Recipe.from_toml(recipe.to_toml()) == Recipe("pca", {"dim": 3}, Policy(0.1, 0.9), radius=0.5)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_recipe_files_equal_the_defaults_in_the_code(name: str, repo: Path) -> None:
+    path = repo / "models" / "recipes" / f"{name}.toml"
+    assert Recipe.load(path) == RECIPES[name], "run: python training/write_recipes.py"
+    assert path.read_text(encoding="utf-8").endswith(RECIPES[name].to_toml()), "run: python training/write_recipes.py"
+
+
+def test_every_recipe_file_names_every_setting(repo: Path) -> None:
+    for path in (repo / "models" / "recipes").glob("*.toml"):
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        missing = set(Recipe.__dataclass_fields__) - set(table)
+        assert not missing, f"{path.name} leaves out {missing}"
+
+
+def test_the_papers_recipe_is_umap_wilson_and_a_fixed_radius() -> None:
+    paper = RECIPES["paper"]
+    assert (paper.reducer, paper.policy.interval, paper.fraction) == ("umap", "wilson", None)
+
+
+def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('reducer = "pca"\nradius = 0.7\n[policy]\nalpha = 0.2\n', encoding="utf-8")
+    mine = Recipe.load(path)
+    base = RECIPES["pca"]
+    assert mine == replace(base, radius=0.7, policy=replace(base.policy, alpha=0.2))
+    assert Recipe.load(str(path)) == mine
+    assert Recipe.load(mine) is mine
+    assert Recipe.load("pca") is base
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("raduis = 0.3", r"mine has an unknown key raduis; known are .*radius"),
+        ("[policy]\nalhpa = 0.3", r"mine.*alhpa"),
+        ("radius = ", "mine is not TOML"),
+        ("policy = 3", "mine"),
+        ("params = 3", "params"),
+        ('radius = "wide"', "radius"),
+        ("radius = -1.0", "radius > 0"),
+        ("radius = nan", "radius > 0"),
+        ("fraction = 0.0", "fraction in"),
+        ("fraction = 1.5", "fraction in"),
+        ("fraction = 'none'\nreject_fraction = 0.1", "reject_fraction only together"),
+        ("folds = 1", "folds to be an integer of at least 2, got 1"),
+        ("folds = 2.0", "folds to be an integer"),
+        ("retrain_every = 0", "retrain_every"),
+        ("max_steps = true", "max_steps"),
+        ("window = 9", "window"),
+        ("budget = 0", "budget > 0"),
+        ("budget = nan", "budget > 0"),
+        ("[policy]\nlower_bound = 0.5", "lower_bound"),
+        ("[policy]\nalpha = 1.0", "0 < alpha < 1"),
+        ('[policy]\ninterval = "wald"', "interval among"),
+    ],
+)
+def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text: str, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        Recipe.from_toml(text, where="mine")
+
+
+def test_an_unknown_recipe_lists_the_known_ones() -> None:
+    with pytest.raises(SettingError, match=r"conv, umap, pca, paper.*covn is neither"):
+        Recipe.load("covn")
+
+
+def test_with_policy_changes_that_and_nothing_else() -> None:
+    recipe = RECIPES["pca"].with_policy(alpha=0.5, interval="jeffreys")
+    assert recipe.policy == replace(RECIPES["pca"].policy, alpha=0.5, interval="jeffreys")
+    assert replace(recipe, policy=RECIPES["pca"].policy) == RECIPES["pca"]
