@@ -20,12 +20,12 @@ Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 class ReferenceRing(nn.Module):
     """A bounded block of labelled points; the oldest leaves first, whatever its label.
 
-    points (d, capacity) float32, one row a dimension; votes (2, capacity) float32, labels of 1.0 or 0.0 above a row of
-    ones, so that one product counts both; spaces (capacity,) int64; total () int64, points ever added.
+    points (d, capacity) float32, one row a dimension; labels (capacity,) float32, 1.0 or 0.0;
+    spaces (capacity,) int64; total () int64, points ever added.
     """
 
     points: Tensor
-    votes: Tensor
+    labels: Tensor
     spaces: Tensor
     total: Tensor
 
@@ -34,14 +34,9 @@ class ReferenceRing(nn.Module):
         self.dim = dim
         self.capacity = capacity
         self.register_buffer("points", torch.zeros(dim, capacity))
-        self.register_buffer("votes", torch.stack([torch.zeros(capacity), torch.ones(capacity)]))
+        self.register_buffer("labels", torch.zeros(capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
         self.register_buffer("total", torch.zeros((), dtype=torch.int64))
-
-    @property
-    def labels(self) -> Tensor:
-        """(capacity,) float32, 1.0 or 0.0; writing to it writes to the block."""
-        return self.votes[0]
 
     @torch.jit.export
     def size(self) -> int:
@@ -54,7 +49,7 @@ class ReferenceRing(nn.Module):
         total = int(self.total.item())
         slot = total % self.capacity
         self.points[:, slot] = point
-        self.votes[0, slot] = label
+        self.labels[slot] = label
         self.spaces[slot] = space
         self.total.fill_(total + 1)
 
@@ -81,9 +76,10 @@ class ReferenceRing(nn.Module):
             limit = float(distances.kthvalue(min(n, int(math_ceil(fraction * n))))[0].item())
             if not limit < float("inf"):
                 return 0, 0  # beyond all measure: at an infinite distance every reference would tie
-        counts: list[float] = torch.mv(self.votes[:, :n], (distances <= limit).to(torch.float32)).tolist()
-        n_success = int(counts[0])
-        return n_success, int(counts[1]) - n_success
+        inside = (distances <= limit).to(torch.float32)
+        k = int(torch.dot(inside, inside).item())  # exact below 2**24 points
+        n_success = int(torch.dot(inside, self.labels[:n]).item())
+        return n_success, k - n_success
 
 
 def math_ceil(x: float) -> int:

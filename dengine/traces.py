@@ -94,5 +94,7 @@ class TraceGate(nn.Module):
             reason = self.constant
         elif max(high, -low) >= self.limit:
             reason = self.saturated
-        steps = (x.flatten().to(torch.float64).clamp(-self.clamp, self.clamp) * self.quantum).floor()
-        return reason, int((steps.to(torch.int64) * self.weights).sum().item())
+        if not max(high, -low) <= self.clamp:  # a NaN among them tells nothing of the others
+            x = x.clamp(-self.clamp, self.clamp)
+        steps = (x.flatten() * self.quantum).floor_().to(torch.int64)  # exact in float32: the quantum is a power of two
+        return reason, int(torch.dot(steps, self.weights).item())
