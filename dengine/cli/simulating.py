@@ -1,0 +1,32 @@
+"""`dengine simulate`: traces of the simulated cell, into a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .options import example, json_option, seed_option
+from .output import progress, show, write_json
+
+
+@click.command(epilog=example("dengine simulate --n 100 --out traces.npz --seed 0"))
+@click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate.")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, help="An .npz file.")
+@click.option("--scenario", default="nominal", show_default=True, help="nominal, wear, variant or bias_jump.")
+@seed_option
+@click.option("--n-jobs", type=int, default=-1, show_default=True, help="Processes; -1: one a core.")
+@json_option
+def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, as_json: bool) -> None:
+    """Simulate insertions in MuJoCo and write their force traces and labels."""
+    from ..cells.generate import save_traces
+    from ..cells.generate import simulate as simulate_traces
+
+    with progress(f"simulating {scenario}", n, as_json) as advance:
+        traces = simulate_traces(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
+    path = save_traces(out, traces)
+    good = int(traces.y.sum())
+    if as_json:
+        write_json({"verb": "simulate", "simulated": True, "scenario": scenario, "n": n, "successes": good, "file": path})
+        return
+    show(f"Simulated {n} insertions ({scenario}): {good} successes, {n - good} failures.", f"Wrote {path}")
