@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dengine import sql_store
+from dengine import sql_database
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.sql_store import SqlStore
@@ -51,9 +51,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
     return url_of(request.param, tmp_path), uuid.uuid4().hex
 
 
-def decision(
-    name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0
-) -> Decision:
+def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
     return Decision(name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0)
 
 
@@ -425,19 +423,19 @@ def test_the_writer_commits_without_being_asked(place: tuple[str, str]) -> None:
 
 def test_a_failed_write_is_told_kept_and_written_later(place: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     with SqlStore(*place) as store:
-        real = store._insert
+        real = store._database.insert
 
         def full(connection: sa.Connection, batch: object) -> None:
             raise sa.exc.OperationalError("INSERT", {}, sqlite3.OperationalError("database or disk is full"))
 
-        monkeypatch.setattr(store, "_insert", full)
+        monkeypatch.setattr(store._database, "insert", full)
         put(store, "a")
         with pytest.raises(StoreError, match=r"disk is full.*Free some space.*1 decisions wait"):
             store.flush()
         with pytest.raises(StoreError):
             store.put_label("a", True, Source.VERIFICATION, 0, None)
         assert store.get_decision("a") is not None
-        monkeypatch.setattr(store, "_insert", real)
+        monkeypatch.setattr(store._database, "insert", real)
         assert store.put_label("a", True, Source.VERIFICATION, 0, None) == 1
         assert store.status()["write_failures"] >= 2
         assert store.status()["decisions"] == 1
@@ -448,22 +446,22 @@ def test_a_commit_whose_answer_was_lost_is_not_written_twice(
 ) -> None:
     with SqlStore(*place) as store:
         with monkeypatch.context() as patch:
-            patch.setattr(store, "_forget", lambda batch: None)  # committed, and still queued
+            patch.setattr(store._database, "_forget", lambda batch: None)  # committed, and still queued
             put(store, "a")
             store.flush()
-        store._doubtful = True
+        store._database._doubtful = True
         store.flush()
         assert store.status()["decisions"] == 1
-        assert store._queue_bytes == 0
+        assert store._database._queue_bytes == 0
 
 
 def test_a_full_queue_is_written_by_put_decision_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql_store, "LINGER", 60.0)
-    monkeypatch.setattr(sql_store, "QUEUE_BYTES", 3 * C * T * 4)
+    monkeypatch.setattr(sql_database, "LINGER", 60.0)
+    monkeypatch.setattr(sql_database, "QUEUE_BYTES", 3 * C * T * 4)
     with SqlStore(str(tmp_path / "a.db")) as store:
         for i in range(20):
             put(store, str(i))
-            assert len(store._queue) <= 4
+            assert len(store._database._queue) <= 4
         store.flush()
         assert store.status()["decisions"] == 20
 
@@ -478,7 +476,7 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
 
 
 def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store, store._transaction(write=False) as connection:
+    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
         for query in (store._newest(100), store._trace_query(5, 10), store._decision_query("a")):
             text = query.compile(connection, compile_kwargs={"literal_binds": True})
             plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
@@ -487,7 +485,7 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
 
 
 def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store, store._transaction(write=False) as connection:
+    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
 
@@ -529,9 +527,7 @@ def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path: Path, name: st
         SqlStore(str(tmp_path / name))
 
 
-@pytest.mark.parametrize(
-    "url", ["sqlite://", "sqlite:///:memory:", "mysql://u:secret@host/db", "nonsense://x", "a://:b:c"]
-)
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://u:secret@host/db", "nonsense://x", "a://:b:c"])
 def test_a_url_that_is_not_served_is_refused_without_its_password(url: str) -> None:
     with pytest.raises(StoreError) as caught:
         SqlStore(url)

@@ -42,7 +42,7 @@ def test_cells_that_open_an_empty_database_at_once_all_succeed() -> None:
 
 def test_a_lost_connection_loses_nothing() -> None:
     with SqlStore(URL, uuid.uuid4().hex) as store:
-        with store._transaction(write=False) as connection:
+        with store._database.transaction(write=False) as connection:
             victims = connection.execute(sa.text("SELECT pg_backend_pid()")).scalar_one()
         admin = sa.create_engine(URL)
         with admin.connect() as connection:
