@@ -38,7 +38,7 @@ from .resuming import resume
 from .retraining import Limits, Retrainer, Trained
 from .store import Store, StoredDecision, open_store
 from .traces import REASONS, TraceGate, as_trace, spec_of
-from .window import AnyModel, Window
+from .window import AnyModel, Window, hold, place
 
 log = logging.getLogger("dengine")
 NOTHING_KNOWN = Judgement(Action.VERIFY, 0.0, 1.0, 0, 0, None)
@@ -186,13 +186,13 @@ class DataEngine:
         known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace)
         source = _source_of(known, success)
         model = None if known.quarantined else self._model
-        point = None if model is None else model.place(known.trace, known.content_hash)
+        point = None if model is None else place(model, known.trace, known.content_hash)
         stored = point if isinstance(model, ModelPrediction) else None
         seq = self.store.put_label(decision_id, bool(success), source, self.version, stored)
         if known.quarantined:
             return None
         if model is not None and point is not None:
-            model.hold(point, int(success), known.content_hash)
+            hold(model, point, int(success), known.content_hash)
         self._window.add(known.trace, int(success), known.content_hash, seq)
         self.new_labels += 1
         return self.start_retrain() if self.new_labels >= self.recipe.retrain_every else None
@@ -208,7 +208,13 @@ class DataEngine:
             self._agree_on(spec_of(x))
         fault, hash_ = self._gate(torch.from_numpy(x))
         judged = replace(NOTHING_KNOWN, action=Action.ACCEPT)
-        decision = replace(self._conclude(judged, Reason.CERTAIN, hash_), id=decision_id, action=Action.ACCEPT, audit=False)
+        decision = replace(
+            self._conclude(judged, Reason.CERTAIN, hash_),
+            id=decision_id,
+            action=Action.ACCEPT,
+            reason=Reason.CERTAIN,  # the part went on unchecked, whatever the audit's coin says
+            audit=False,
+        )
         self.store.put_decision(decision, x, hash_, quarantined=bool(fault))
         known = self.store.get_decision(decision_id)
         if known is None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .prediction import ModelPrediction
 from .store import Labelled, ModelVersion, Store
-from .window import AnyModel, Window
+from .window import AnyModel, Window, hold, place
 
 
 @dataclass(frozen=True)
@@ -53,4 +53,6 @@ def _hold_since(model: AnyModel, store: Store, version: ModelVersion, labelled: 
     for i in np.flatnonzero(labelled.seq > version.last_seq):
         hash_ = int(labelled.hashes[i])
         point = points.get(int(labelled.seq[i]))  # unknown: its decision was answered by an earlier version
-        model.hold(model.place(labelled.traces[i], hash_) if point is None else point, int(labelled.labels[i]), hash_)
+        point = place(model, labelled.traces[i], hash_) if point is None else point
+        if point is not None:
+            hold(model, point, int(labelled.labels[i]), hash_)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from .prediction import ModelPrediction
 from .store import Labelled
 
 AnyModel = ModelPrediction | ForeignModel
+log = logging.getLogger("dengine")
 
 
 class Window:
@@ -73,4 +76,23 @@ class Window:
         data = self.snapshot()
         for i in np.flatnonzero(data.seq > last_seq):
             hash_ = int(data.hashes[i])
-            model.hold(model.place(data.traces[i], hash_), int(data.labels[i]), hash_)
+            point = place(model, data.traces[i], hash_)
+            if point is not None:
+                hold(model, point, int(data.labels[i]), hash_)
+
+
+def place(model: AnyModel, trace: NDArray[np.float32], hash_: int) -> NDArray[np.float32] | None:
+    """Where a trace would live as a reference; None where the model fails on it, which must cost neither cell nor label."""
+    try:
+        return model.place(trace, hash_)
+    except Exception:
+        log.exception("the model cannot place a labelled trace; the next version learns it from the store")
+        return None
+
+
+def hold(model: AnyModel, point: NDArray[np.float32], label: int, hash_: int) -> None:
+    """Make a placed trace a reference; a model that fails at it goes on without."""
+    try:
+        model.hold(point, label, hash_)
+    except Exception:
+        log.exception("the model cannot take a labelled trace; the next version learns it from the store")
