@@ -1,0 +1,79 @@
+"""The null test, which stays for ever: labels that are independent of the trace yield next to nothing certain.
+
+Beside it a deliberately dishonest configuration, which the same test catches.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, ReplayCell, WilsonRadiusClassifier, replay
+from dengine.experiments.replay import collect
+from dengine.recipe import RECIPES
+from dengine.reducers.base import OneSpace
+
+POLICY = Policy(alpha=0.1, lower_bound=0.9)
+CYCLES = 1503
+PROOF = int(os.environ.get("DENGINE_PROOF_REPEATS", "2")) >= 20
+BY_CHANCE = 8.0  # certain cycles of 1503, on average: measured 0.1 to 0.8, in rare bursts
+
+
+def noise_labels(make_data, seed: int, n: int = CYCLES) -> Dataset:
+    """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with them."""
+    data = make_data(n, samples=100, seed=seed, noise=2.0)
+    return Dataset(data.X, (np.random.default_rng(seed + 10_000).random(n) < 0.8).astype(np.int8), name="noise labels")
+
+
+def certain(played: Replay) -> int:
+    return int((played.action != "verify").sum())
+
+
+def error_rate(played: list[Replay]) -> float:
+    """Share of the certain that were wrong."""
+    wrong = sum(int(((p.action == "accept") & ~p.truth).sum() + ((p.action == "reject") & p.truth).sum()) for p in played)
+    return wrong / max(1, sum(map(certain, played)))
+
+
+@pytest.mark.parametrize("name", ["conv", "pca", pytest.param("umap", marks=pytest.mark.skipif(not PROOF, reason="slow"))])
+def test_labels_of_noise_yield_next_to_nothing_certain(name: str, make_data, proof_repeats: int) -> None:
+    recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
+    played = [replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(proof_repeats)]
+    assert np.mean([certain(p) for p in played]) <= BY_CHANCE
+
+
+# ------------------------------------------------------------------------------------------- caught when it cheats
+
+
+class SeesEverything(OneSpace):
+    """Dishonest on purpose: one space, fitted on the very labels that are then counted in it."""
+
+    def fit(self, X, y=None, folds=None, stop=None):
+        self.reducer.fit(X.reshape(len(X), -1), y)
+        return self
+
+
+def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:
+    """The loop around LDA on 100 samples: cross-fitted, or fitted on all labels at once."""
+    reducer = LinearDiscriminantAnalysis() if honest else SeesEverything(LinearDiscriminantAnalysis())
+    model = ModelPrediction(reducer, WilsonRadiusClassifier(0.3, POLICY.alpha, POLICY.lower_bound), folds=2)
+    engine = DataEngine(recipe=Recipe("pca", policy=POLICY), model=model, seed=seed, replaying=True)
+    order = np.random.default_rng(seed).permutation(len(data))
+    return collect(engine, ReplayCell(data, order), data, seed)
+
+
+def test_the_same_labels_counted_where_they_were_fitted_are_caught(make_data, proof_repeats: int) -> None:
+    streams = [noise_labels(make_data, seed, 600) for seed in range(proof_repeats)]
+    honest = [with_lda(True, data, seed) for seed, data in enumerate(streams)]
+    dishonest = [with_lda(False, data, seed) for seed, data in enumerate(streams)]
+    assert np.mean([certain(p) for p in honest]) <= BY_CHANCE
+    assert np.mean([certain(p) for p in dishonest]) > 5 * BY_CHANCE
+    assert error_rate(dishonest) > 1.5 * (1.0 - POLICY.lower_bound)
+
+
+def test_an_honest_engine_does_become_certain_where_the_trace_tells(make_data) -> None:
+    # Or silence would pass the null test.
+    played = with_lda(True, make_data(600, samples=100, noise=2.0), 0)
+    assert certain(played) > 150
+    assert error_rate([played]) <= 0.1

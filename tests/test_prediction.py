@@ -1,0 +1,291 @@
+"""The model prediction: no label is counted in an embedding that saw it, and states and processes carry it unchanged."""
+
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.naive_bayes import GaussianNB
+from sklearn.neighbors import NeighborhoodComponentsAnalysis
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from dengine import (
+    Action,
+    CrossFitted,
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    ReplayCell,
+    WilsonRadiusClassifier,
+    wilson_interval,
+)
+from dengine.errors import SettingError
+from dengine.folds import content_fold
+from dengine.prediction import Model
+from dengine.reducers.base import OneSpace, in_spaces, uses_labels
+
+
+def classifier(**changes) -> WilsonRadiusClassifier:
+    return WilsonRadiusClassifier(**{"radius": 0.5, "alpha": 0.1, "lower_bound": 0.9} | changes)
+
+
+def lda(folds: int = 2) -> ModelPrediction:
+    return ModelPrediction(LinearDiscriminantAnalysis(), classifier(), folds)
+
+
+# ---------------------------------------------------------------------------------------------- honest counting
+
+
+@pytest.mark.parametrize("folds", [2, 3])
+@pytest.mark.parametrize(
+    "reducer",
+    [LinearDiscriminantAnalysis(), NeighborhoodComponentsAnalysis(n_components=2, max_iter=5, random_state=0)],
+    ids=["lda", "nca"],
+)
+def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(reducer, folds: int, make_data) -> None:
+    data = make_data(120, samples=40)
+    queries = make_data(15, samples=40, seed=9).X[:, None, :]
+    fold = content_fold(data.X, folds)
+    honest = ModelPrediction(reducer, classifier(), folds).fit(data.X, data.y)
+    for k in range(folds):
+        y, inside = data.y.copy(), fold == k
+        y[inside] = np.random.default_rng(k).permutation(y[inside])
+        other = ModelPrediction(reducer, classifier(), folds).fit(data.X, y)
+        np.testing.assert_array_equal(other.spaces.embed(queries)[:, k], honest.spaces.embed(queries)[:, k])
+        points, spaces = honest.index.ring.points, honest.index.ring.spaces
+        n = len(data)
+        assert (spaces[:n].numpy() == fold).all()
+        np.testing.assert_array_equal(other.index.ring.points[:, :n][:, inside], points[:, :n][:, inside])
+        assert other.scale[k] == honest.scale[k]
+        moved = [j for j in range(folds) if j != k]
+        assert not np.array_equal(other.spaces.embed(queries)[:, moved], honest.spaces.embed(queries)[:, moved])
+
+
+def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) -> None:
+    model = lda().fit(data.X[:150], data.y[:150])
+    for x, y in zip(data.X[150:], data.y[150:], strict=True):
+        model.add(x, y)
+    ring, fold = model.index.ring, content_fold(data.X, 2)
+    assert (ring.spaces[:200].numpy() == fold).all()
+    assert (ring.labels[:200].numpy() == data.y).all()
+    own = model.spaces.embed_own(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
+    np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, own, atol=1e-5)
+
+
+def test_counts_are_summed_over_the_spaces_by_brute_force(data: Dataset) -> None:
+    model = lda(3).fit(data.X[:150], data.y[:150])
+    Z = model.spaces.embed(data.X[150:, None, :]) / model.scale[None, :, None]
+    ring = model.index.ring
+    points, spaces, labels = (a[..., :150].numpy() for a in (ring.points, ring.spaces, ring.labels))
+    near = ((Z[:, spaces] - points.T[None]) ** 2).sum(axis=2) <= 0.5**2
+    n_success, n_failure = model.count(data.X[150:])
+    np.testing.assert_array_equal(n_success, (near & (labels == 1)).sum(axis=1))
+    np.testing.assert_array_equal(n_failure, (near & (labels == 0)).sum(axis=1))
+    assert n_success.sum() > 0
+
+
+def test_duplicates_of_a_trace_never_train_the_space_they_are_counted_in(data: Dataset) -> None:
+    twice = np.concatenate([data.X, data.X])
+    fold = content_fold(twice, 2)
+    spaces = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], np.tile(data.y, 2), fold)
+    flipped = np.concatenate([data.y, np.where(fold[:200] == 0, 1 - data.y, data.y)])
+    other = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], flipped, fold)
+    np.testing.assert_array_equal(spaces.embed(data.X[:, None, :])[:, 0], other.embed(data.X[:, None, :])[:, 0])
+
+
+class _Nosy(TransformerMixin, BaseEstimator):
+    """Takes labels if it is handed any, and does not say so."""
+
+    def fit(self, X, y=None):
+        assert y is None, "a label-free reducer was handed labels"
+        self.n_ = len(X)
+        return self
+
+    def transform(self, X):
+        return np.asarray(X)[:, :2]
+
+
+def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Dataset) -> None:
+    model = ModelPrediction(_Nosy(), classifier()).fit(data.X, data.y)
+    assert model.n_spaces == 1
+    assert model.spaces.reducer.n_ == 200
+
+
+def test_the_tag_decides_between_one_space_and_cross_fitting() -> None:
+    assert uses_labels(LinearDiscriminantAnalysis())
+    assert not uses_labels(PCA())
+    assert isinstance(in_spaces(LinearDiscriminantAnalysis(), 3), CrossFitted)
+    assert isinstance(in_spaces(PCA(), 3), OneSpace)
+
+
+def test_a_pipeline_that_uses_labels_works_when_it_is_cross_fitted_by_hand(data: Dataset) -> None:
+    reducer = CrossFitted(make_pipeline(StandardScaler(), LinearDiscriminantAnalysis()), folds=2)
+    model = ModelPrediction(reducer, classifier()).fit(data.X[:150], data.y[:150])
+    decided = model.decide(data.X[150:])
+    assert (decided[data.y[150:] == 0] != Action.ACCEPT).all()
+    assert (decided == Action.ACCEPT).sum() > 20
+
+
+def test_scikit_learns_pca_works_unchanged(data: Dataset) -> None:
+    model = ModelPrediction(PCA(2), classifier()).fit(data.X[:150], data.y[:150])
+    decided = model.decide(data.X[150:])
+    assert (decided[data.y[150:] == 0] != Action.ACCEPT).all()
+    assert (decided == Action.ACCEPT).sum() > 20
+
+
+def test_one_class_outside_a_fold_is_a_setting_error_that_says_so(data: Dataset) -> None:
+    with pytest.raises(SettingError, match="Expected both classes outside fold 0"):
+        lda().fit(data.X[:20], np.ones(20))
+    with pytest.raises(SettingError, match="folds >= 2"):
+        lda(folds=1).fit(data.X, data.y)
+
+
+# ------------------------------------------------------------------------------------------------- the model itself
+
+
+def test_it_is_a_model_by_the_protocol(data: Dataset) -> None:
+    assert isinstance(ModelPrediction("pca"), Model)
+
+
+def test_bounds_follow_from_counts_and_decisions_from_bounds(data: Dataset) -> None:
+    model = lda().fit(data.X[:150], data.y[:150])
+    lower, upper = model.predict_interval(data.X[150:])
+    np.testing.assert_allclose((lower, upper), wilson_interval(*model.count(data.X[150:]), 0.1), atol=1e-12)
+    np.testing.assert_array_equal(model.decide(data.X[150:]), Policy(0.1, 0.9).actions(lower, upper))
+
+
+@pytest.mark.parametrize("reducer", ["pca", LinearDiscriminantAnalysis()], ids=["pca", "lda"])
+def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
+    newtons = ModelPrediction(reducer, classifier()).fit(data.X[:150], data.y[:150])
+    hashes_of_newtons = newtons.index.ring.spaces[:150].numpy()
+    radii = np.linalg.norm(newtons.index.ring.points[:, :150].numpy(), axis=0)
+    for k in range(newtons.n_spaces):
+        own = newtons.index.ring.points[:, :150].numpy().T[hashes_of_newtons == k]
+        assert np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean()) == pytest.approx(1.0, rel=1e-4)
+    assert radii.max() < 100
+
+
+def test_an_unfitted_model_says_what_to_do(data: Dataset) -> None:
+    with pytest.raises(ValueError, match=r"call fit\(X, y\) first"):
+        ModelPrediction("pca").decide(data.X)
+
+
+def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None:
+    parent = ModelPrediction("pca", classifier()).fit(data.X[:100], data.y[:100])
+    before = parent.judge_many(data.X[100:])
+    child = parent.successor().fit(data.X[50:], 1 - data.y[50:])
+    child.add(data.X[0], 1)
+    assert parent.judge_many(data.X[100:]) == before
+    assert child.judge_many(data.X[100:]) != before
+
+
+# -------------------------------------------------------------------------------------------- states and processes
+
+
+def fitted(name: str, data: Dataset) -> ModelPrediction:
+    reducers = {"pca": "pca", "lda": LinearDiscriminantAnalysis()}
+    model = ModelPrediction(reducers[name], classifier()).fit(data.X[:120], data.y[:120])
+    for x, y in zip(data.X[120:150], data.y[120:150], strict=True):
+        model.add(x, y)
+    return model
+
+
+def test_a_state_restores_every_judgement_bit_for_bit(data: Dataset) -> None:
+    model = fitted("pca", data)
+    restored = ModelPrediction("pca", classifier()).set_state(model.get_state())
+    assert restored.judge_many(data.X) == model.judge_many(data.X)
+    restored.add(data.X[160], 1)
+    model.add(data.X[160], 1)
+    assert restored.judge_many(data.X) == model.judge_many(data.X)
+
+
+def test_a_state_is_plain_arrays_and_a_copy(data: Dataset) -> None:
+    model = fitted("pca", data)
+    state = model.get_state()
+    assert all(isinstance(v, np.ndarray) and not v.dtype.hasobject for v in state.values())
+    kept = {name: v.copy() for name, v in state.items()}
+    model.add(data.X[160], 1)
+    for name, value in kept.items():
+        np.testing.assert_array_equal(state[name], value, err_msg=name)
+
+
+def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements(data: Dataset) -> None:
+    model = fitted("lda", data)
+    state = model.get_state()
+    assert not any(name.startswith("reducer.") for name in state)
+    restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
+    assert restored.judge_many(data.X) == model.judge_many(data.X)
+
+
+@pytest.mark.parametrize("name", ["pca", "lda"])
+def test_a_pickled_model_judges_the_same(name: str, data: Dataset) -> None:
+    model = fitted(name, data)
+    assert pickle.loads(pickle.dumps(model)).judge_many(data.X) == model.judge_many(data.X)
+
+
+def test_a_model_trained_in_a_spawned_process_judges_as_one_trained_here(data: Dataset) -> None:
+    here = lda().fit(data.X, data.y)
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        there = pool.submit(lda().fit, data.X, data.y).result()
+    assert there.judge_many(data.X) == here.judge_many(data.X)
+
+
+# ---------------------------------------------------------------------------------------------------- a rival
+
+
+class NaiveBayes:
+    """A rival method: no neighbours, its probability is its bound."""
+
+    def __init__(self) -> None:
+        self.model, self.seen = GaussianNB(), []
+
+    def fit(self, X, y):
+        self.model.fit(X.reshape(len(X), -1), y)
+        self.n_ = np.bincount(y, minlength=2)
+
+    def add(self, x, y):
+        self.seen.append(int(y))
+
+    def count(self, X):
+        return np.full(len(X), self.n_[1]), np.full(len(X), self.n_[0])
+
+    def predict_interval(self, X):
+        p = self.model.predict_proba(X.reshape(len(X), -1))[:, 1]
+        return p, p
+
+    def decide(self, X):
+        return Policy(0.1, 0.9).actions(*self.predict_interval(X))
+
+
+def test_a_rival_method_runs_in_the_same_loop(data: Dataset) -> None:
+    assert isinstance(NaiveBayes(), Model)
+    rival = NaiveBayes()
+    engine = DataEngine(model=rival, retrain_every=40)
+    cycles = list(engine.run(ReplayCell(data), len(data)))
+    versions = [c.decision.model_version for c in cycles]
+    assert versions == sorted(versions)
+    assert versions[-1] == sum(c.retrain is not None and c.retrain.accepted for c in cycles) > 0
+    certain = np.array([c.decision.action is not Action.VERIFY for c in cycles])
+    right = np.array([(c.decision.action is Action.ACCEPT) == bool(y) for c, y in zip(cycles, data.y, strict=True)])
+    assert certain.sum() > 80
+    assert right[certain].mean() > 0.95
+    assert not hasattr(rival, "n_")  # only copies were trained
+    assert len(engine.model.seen) == sum(
+        c.success is not None for c in cycles[[c.retrain is not None for c in cycles].index(True) + 1 :]
+    )
+
+
+def test_a_rival_that_predicts_by_neighbours_decides_as_the_engines_own(data: Dataset) -> None:
+    recipe = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9))
+    own = list(DataEngine(recipe=recipe, replaying=True).run(ReplayCell(data), len(data)))
+    rival = ModelPrediction("pca", WilsonRadiusClassifier(0.5, 0.1, 0.9))
+    same = list(DataEngine(recipe=recipe, model=rival, replaying=True).run(ReplayCell(data), len(data)))
+    assert [c.decision.action for c in same] == [c.decision.action for c in own]
+    assert [(c.decision.lower, c.decision.upper) for c in same] == [(c.decision.lower, c.decision.upper) for c in own]

@@ -1,0 +1,162 @@
+"""Recorded streams through the same loop: exact under a seed, and counted right."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from dengine import Action, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
+from dengine.errors import DataError, SettingError
+from dengine.experiments.grid import run_replays
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
+TIMES = ("decide_seconds", "retrain_seconds", "retrains")
+
+
+def same(one: Replay, other: Replay) -> None:
+    for f in fields(Replay):
+        if f.name not in TIMES:
+            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
+    for a, b in zip(one.retrains, other.retrains, strict=True):
+        assert replace(a, seconds=0.0) == replace(b, seconds=0.0)
+
+
+@pytest.fixture(scope="module")
+def played(data: Dataset) -> Replay:
+    return replay(data, RECIPE, seed=1)
+
+
+def test_a_seed_repeats_exactly(data: Dataset, played: Replay) -> None:
+    same(replay(data, RECIPE, seed=1), played)
+
+
+def test_an_audited_replay_repeats_exactly_too(data: Dataset) -> None:
+    audited = RECIPE.with_policy(audit_rate=0.3)
+    same(replay(data, audited, seed=2), replay(data, audited, seed=2))
+
+
+def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data: Dataset, played: Replay) -> None:
+    hurried = replay(data, replace(RECIPE, budget=1e-9), seed=1)
+    same(replace(hurried, recipe=RECIPE), played)
+
+
+def test_another_seed_is_another_order(data: Dataset, played: Replay) -> None:
+    other = replay(data, RECIPE, seed=2)
+    assert not np.array_equal(other.truth, played.truth)
+    assert other.truth.sum() == played.truth.sum()
+
+
+def test_unshuffled_plays_the_stream_as_recorded(data: Dataset) -> None:
+    for seed in (0, 1):
+        np.testing.assert_array_equal(replay(data, RECIPE, seed, shuffle=False).truth, data.y.astype(bool))
+
+
+def test_fewer_cycles_are_the_beginning_of_the_same_pass(data: Dataset, played: Replay) -> None:
+    short = replay(data, RECIPE, seed=1, cycles=90)
+    np.testing.assert_array_equal(short.action, played.action[:90])
+    np.testing.assert_array_equal(short.lower, played.lower[:90])
+    for cycles in (0, 201):
+        with pytest.raises(SettingError, match="Expected 1 to 200 cycles"):
+            replay(data, RECIPE, cycles=cycles)
+
+
+def test_actions_follow_from_the_recorded_bounds(played: Replay) -> None:
+    actions = RECIPE.policy.actions(played.lower, played.upper)
+    np.testing.assert_array_equal(played.action, actions.astype(str))
+    lower, upper = RECIPE.policy.bound(played.n_success, played.n_failure)
+    np.testing.assert_allclose((played.lower, played.upper), (lower, upper), atol=1e-12)
+
+
+def test_the_summary_counts_what_happened(played: Replay) -> None:
+    row, pairs = played.summary(), list(zip(played.action, played.truth, strict=True))
+    assert row["accepted"] == sum(a == "accept" for a, _ in pairs) > 50
+    assert row["rejected"] == sum(a == "reject" for a, _ in pairs)
+    assert row["certain"] == row["accepted"] + row["rejected"]
+    assert row["false_positive"] == sum(a == "accept" and not y for a, y in pairs)
+    assert row["false_negative"] == sum(a == "reject" and bool(y) for a, y in pairs)
+    assert row["precision"] == pytest.approx(1 - row["false_positive"] / row["accepted"])
+    assert row["saved_s"] == 5.0 * row["certain"]
+    assert (row["cycles"], row["seed"], row["retrains"]) == (200, 1, len(played.retrains))
+
+
+def test_what_was_never_decided_has_no_precision(data: Dataset) -> None:
+    row = replay(data, RECIPE, cycles=30).summary()
+    assert row["certain"] == 0
+    assert np.isnan([row["precision"], row["npv"], row["retrain_max_s"]]).all()
+
+
+def test_positions_are_kept_where_a_model_embedded_the_trace(played: Replay) -> None:
+    before = 40
+    assert played.position.shape == (200, 2)
+    assert np.isnan(played.position[:before]).all()
+    assert np.isfinite(played.position[before:]).all()
+
+
+def test_confirmed_parts_are_learned_from(data: Dataset, played: Replay) -> None:
+    told = replay(data, RECIPE, seed=1, confirm=True)
+    assert told.n_success[-1] + told.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
+
+
+def test_progress_is_told_cycle_by_cycle(data: Dataset) -> None:
+    seen: list[int] = []
+    replay(data, RECIPE, cycles=20, on_cycle=seen.append)
+    assert seen == list(range(1, 21))
+
+
+# --------------------------------------------------------------------------------------------------------- grids
+
+
+def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:
+    table = run_grid(data, [RECIPE], (0.1, 0.5), (0.8, 0.9), ("wilson", "binomial"), repeats=2, n_jobs=1, cycles=80)
+    keys = ["recipe", "interval", "alpha", "lower_bound", "seed"]
+    assert len(table) == 16
+    assert len(table.drop_duplicates(keys)) == 16
+    assert set(table["seed"]) == {0, 1}
+    row = table.query("interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9 and seed == 1").iloc[0]
+    alone = replay(data, RECIPE, seed=1, cycles=80).summary()
+    assert {k: row[k] for k in ("certain", "accepted", "rejected")} == {
+        k: alone[k] for k in ("certain", "accepted", "rejected")
+    }
+
+
+def test_parallel_replays_equal_serial_ones(data: Dataset) -> None:
+    serial = run_replays(data, [RECIPE], (0, 1), cycles=80)
+    for one, other in zip(serial, run_replays(data, [RECIPE], (0, 1), cycles=80, n_jobs=2), strict=True):
+        same(one, other)
+
+
+# ------------------------------------------------------------------------------------------------------ the cell
+
+
+def test_a_replay_cell_plays_its_order_and_says_when_all_is_played(data: Dataset) -> None:
+    cell = ReplayCell(data, np.array([5, 3]))
+    np.testing.assert_array_equal(cell.insert(), data.X[5])
+    assert cell.verify() == bool(data.y[5])
+    np.testing.assert_array_equal(cell.insert(), data.X[3])
+    with pytest.raises(IndexError, match="has 2 cycles, and all were played"):
+        cell.insert()
+
+
+@pytest.mark.parametrize(
+    ("label", "confirm", "outcome"),
+    [
+        (0, False, Outcome.STOPPED),
+        (0, True, Outcome.STOPPED),
+        (1, False, Outcome.UNKNOWN),
+        (1, True, Outcome.CONFIRMED),
+    ],
+)
+def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(label, confirm, outcome, data) -> None:
+    cell = ReplayCell(data, np.flatnonzero(data.y == label), confirm)
+    cell.insert()
+    assert cell.proceed() is outcome
+
+
+def test_a_pair_of_arrays_replays_as_a_dataset_does(data: Dataset, played: Replay) -> None:
+    np.testing.assert_array_equal(replay((data.X, data.y), RECIPE, seed=1).action, played.action)
+    with pytest.raises(DataError, match="neither"):
+        replay("no-such-set", RECIPE)
+
+
+def test_the_actions_are_the_three_words(played: Replay) -> None:
+    assert set(played.action) <= {str(a) for a in Action}
