@@ -116,7 +116,13 @@ def test_a_cell_without_a_clock_has_no_rate_and_one_panel_less() -> None:
     log = log_of(None)
     assert log.summary()["parts_per_hour"] is None
     assert len(run_picture(log).axes) == 2
-    assert len(run_picture(log_of(np.arange(1.0, 101.0)), verify_s=5.0).axes) == 3
+    assert len(run_picture(log_of(np.arange(1.0, 101.0))).axes) == 3
+
+
+def test_a_run_that_verified_every_part_lies_on_its_own_baseline() -> None:
+    log = RunLog(np.array(["verify"] * 50), np.ones(50), np.zeros(50, dtype=bool), 52.0 * np.arange(1, 51), ())
+    run, baseline = run_picture(log).axes[2].lines
+    np.testing.assert_allclose(run.get_ydata(), baseline.get_ydata())
 
 
 def test_every_figure_is_written_as_a_png_without_pyplot(tmp_path) -> None:

@@ -90,7 +90,7 @@ def _report(log: RunLog, cell: Cell, kind: str, title: str, out: Path | None, as
     total, stretches = log.summary(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst = max((r.seconds for r in log.retrains), default=None)
-    files = _save(log, cell, title, out) if out is not None else []
+    files = _save(log, title, out) if out is not None else []
     if as_json:
         result = {"verb": "run", "title": title, "simulated": kind == "simulated", "total": total, "stretches": stretches}
         write_json(result | {"cell": clock, "retrains": len(log.retrains), "retrain_max_s": worst, "files": files})
@@ -125,14 +125,13 @@ def _table(rows: list[dict[str, Any]], title: str) -> Any:
     return table
 
 
-def _save(log: RunLog, cell: Cell, title: str, out: Path) -> list[Path]:
+def _save(log: RunLog, title: str, out: Path) -> list[Path]:
     import pandas as pd
 
     from ..experiments.figures import run_picture, save
     from ..experiments.tables import write_csv
 
-    verify_s = getattr(getattr(cell, "parameters", None), "verify_s", None)
     columns = {"action": log.action, "truth": log.truth, "stopped": log.stopped}
     frame = pd.DataFrame(columns | ({} if log.clock_s is None else {"clock_s": log.clock_s}))
     frame.insert(0, "cycle", range(1, len(log) + 1))
-    return [write_csv(frame, out / "run.csv"), save(run_picture(log, title, verify_s=verify_s), out / "run.png")]
+    return [write_csv(frame, out / "run.csv"), save(run_picture(log, title), out / "run.png")]

@@ -137,11 +137,10 @@ def _scatter(axes: Axes, z: Floats, kinds: NDArray[Any], marks: Mapping[Any, tup
     axes.legend(loc="best", frameon=True, framealpha=0.9)
 
 
-def run_picture(log: RunLog, title: str = "", window: int = 100, verify_s: float | None = None) -> Figure:
-    """A live run: verified share, errors so far and, with a clock, parts an hour.
+def run_picture(log: RunLog, title: str = "", window: int = 100) -> Figure:
+    """A live run: verified share, errors so far and, with a clock, parts an hour."""
+    from matplotlib.ticker import MaxNLocator
 
-    verify_s : seconds of a check; draws what verifying every part would have given on the same clock.
-    """
     window = min(window, max(1, len(log) // 3))
     figure, axes = _axes(2 if log.clock_s is None else 3, (9.0, 6.0 if log.clock_s is None else 8.5))
     x = np.arange(1, len(log) + 1)
@@ -153,25 +152,24 @@ def run_picture(log: RunLog, title: str = "", window: int = 100, verify_s: float
         x, np.cumsum(log.false_negative), color=GREEN, where="post", linestyle="--", label="good part rejected (FN)"
     )
     axes[1].set(ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * max(log.false_positive.sum(), log.false_negative.sum())))
-    axes[1].yaxis.get_major_locator().set_params(integer=True)
+    axes[1].yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     _legend(axes[1])
     if log.clock_s is not None:
-        _draw_rate(axes[2], log, log.clock_s, window, verify_s)
+        _draw_rate(axes[2], log, log.clock_s, window)
     axes[-1].set(xlabel="cycle")
     figure.suptitle(title)
     return figure
 
 
-def _draw_rate(axes: Axes, log: RunLog, clock_s: Floats, window: int, verify_s: float | None) -> None:
+def _draw_rate(axes: Axes, log: RunLog, clock_s: Floats, window: int) -> None:
     x, took = np.arange(1, len(log) + 1), np.diff(clock_s, prepend=0.0)
     rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
-    settled = x >= min(window, len(log))  # a rate over few cycles is mostly luck
+    settled = x >= window  # a rate over few cycles is mostly luck
     axes.plot(x[settled], rate[settled], color=BLUE, label="this run")
-    if verify_s is not None:
-        # A cycle's shortest time is one without check or stop; every part is then checked, and every good one goes on.
-        always = (
-            3600 * sliding_sum(log.truth == 1.0, window) / (sliding_sum(np.ones(len(x)), window) * (took.min() + verify_s))
-        )
+    if log.verified.any():
+        # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
+        seconds = float(np.median(took[log.verified])) * sliding_sum(np.ones(len(x)), window)
+        always = 3600 * sliding_sum(log.truth == 1.0, window) / seconds
         axes.plot(x[settled], always[settled], color=GREY, linestyle=":", label="had every part been verified")
     axes.set(ylabel=f"good parts/h, last {window}")
     _legend(axes)
