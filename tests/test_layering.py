@@ -1,0 +1,169 @@
+"""The layers: who may import whom, who may import what is heavy, and how long a file may grow."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import dengine
+
+ROOT = Path(dengine.__file__).parent
+
+LAYER = {  # by module, or by package for all that is in it; the longest name that fits counts
+    "dengine": 0,  # __init__: the version, and lazy names
+    "errors": 0,
+    "records": 0,
+    "bounds": 1,
+    "certificate": 1,
+    "datasets": 1,
+    "folds": 1,
+    "judge": 1,
+    "neighbors": 1,
+    "policy": 1,
+    "recipe": 1,
+    "traces": 1,
+    "reducers": 2,
+    "cells": 3,
+    "classifier": 3,
+    "core": 3,
+    "decider": 3,
+    "foreign": 3,
+    "memory_store": 3,
+    "prediction": 3,
+    "sql_database": 3,
+    "sql_engine": 3,
+    "sql_rows": 3,
+    "sql_store": 3,
+    "sql_tables": 3,
+    "store": 3,
+    "store_checks": 3,
+    "stored": 3,
+    "window": 3,
+    "factory": 4,
+    "resuming": 4,
+    "retraining": 4,
+    "engine": 5,
+    "experiments": 6,
+    "export": 6,
+    "exported": 6,
+    "importing": 6,
+    "cli": 7,
+}
+HEAVY = {  # at the top of a module only in those dedicated to it, which are themselves imported where they are used
+    "umap": (),
+    "mujoco": ("cells.world",),
+    "matplotlib": ("experiments.figures",),
+    "sqlalchemy": ("sql_database", "sql_engine", "sql_rows", "sql_store", "sql_tables"),
+    "pandas": (),
+    "torchmetrics": (),
+    "onnxruntime": (),
+}
+LINES = 330
+LONGER = {"engine": 360}  # module: lines; the loop, its public face and their contracts in one sitting
+
+MODULES = {
+    ".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__").replace("__init__", "dengine"): p
+    for p in sorted(ROOT.rglob("*.py"))
+}
+
+
+def typing_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def nodes(tree: ast.AST, functions: bool = True) -> Iterator[ast.AST]:
+    """Every node that runs: without blocks for type checkers; without functions, those that run on import."""
+    for node in ast.iter_child_nodes(tree):
+        if typing_only(node) or (not functions and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)):
+            continue
+        yield node
+        yield from nodes(node, functions)
+
+
+def resolve(name: str) -> str:
+    """The module that a dotted name under dengine means: `cells.replay.ReplayCell` -> `cells.replay`."""
+    while name and name not in MODULES:
+        name = name.rpartition(".")[0]
+    return name or "dengine"
+
+
+def imports(module: str) -> set[str]:
+    """Modules of dengine that a module imports, at its top or within its functions."""
+    path = MODULES[module]
+    package = path.relative_to(ROOT).parts[:-1]
+    found = set()
+    for node in nodes(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            base = (*package[: len(package) - node.level + 1], node.module or "") if node.level else (node.module or "",)
+            if node.level or base[0].split(".")[0] == "dengine":
+                full = ".".join(part for part in base if part).removeprefix("dengine").lstrip(".")
+                found |= {resolve(f"{full}.{alias.name}".lstrip(".")) for alias in node.names}
+        elif isinstance(node, ast.Import):
+            ours = [a.name for a in node.names if a.name.split(".")[0] == "dengine"]
+            found |= {resolve(name.removeprefix("dengine").lstrip(".")) for name in ours}
+    return found - {module}
+
+
+def layer(module: str) -> int:
+    name = module
+    while name and name not in LAYER:
+        name = name.rpartition(".")[0]
+    assert name, f"dengine/{module} has no layer yet: give it one in tests/test_layering.py, as in the design"
+    return LAYER[name]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_module_imports_only_from_its_own_layer_or_lower_ones(module: str) -> None:
+    above = {other: layer(other) for other in imports(module) if layer(other) > layer(module)}
+    assert not above, f"{module} (layer {layer(module)}) imports {above}"
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    # A package's __init__ names what is in it; whoever imports from inside the package does not mean the __init__.
+    order = list(TopologicalSorter({m: imports(m) for m in MODULES}).static_order())  # raises CycleError
+    assert set(order) == set(MODULES)
+
+
+def test_the_parser_sees_the_imports_that_are_there() -> None:
+    assert {"judge", "neighbors", "policy", "records"} <= imports("classifier")
+    assert "reducers.base" in imports("core")
+    assert "errors" in imports("reducers.linear")
+    assert "sql_store" in imports("store")  # within a function
+    assert imports("dengine") == set()  # for type checkers alone
+
+
+@pytest.mark.parametrize("heavy", HEAVY)
+def test_what_is_heavy_is_imported_where_it_is_used(heavy: str) -> None:
+    at_the_top = set()
+    for module, path in MODULES.items():
+        for node in nodes(ast.parse(path.read_text(encoding="utf-8")), functions=False):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            names += [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            if heavy in {name.split(".")[0] for name in names}:
+                at_the_top.add(module)
+    assert at_the_top <= set(HEAVY[heavy])
+
+
+def test_an_engine_with_pca_in_memory_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, numpy as np; from dengine import DataEngine; e = DataEngine('pca', retrain_every=10)\n"
+        "for i in range(12): e.report(e.decide(np.random.default_rng(i).normal(size=30)).id, i % 2 == 0)\n"
+        "assert e.version == 1\n"
+        f"print(*[m for m in {[m for m in HEAVY if m != 'pandas']} if m in sys.modules])"  # scikit-learn may load pandas
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_file_is_one_idea_long(module: str) -> None:
+    lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+    assert lines <= LONGER.get(module, LINES), f"{module} has {lines} lines: it is two ideas"
+
+
+def test_no_exception_outlives_its_reason() -> None:
+    assert {m for m in LONGER if len(MODULES[m].read_text(encoding="utf-8").splitlines()) <= LINES} == set()
