@@ -188,6 +188,10 @@ class _Native(OneSpace):
         """(n, C, T) -> (n, d)."""
         return _float32(self.reducer.embed_own(X, folds))
 
+    def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
+        """(n, C, T) -> (n, d), as `embed_own`; an `embedding_` that it may have is its own affair."""
+        return self.embed_own(X, folds)
+
     def transform(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, d)."""
         return _float32(self.reducer.transform(X))
