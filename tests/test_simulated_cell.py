@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 from dataclasses import fields, replace
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -101,6 +102,13 @@ def test_the_cell_replays_what_simulate_makes() -> None:
     for trace, label in zip(traces.X, traces.y, strict=True):
         np.testing.assert_array_equal(cell.insert(), trace)
         assert cell.verify() == bool(label)
+
+
+def test_the_cell_still_makes_the_bundled_traces() -> None:
+    with (files("dengine") / "data" / "insertion.npz").open("rb") as file, np.load(file) as stored:
+        bundled, cycles, seed = stored["X"][:5] * stored["scale"], stored["cycle"][:5], int(stored["seed"])
+    made = np.stack([insert_once(CellParameters(), seed, int(cycle)).trace for cycle in cycles])
+    assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
 
 
 def test_quotas_keep_the_first_of_each_label_in_order(monkeypatch: pytest.MonkeyPatch) -> None:

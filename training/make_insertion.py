@@ -27,6 +27,7 @@ from dengine.cells.scenarios import SCENARIOS
 from dengine.datasets import Dataset, load_dataset
 
 SUCCESSES, FAILURES = 803, 700  # as in the paper
+SEED = 1503  # not 0: a cell run on the default seed must not meet the bundled parts again
 SHOWN = 30  # traces a cause
 NEAR_MM = 4.0
 TITLES = {"none": "success"}
@@ -137,7 +138,8 @@ paper that the method comes from ({successes} successes, {failures} failures); i
 
 ## How it was made
 
-    python training/make_insertion.py --out dengine/data --seed {seed}
+    python training/make_insertion.py --out dengine/data --seed {seed}       # this file, its pictures and this card
+    dengine simulate --n {cycles} --seed {seed} --out traces.npz                        # the same cycles, before the choice below
 
 The nominal `SimulatedCell` ran until it had {successes} successes and {failures} failures, which took {cycles} cycles;
 the first ones of each label were kept, in the order of their cycles. Trace *i* of a seed depends on (seed, cycle) alone,
@@ -251,7 +253,7 @@ def write_card(out: Path, steps: int, jobs: int) -> str:
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), default=Path("dengine/data"), help="Folder to write to.")
-@click.option("--seed", default=0, help="Seed of the simulated cell.")
+@click.option("--seed", default=SEED, show_default=True, help="Seed of the simulated cell.")
 @click.option("--steps", default=200, help="Insertions to repeat at half the time step.")
 @click.option("--jobs", default=-1, help="Processes, as joblib counts them.")
 @click.option("--card-only", is_flag=True, help="Keep the traces that are there; measure and draw them anew.")
