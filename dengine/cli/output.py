@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -37,7 +38,9 @@ def write_json(result: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value that `json` takes: paths and enums as text, NaN and infinities as None."""
+    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

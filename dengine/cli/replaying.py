@@ -125,22 +125,21 @@ def _parts(replays: list[Replay], size: int) -> list[list[Replay]]:
 def _report(
     verb: str, by_recipe: dict[str, list[Replay]], data: str, in_order: bool, out: Path | None, as_json: bool
 ) -> None:
-    from ..experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line
+    from ..experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, retrain_line
 
     named = [(name, each) for name, replays in by_recipe.items() for each in replays]
     frame = frame_of([each for _, each in named], [name for name, _ in named])
     rows = [row | {"promise_kept": promise_kept(row)} for row in pool(frame)]
     files = _save(frame, by_recipe, _title(data, by_recipe, in_order), out) if out is not None else []
-    worst = max(named, key=lambda pair: max(pair[1].retrain_seconds, default=0.0))
-    seconds = max(worst[1].retrain_seconds, default=0.0)
+    retrains = {name: [r for each in replays for r in each.retrains] for name, replays in by_recipe.items()}
     if as_json:
-        write_json(
-            {"verb": verb, "data": data, "in_order": in_order, "rows": rows, "retrain_max_s": seconds, "files": files}
-        )
+        dropped = {name: sum(not r.accepted for r in reports) for name, reports in retrains.items()}
+        rows = [row | {"retrains_dropped": dropped[row["recipe"]]} for row in rows]
+        write_json({"verb": verb, "data": data, "in_order": in_order, "rows": rows, "files": files})
         return
     show(pooled_table(rows, _title(data, by_recipe, in_order)))
     show(*(promise_line(row) for row in rows))
-    show(f"Worst retrain: {seconds:.3f} s ({worst[0]}, seed {worst[1].seed}).")
+    show(*(f"{name}: {retrain_line(reports)}" for name, reports in retrains.items()))
     show(*(f"Wrote {path}" for path in files))
 
 

@@ -87,13 +87,15 @@ CELLS = {"simulated": _simulated, "replay": _recorded}
 
 
 def _report(log: RunLog, cell: Cell, kind: str, title: str, out: Path | None, as_json: bool) -> None:
+    from ..experiments.tables import retrain_line
+
     total, stretches = log.summary(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst = max((r.seconds for r in log.retrains), default=None)
     files = _save(log, title, out) if out is not None else []
     if as_json:
         result = {"verb": "run", "title": title, "simulated": kind == "simulated", "total": total, "stretches": stretches}
-        write_json(result | {"cell": clock, "retrains": len(log.retrains), "retrain_max_s": worst, "files": files})
+        write_json(result | {"cell": clock, "retrains": log.retrains, "retrain_max_s": worst, "files": files})
         return
     show(_table([*stretches, total], title))
     if clock is not None:
@@ -102,7 +104,7 @@ def _report(log: RunLog, cell: Cell, kind: str, title: str, out: Path | None, as
             f"verifying every part, {clock['stops']} stops and {clock['sent_back']} good parts sent back taken off; "
             f"{clock['escapes']} bad parts escaped in silence."
         )
-    show("No retrain." if worst is None else f"{len(log.retrains)} retrains, the worst in {worst:.3f} s.")
+    show(retrain_line(log.retrains))
     show(*(f"Wrote {path}" for path in files))
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import click
 
 from .options import RecipeChoice, data_options, example, json_option, read, recipe_options
@@ -34,6 +32,7 @@ def train(
     trained on. A store that has been used keeps its own recipe and seed.
     """
     from ..engine import DataEngine
+    from ..experiments.tables import retrain_line
     from ..importing import import_labelled, train_until_done
 
     dataset = read(data, samples)
@@ -44,23 +43,14 @@ def train(
         reports = train_until_done(engine, retrains, lambda report: advance(1))
         status, answering = engine.store.status(), engine.recipe
     if as_json:
-        write_json(
-            {"verb": "train", "store": store, "import": _fields(imported), "retrains": [_fields(r) for r in reports]}
-        )
+        write_json({"verb": "train", "store": store, "import": imported, "retrains": reports})
     else:
         resumed = "a used store" if imported.resumed else "a new store"
         show(
             f"Imported {imported.imported} traces into {resumed}, {imported.quarantined} more into quarantine; "
             f"{imported.known} were known from an earlier import.",
-            f"Trained {answering.reducer} on {reports[-1].n_traces} traces: version {reports[-1].version}, "
-            f"{len(reports)} retrain(s), worst {max(r.seconds for r in reports):.3f} s.",
+            f"Version {reports[-1].version} of {answering.reducer} answers. {retrain_line(reports)}",
             f"{store} holds {status['labels']} labels.",
         )
     if not reports[-1].accepted:
         raise click.ClickException(f"The last retrain was {reports[-1].reason}.")
-
-
-def _fields(record: Any) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    return asdict(record)

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..records import RetrainReport
 from .replay import Replay
 
 if TYPE_CHECKING:
@@ -122,6 +123,16 @@ _CELLS_OF: dict[str, Any] = {
     "decide µs\np50, p99": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
     "saved s\n ": lambda r: f"{r['saved_s']:.0f}\n",
 }
+
+
+def retrain_line(retrains: Sequence[RetrainReport]) -> str:
+    """How many retrains there were, the worst of them, and why candidates were dropped."""
+    if not retrains:
+        return "No retrain."
+    worst, dropped = max(r.seconds for r in retrains), [r for r in retrains if not r.accepted]
+    last = f"; {len(dropped)} dropped, the last for: {dropped[-1].reason.removeprefix('dropped: ')}" if dropped else ""
+    many = "" if len(retrains) == 1 else "s"
+    return f"{len(retrains)} retrain{many}, the worst in {worst:.3f} s{last}."
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path) -> Path:
