@@ -116,7 +116,7 @@ def report_step(check: StepCheck) -> str:
     median, most, largest = check.shift_mm
     return (
         f"{len(check.flipped_mm)} of {check.n} labels differ{f' ({moved})' if moved else ''}. The final height moves by "
-        f"{median:.1g} mm in the median, {most:.1g} mm at the 95th percentile and {largest:.1g} mm at most (a jammed part)"
+        f"{median:.1g} mm in the median, {most:.1g} mm at the 95th percentile and {largest:.1g} mm at most"
     )
 
 

@@ -138,8 +138,8 @@ paper that the method comes from ({successes} successes, {failures} failures); i
 
 ## How it was made
 
-    python training/make_insertion.py --out dengine/data --seed {seed}       # this file, its pictures and this card
-    dengine simulate --n {cycles} --seed {seed} --out traces.npz                        # the same cycles, before the choice below
+    python training/make_insertion.py --out dengine/data --seed {seed}   # this file, its pictures and this card
+    dengine simulate --n {cycles} --seed {seed} --out traces.npz         # the same cycles, before the choice below
 
 The nominal `SimulatedCell` ran until it had {successes} successes and {failures} failures, which took {cycles} cycles;
 the first ones of each label were kept, in the order of their cycles. Trace *i* of a seed depends on (seed, cycle) alone,
