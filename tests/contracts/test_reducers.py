@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 
-from dengine import REDUCERS, DataEngine, Dataset, ModelPrediction, Policy, ReplayCell, make_reducer
+from dengine import REDUCERS, DataEngine, Dataset, ModelPrediction, Policy, Recipe, ReplayCell, make_reducer
 from dengine.errors import SettingError
 from dengine.folds import content_fold
 from dengine.recipe import RECIPES
@@ -154,7 +154,13 @@ def test_its_state_is_plain_arrays_that_restore_it_bit_for_bit(name: str, fitted
 @every_reducer
 def test_an_engine_resumes_from_its_store_with_identical_decisions(name: str, make_data, tmp_path: Path) -> None:
     data, url = make_data(110, samples=100), str(tmp_path / "engine.db")
-    recipe = replace(RECIPES[name], params=QUICK.get(name, {}), policy=Policy(0.2, 0.8), retrain_every=70, max_steps=STEPS)
+    recipe = replace(
+        RECIPES.get(name, Recipe(name)),
+        params=QUICK.get(name, {}),
+        policy=Policy(0.2, 0.8),
+        retrain_every=70,
+        max_steps=STEPS,
+    )
 
     def asked(engine: DataEngine) -> list[tuple]:
         decided = [engine.decide(x) for x in data.X[90:]]
