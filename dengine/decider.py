@@ -57,7 +57,7 @@ class Decider(nn.Module):
         return action, reason, lower, upper, n_success, n_failure, z
 
     def forward(self, traces: Tensor) -> Many:
-        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure, all (B,), embedding (B, K, d)."""
+        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure: (B,); embedding (B, K, d)."""
         batch = traces.unsqueeze(0) if traces.dim() == 1 else traces
         n = batch.size(0)
         whole = torch.zeros(n, 4, dtype=torch.int64)
@@ -66,7 +66,8 @@ class Decider(nn.Module):
         for i in range(n):
             action, reason, lower, upper, n_success, n_failure, z = self.decide(batch[i])
             whole[i] = torch.tensor([action, reason, n_success, n_failure])
-            bounds[i] = torch.tensor([lower, upper], dtype=torch.float64)
+            bounds[i, 0].fill_(lower)  # assigned, or made a tensor, a scripted float goes through float32
+            bounds[i, 1].fill_(upper)
             embedding[i] = z
         return whole[:, 0], whole[:, 1], bounds[:, 0], bounds[:, 1], whole[:, 2], whole[:, 3], embedding
 

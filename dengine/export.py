@@ -103,6 +103,7 @@ def write_checked(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a file beside its name, sum it, and move both into place, so that a killed export leaves no half file."""
     partial = target.with_name(target.name + ".partial")
     try:
+        partial.touch()  # torch names an unwritable place in words of its own
         write(partial)
         digest = hashlib.sha256(partial.read_bytes()).hexdigest()
         sum_file(target).write_text(f"{digest}  {target.name}\n", encoding="ascii")

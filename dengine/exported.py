@@ -90,8 +90,11 @@ def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
         raise ExportError(
             f"{target} has its checksum but is no loadable TorchScript: {str(error).splitlines()[0]}."
         ) from error
-    model = ExportedModel(module, metadata)
-    _check_golden(model, target)
+    try:
+        model = ExportedModel(module, metadata)
+        _check_golden(model, target)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ExportError(f"{target} is not a dengine export: its description does not fit its module: {error}.") from error
     return model
 
 
@@ -121,9 +124,9 @@ def _metadata(content: bytes, path: Path) -> dict[str, Any]:
             metadata: dict[str, Any] = json.loads(archive.read(name))
     except (zipfile.BadZipFile, StopIteration, ValueError) as error:
         raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error
-    schema = metadata.get("schema")
+    schema = metadata.get("schema") if isinstance(metadata, dict) else None
     if not isinstance(schema, int) or schema > SCHEMA:
-        made_by = metadata.get("dengine", "an unknown version")
+        made_by = metadata.get("dengine", "an unknown version") if isinstance(metadata, dict) else "something else"
         raise ExportError(
             f"{path} has schema {schema}, written by dengine {made_by}; this one reads up to {SCHEMA}: upgrade it."
         )

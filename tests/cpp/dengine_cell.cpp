@@ -1,0 +1,107 @@
+// A cell's controller without Python: an exported file decides on traces from stdin.
+//
+//   dengine_cell model.ts < traces.csv                      one trace a line, samples separated by commas
+//   dengine_cell model.ts --binary < traces.f32             blocks of little-endian float32, a trace each
+//   dengine_cell model.ts --learn --journal cell.csv < labelled.csv    a line begins with its label: 1, 0 or nothing
+//
+// Out, a line a trace: action,reason,lower,upper,n_success,n_failure,embedding...,microseconds
+//
+// --learn takes a label in after the decision on its trace, and only where that was to verify: an accepted or a rejected
+// part was not measured, so a live cell has no such label. A line that cannot be read is answered with
+// verify,malformed; the program goes on and ends with exit code 1. So does a model that must not be used.
+#include <ATen/Parallel.h>
+#include <c10/core/InferenceMode.h>
+
+#include <chrono>
+#include <cstdio>
+#include <exception>
+#include <iostream>
+#include <limits>
+#include <optional>
+#include <string>
+
+#include "journal.hpp"
+#include "lines.hpp"
+#include "model.hpp"
+
+struct Options {
+    std::string model, journal;
+    bool binary = false, learn = false;
+};
+
+static std::optional<Options> parse_options(int argc, char** argv) {
+    Options options;
+    for (int i = 1; i < argc; ++i) {
+        const std::string word = argv[i];
+        if (word == "--binary") {
+            options.binary = true;
+        } else if (word == "--learn") {
+            options.learn = true;
+        } else if (word == "--journal" && i + 1 < argc) {
+            options.journal = argv[++i];
+        } else if (word.starts_with("--") || !options.model.empty()) {
+            return std::nullopt;
+        } else {
+            options.model = word;
+        }
+    }
+    const bool consistent = !(options.learn && options.binary) && (options.learn || options.journal.empty());
+    return !options.model.empty() && consistent ? std::optional(options) : std::nullopt;
+}
+
+static void print(const std::string& action, const std::string& reason, const Decision& decision, double microseconds) {
+    std::printf("%s,%s,%.17g,%.17g,%lld,%lld", action.c_str(), reason.c_str(), decision.lower, decision.upper,
+                static_cast<long long>(decision.n_success), static_cast<long long>(decision.n_failure));
+    for (const float z : decision.embedding) std::printf(",%.9g", z);
+    std::printf(",%.3f\n", microseconds);
+    std::fflush(stdout);  // the cell waits for this line
+}
+
+static int run(const Options& options) {
+    at::set_num_threads(1);  // steadier by far at these sizes
+    Model model(options.model);
+    const c10::InferenceMode guard;
+    const auto size = static_cast<std::size_t>(model.channels * model.samples);
+
+    std::optional<Journal> journal;
+    if (!options.journal.empty()) {
+        journal.emplace(options.journal, model.sum, size, [&](Input& known) { model.learn(known.samples.data(), *known.success); });
+    }
+    const Decision unknown{0, 0, 0.0, 1.0, 0, 0, std::vector<float>(model.width, std::numeric_limits<float>::quiet_NaN())};
+    int malformed = 0;
+    Input input;
+    for (long long number = 1; options.binary ? next_block(std::cin, size, input) : next_line(std::cin, options.learn, size, input); ++number) {
+        if (!input.fault.empty()) {
+            ++malformed;
+            std::fprintf(stderr, "dengine_cell: trace %lld is malformed: %s\n", number, input.fault.c_str());
+            print(model.actions[0], "malformed", unknown, 0.0);
+            continue;
+        }
+        const auto begin = std::chrono::steady_clock::now();
+        const Decision decision = model.decide(input.samples.data());
+        const std::chrono::duration<double, std::micro> elapsed = std::chrono::steady_clock::now() - begin;
+        print(model.actions.at(decision.action), model.reasons.at(decision.reason), decision, elapsed.count());
+        if (options.learn && input.success && decision.action == 0) {
+            if (journal) journal->append(*input.success, input.samples);  // written before it is counted
+            model.learn(input.samples.data(), *input.success);
+        }
+    }
+    return malformed > 0 ? 1 : 0;
+}
+
+int main(int argc, char** argv) {
+    std::ios::sync_with_stdio(false);
+    const auto options = parse_options(argc, argv);
+    if (!options) {
+        std::fprintf(stderr, "usage: dengine_cell MODEL.ts [--binary | --learn [--journal FILE]] < TRACES\n");
+        return 2;
+    }
+    try {
+        return run(*options);
+    } catch (const c10::Error& error) {
+        std::fprintf(stderr, "dengine_cell: %s: %s\n", options->model.c_str(), error.what_without_backtrace());
+    } catch (const std::exception& error) {
+        std::fprintf(stderr, "dengine_cell: %s: %s\n", options->model.c_str(), error.what());
+    }
+    return 1;
+}

@@ -1,0 +1,80 @@
+// Traces in: a CSV line or a block of little-endian float32. Samples of several channels follow one another, channel by channel.
+#pragma once
+
+#include <bit>
+#include <charconv>
+#include <cstddef>
+#include <cstdlib>
+#include <istream>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+static_assert(std::endian::native == std::endian::little, "binary traces are little-endian");
+
+struct Input {
+    std::vector<float> samples;
+    std::optional<bool> success;  // the label, where one was given
+    std::string fault;            // why the line cannot be read; empty where it can
+};
+
+inline std::string_view trimmed(std::string_view word) {
+    const auto first = word.find_first_not_of(" \t\r");
+    return first == std::string_view::npos ? std::string_view{} : word.substr(first, word.find_last_not_of(" \t\r") - first + 1);
+}
+
+// nan and inf are numbers here: a sensor that says so gets its reason from the model.
+inline bool parse(std::string_view word, float& out) {
+    const auto [end, error] = std::from_chars(word.data(), word.data() + word.size(), out);
+    if (error == std::errc::result_out_of_range) {
+        out = std::strtof(std::string(word).c_str(), nullptr);  // an infinity, or next to zero
+        return true;
+    }
+    return error == std::errc() && end == word.data() + word.size();
+}
+
+// `[label,]sample,sample,...`; a label is 1 (success), 0 (failure) or empty (unknown).
+inline void parse_line(std::string_view line, bool labelled, std::size_t expected, Input& input) {
+    input.samples.clear();
+    input.success.reset();
+    input.fault.clear();
+    for (std::size_t column = 0;; ++column) {
+        const auto comma = line.find(',');
+        const auto word = trimmed(line.substr(0, comma));
+        float value = 0.0F;
+        if (labelled && column == 0) {
+            if (word != "" && word != "0" && word != "1") input.fault = "expected a label of 1, 0 or nothing, got \"" + std::string(word.substr(0, 20)) + "\"";
+            if (word != "") input.success = word == "1";
+        } else if (parse(word, value)) {
+            input.samples.push_back(value);
+        } else if (input.fault.empty()) {
+            input.fault = "expected a number in column " + std::to_string(column + 1) + ", got \"" + std::string(word.substr(0, 20)) + "\"";
+        }
+        if (comma == std::string_view::npos) break;
+        line.remove_prefix(comma + 1);
+    }
+    if (input.fault.empty() && input.samples.size() != expected) {
+        input.fault = "expected " + std::to_string(expected) + " samples, got " + std::to_string(input.samples.size());
+    }
+}
+
+// The next line that is not empty; false at the end.
+inline bool next_line(std::istream& in, bool labelled, std::size_t expected, Input& input) {
+    for (std::string line; std::getline(in, line);) {
+        if (trimmed(line).empty()) continue;
+        parse_line(line, labelled, expected, input);
+        return true;
+    }
+    return false;
+}
+
+// The next block of `expected` float32; false at the end.
+inline bool next_block(std::istream& in, std::size_t expected, Input& input) {
+    input.fault.clear();
+    input.samples.resize(expected);
+    in.read(reinterpret_cast<char*>(input.samples.data()), static_cast<std::streamsize>(expected * sizeof(float)));
+    if (in.gcount() == 0) return false;
+    if (!in) input.fault = "expected " + std::to_string(expected * sizeof(float)) + " bytes, got " + std::to_string(in.gcount());
+    return true;
+}
