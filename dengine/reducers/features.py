@@ -1,0 +1,117 @@
+"""Label-free features of a trace: segment statistics, and a convolution whose filters are learned from patches.
+
+    x (B, C, T) -> the trace itself, S segments: mean, deviation, minimum, maximum        (B, 4*C*S)
+                -> conv, F filters a twentieth of the trace long -> ReLU -> mean over R regions  (B, F*R)
+
+The filters are the principal components of the patches, whitened: what a linear convolutional autoencoder with one
+hidden layer converges to (Baldi and Hornik, 1989, Neural Networks 2; PCANet: Chan et al., 2015, IEEE TIP 24), so the
+closed form replaces its training. No label is read anywhere here: one set of features serves every fold.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ..errors import SettingError
+
+Floats = NDArray[np.float32]
+PATCH_TRACES = 256
+PATCHES = 5000  # enough for a covariance of 50 x 50, and 10 ms of work
+PATCH_SHARE = 20  # a patch is this part of a trace: a contact event, not a sample's noise
+CLIP = 4.0  # deviations; an outlier may not carry a score by itself
+
+
+class TraceFeatures(nn.Module):
+    """(B, C, T) raw traces -> (B, P) standardised features; holds every constant it needs.
+
+    channels, samples : C and T.  segments, filters, regions : S, F and R of the module's docstring.
+    """
+
+    shift: Tensor
+    scale: Tensor
+    kernel: Tensor
+    bias: Tensor
+    offset: Tensor
+    gain: Tensor
+
+    def __init__(self, channels: int, samples: int, segments: int, filters: int, regions: int) -> None:
+        super().__init__()
+        if samples < 2 * segments or samples < 4 * regions:
+            raise SettingError(
+                f"Expected at least {max(2 * segments, 4 * regions)} samples for {segments} segments and "
+                f"{regions} regions, got {samples}; lower `segments` or record longer."
+            )
+        self.channels, self.segments, self.regions = channels, segments, regions
+        self.length = samples // segments
+        self.head = samples - segments * self.length  # left out at the start: the end of an insertion tells most
+        self.patch = max(2, samples // PATCH_SHARE)
+        self.stride = max(1, self.patch // 4)
+        frames = (samples - self.patch) // self.stride + 1
+        self.per_region = max(1, frames // regions)
+        if frames < regions:
+            raise SettingError(f"Expected at most {frames} regions for {samples} samples, got {regions}.")
+        # Frames start late enough for the last one to end with the trace.
+        self.skip = samples - self.patch - (regions * self.per_region - 1) * self.stride
+        n_features = 4 * channels * segments + filters * regions
+        # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
+        self.register_buffer("shift", torch.zeros(channels, 1))
+        self.register_buffer("scale", torch.ones(channels, 1))
+        self.register_buffer("kernel", torch.zeros(filters, channels, self.patch))
+        self.register_buffer("bias", torch.zeros(filters))
+        self.register_buffer("offset", torch.zeros(n_features))
+        self.register_buffer("gain", torch.ones(n_features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
+        f = torch.addcmul(self.offset, self.raw(x), self.gain)
+        return f.clamp(-4.0, 4.0)  # CLIP: a scripted method reads no global
+
+    def raw(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P), not standardised."""
+        x = torch.addcmul(self.shift, x, self.scale)
+        pieces = x[:, :, self.head :].reshape(x.size(0), self.channels * self.segments, self.length)  # (B, C*S, T/S)
+        mean = pieces.mean(2)
+        # The norm is the deviation but for a constant factor, which `gain` takes out; half the time of `var_mean`.
+        deviation = torch.linalg.vector_norm(pieces - mean.unsqueeze(2), dim=2)
+        h = torch.relu(nn.functional.conv1d(x[:, :, self.skip :], self.kernel, self.bias, stride=self.stride))
+        h = h.view(x.size(0), self.kernel.size(0), self.regions, self.per_region).mean(3)  # (B, F, L) -> (B, F, R)
+        return torch.cat([mean, deviation, pieces.amin(2), pieces.amax(2), h.flatten(1)], 1)
+
+    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
+        """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
+        wide = X.double()
+        centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
+        scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
+        self.scale.copy_(scale[:, None])
+        self.shift.copy_((-centre * scale)[:, None])
+        some = X[torch.from_numpy(rng.permutation(len(X))[:PATCH_TRACES])]
+        patches = torch.addcmul(self.shift, some, self.scale).unfold(2, self.patch, self.stride)  # (n, C, L, patch)
+        patches = patches.transpose(1, 2).flatten(2).flatten(0, 1)  # (n * L, C * patch)
+        patches = patches[torch.from_numpy(rng.permutation(len(patches))[:PATCHES])].double()
+        mean = patches.mean(0)
+        _, sizes, axes = torch.linalg.svd(patches - mean, full_matrices=False)
+        n_filters = self.kernel.size(0)
+        sizes = sizes / len(patches) ** 0.5
+        # A direction without variance would be amplified noise: it keeps a filter of zeros.
+        gain = torch.where(sizes > 1e-4 * sizes[0].clamp(min=1e-12), 1.0 / sizes.clamp(min=1e-12), 0.0)
+        kernel = torch.zeros(n_filters, patches.size(1), dtype=torch.float64)
+        found = min(n_filters, len(sizes))
+        kernel[:found] = _signed(axes[:found]) * gain[:found, None]
+        self.kernel.copy_(kernel.view_as(self.kernel))
+        self.bias.copy_(-kernel @ mean)
+
+    def standardise(self, raw: Tensor) -> Tensor:
+        """Set the features' mean and deviation from raw features (n, P), and return those standardised."""
+        wide = raw.double()
+        deviation = wide.std(0, unbiased=False)
+        floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
+        self.gain.copy_(1.0 / (deviation + floor))
+        self.offset.copy_(-wide.mean(0) / (deviation + floor))
+        return torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP)
+
+
+def _signed(axes: Tensor) -> Tensor:
+    """Rows (F, m) turned so that each one's largest entry is positive: the sign of an eigenvector is an accident."""
+    largest = axes.gather(1, axes.abs().argmax(1, keepdim=True))
+    return axes * torch.where(largest < 0, -1.0, 1.0)

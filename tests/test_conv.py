@@ -1,0 +1,261 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from sklearn.utils import get_tags
+
+from dengine.errors import SettingError, TraceError
+from dengine.reducers.base import StopRule, content_fold
+from dengine.reducers.conv import ConvReducer
+
+BOTH = pytest.mark.parametrize("objective", ["supervised", "label_free"])
+STEPS = StopRule(max_steps=20)
+
+
+def traces(n=160, channels=1, samples=152, seed=0):
+    """Bumps at a random place; a late bump is a failure, with some noise in the labels."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(0.2, 0.9, size=(n, 1, 1))
+    t = np.linspace(0.0, 1.0, samples)
+    X = np.exp(-(((t - place) / 0.05) ** 2)) * rng.uniform(5, 15, size=(n, channels, 1))
+    X = (X + 0.3 * rng.normal(size=(n, channels, samples))).astype(np.float32)
+    y = (place[:, 0, 0] + 0.05 * rng.normal(size=n) < 0.7).astype(np.int64)
+    return X, y
+
+
+def fitted(objective="supervised", **params):
+    X, y = traces()
+    return ConvReducer(objective=objective, **params).fit(X, y, stop=STEPS), X, y
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over_warm_starts(k):
+    X, y = traces()
+    folds, rng = content_fold(X, 3), np.random.default_rng(1)
+    other = y.copy()
+    other[folds == k] = 1 - y[folds == k]
+    one, two = ConvReducer(folds=3), ConvReducer(folds=3)
+    for n in (60, 110, 160):
+        one.fit(X[:n], y[:n], folds=folds[:n])
+        two.fit(X[:n], other[:n], folds=folds[:n])
+        other[folds == k] = rng.permutation(other[folds == k])  # other labels again at the next warm start
+        a, b = one.embed(X), two.embed(X)
+        assert np.array_equal(a[:, k], b[:, k])
+        assert one.holdout_losses_[k] == two.holdout_losses_[k]
+        assert not np.array_equal(a, b)  # the other spaces did see them
+
+
+def test_space_k_stays_the_same_where_a_step_limit_ends_the_fit():
+    X, y = traces()
+    folds = content_fold(X, 2)
+    other = np.where(folds == 0, 1 - y, y)
+    stop = StopRule(max_steps=2)
+    a, b = (ConvReducer(folds=2).fit(X, labels, folds=folds, stop=stop).embed(X) for labels in (y, other))
+    assert np.array_equal(a[:, 0], b[:, 0])
+
+
+def test_the_label_free_objective_reads_no_label():
+    X, y = traces()
+    a = ConvReducer(objective="label_free").fit(X, y, stop=STEPS)
+    b = ConvReducer(objective="label_free").fit(X, stop=STEPS)
+    assert np.array_equal(a.embed(X), b.embed(X))
+    assert not get_tags(a).target_tags.required
+    assert get_tags(ConvReducer()).target_tags.required
+
+
+@BOTH
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize(("samples", "channels"), [(152, 1), (400, 6), (800, 2), (1000, 1), (997, 3)])
+def test_every_length_and_number_of_channels_embeds_into_k_spaces_of_d(objective, dim, samples, channels):
+    X, y = traces(60, channels, samples)
+    reducer = ConvReducer(objective=objective, dim=dim, folds=3).fit(X, y, stop=StopRule(max_steps=2))
+    Z = reducer.embed(X)
+    assert Z.shape == (60, reducer.n_spaces, dim)
+    assert Z.dtype == np.float32
+    assert np.isfinite(Z).all()
+    assert reducer.transform(X).shape == (60, dim)
+
+
+@BOTH
+def test_embedding_in_the_own_space_picks_row_i_of_space_folds_i(objective):
+    reducer, X, _ = fitted(objective)
+    folds = content_fold(X, 5)
+    own = folds if objective == "supervised" else np.zeros_like(folds)
+    assert np.array_equal(reducer.embed_own(X, folds), reducer.embed(X)[np.arange(len(X)), own])
+
+
+@BOTH
+def test_fitted_traces_are_placed_without_a_second_pass_where_a_pass_would_place_them(objective):
+    reducer, X, _ = fitted(objective)
+    folds = content_fold(X, 5)
+    fast, slow = reducer.embed_fitted(X, folds), reducer.embed_own(X, folds)
+    assert np.abs(fast - slow).max() <= 1e-6
+    again = clone(reducer).set_state(reducer.get_state())  # resumed, it holds no features of the last fit
+    assert np.array_equal(again.embed_fitted(X, folds), slow)
+
+
+@BOTH
+def test_one_trace_alone_lands_where_it_does_in_a_batch(objective):
+    reducer, X, _ = fitted(objective)
+    single = np.concatenate([reducer.embed(x[None]) for x in X])
+    assert np.abs(single - reducer.embed(X)).max() <= reducer.single_tolerance
+
+
+@BOTH
+def test_scripted_and_frozen_the_module_answers_as_the_reducer_does(objective, tmp_path):
+    reducer, X, _ = fitted(objective)
+    frozen = torch.jit.freeze(torch.jit.script(reducer.module()))
+    torch.jit.save(frozen, tmp_path / "conv.ts")
+    loaded = torch.jit.load(tmp_path / "conv.ts")
+    x = torch.from_numpy(X[:7])
+    for module in (frozen, loaded):
+        for _ in range(4):  # TorchScript optimises over the first calls
+            Z = module(x).detach().numpy()
+        assert np.abs(Z - reducer.embed(X[:7])).max() <= 1e-6
+
+
+@BOTH
+def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit(objective):
+    reducer, X, y = fitted(objective)
+    state = reducer.get_state()
+    again = clone(reducer).set_state(state)
+    assert np.array_equal(again.embed(X), reducer.embed(X))
+    assert again.holdout_loss_ == reducer.holdout_loss_
+    X2, y2 = np.concatenate([X, traces(seed=5)[0]]), np.concatenate([y, traces(seed=5)[1]])
+    assert np.array_equal(again.fit(X2, y2, stop=STEPS).embed(X), reducer.fit(X2, y2, stop=STEPS).embed(X))
+    assert all(isinstance(value, np.ndarray) for value in state.values())
+
+
+@BOTH
+def test_a_seed_repeats_exactly_and_a_clone_starts_cold(objective):
+    reducer, X, y = fitted(objective)
+    assert np.array_equal(clone(reducer).fit(X, y, stop=STEPS).embed(X), reducer.embed(X))
+
+
+def test_a_refit_on_the_same_labels_does_not_move_the_map():
+    reducer, X, y = fitted()
+    before = reducer.embed(X)
+    reducer.fit(X, y)
+    assert reducer.n_steps_ <= 3
+    assert np.abs(reducer.embed(X) - before).max() < 1e-3
+
+
+def test_a_warm_start_ends_where_a_cold_start_does():
+    X, y = traces(300)
+    cold = ConvReducer().fit(X, y)
+    warm = clone(cold).set_state(cold.get_state()).fit(X[:100], y[:100]).fit(X, y)
+    assert np.abs(warm.embed(X)[:, :, 0] - cold.embed(X)[:, :, 0]).max() < 1e-3
+
+
+def test_the_scores_of_traces_they_never_saw_rank_successes_above_failures():
+    reducer, _, _ = fitted()
+    X, y = traces(400, seed=9)
+    p = reducer.transform(X)[:, 0]
+    assert ((p >= 0) & (p <= 1)).all()
+    rank = (p[y == 1][:, None] > p[y == 0][None]).mean()
+    assert rank > 0.9
+
+
+def test_the_second_axis_is_small_against_the_first():
+    reducer, X, _ = fitted()
+    Z = reducer.embed(X)
+    assert np.ptp(Z[..., 1]) <= 0.04 < 0.5 < np.ptp(Z[..., 0])
+
+
+def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_than_the_base_rate():
+    reducer, _, _ = fitted()
+    X, y = traces(1000, seed=9)
+    p = np.clip(reducer.embed(X)[:, :, 0], 1e-6, 1 - 1e-6)
+    new = -np.where(y[:, None] == 1, np.log(p), np.log1p(-p)).mean()
+    base = -(y.mean() * np.log(y.mean()) + (1 - y.mean()) * np.log(1 - y.mean()))
+    assert abs(reducer.holdout_loss_ - new) < 0.15
+    assert reducer.holdout_loss_ < base
+
+
+def test_the_plane_gets_better_at_keeping_neighbours():
+    X, _ = traces(300)
+    short, long = (
+        ConvReducer(objective="label_free").fit(X, stop=StopRule(max_steps=steps)).holdout_loss_ for steps in (5, 200)
+    )
+    assert long < short
+
+
+@BOTH
+def test_no_step_begins_after_the_deadline(objective):
+    X, y = traces()
+    ticks = iter(range(1000))
+    reducer = ConvReducer(objective=objective).fit(X, y, stop=StopRule(deadline=3.0, clock=lambda: float(next(ticks))))
+    assert reducer.n_steps_ == 3
+    late = ConvReducer(objective=objective).fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
+    assert late.n_steps_ == 0
+    assert np.isfinite(late.embed(X)).all()
+
+
+@BOTH
+def test_dead_channels_and_huge_scales_embed_finitely(objective):
+    X, y = traces(80, channels=2)
+    X[:, 1] = 7.0
+    X[:, 0] = X[:, 0] * 1e6 + 1e7
+    reducer = ConvReducer(objective=objective).fit(X, y, stop=STEPS)
+    Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
+    assert np.isfinite(Z).all()
+
+
+def test_the_scale_and_offset_of_a_channel_do_not_matter():
+    X, y = traces()
+    a, b = ConvReducer().fit(X, y, folds=content_fold(X, 5)), ConvReducer().fit(8 * X + 32, y, folds=content_fold(X, 5))
+    assert np.abs(a.embed(X)[..., 0] - b.embed(8 * X + 32)[..., 0]).max() < 5e-3
+
+
+def test_more_traces_move_the_map_less_and_less():
+    X, y = traces(640)
+    reducer = ConvReducer()
+    maps = [reducer.fit(X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
+    moves = [np.abs(b - a).mean() for a, b in pairwise(maps)]
+    assert moves[-1] < moves[0]
+    assert moves[-1] < 0.05
+
+
+def test_too_little_to_learn_from_is_said_clearly():
+    X, y = traces()
+    with pytest.raises(SettingError, match="at least 20 traces, got 12"):
+        ConvReducer().fit(X[:12], y[:12])
+    with pytest.raises(SettingError, match="both classes outside fold 0"):
+        ConvReducer(folds=2).fit(X, np.ones(len(X), dtype=int))
+    folds = np.zeros(len(X), dtype=np.int64)
+    with pytest.raises(SettingError, match="both classes outside fold 0, got 0"):
+        ConvReducer(folds=2).fit(X, y, folds=folds)
+    with pytest.raises(SettingError, match="uses labels"):
+        ConvReducer().fit(X)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"dim": 3}, "dim 1 or 2"),
+        ({"folds": 1}, "folds >= 2"),
+        ({"objective": "both"}, "objective among"),
+        ({"l2": 0.0}, "l2 > 0"),
+        ({"filters": 0}, "filters >= 1"),
+        ({"segments": 100}, "at least 200 samples"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(params, message):
+    X, y = traces()
+    with pytest.raises(SettingError, match=message):
+        ConvReducer(**params).fit(X, y)
+
+
+def test_a_trace_of_another_shape_is_an_error_that_names_both():
+    reducer, X, _ = fitted()
+    with pytest.raises(TraceError, match="1 channels x 152 samples, got 1 x 150"):
+        reducer.embed(X[:, :, :150])
+
+
+def test_no_traces_embed_to_no_points():
+    reducer, X, _ = fitted()
+    assert reducer.embed(X[:0]).shape == (0, 5, 2)
