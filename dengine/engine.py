@@ -17,6 +17,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -113,6 +114,8 @@ class DataEngine:
 
         Raises StoreError where there is nothing to go on with.
         """
+        if not isinstance(url, Store) and "://" not in str(url) and not Path(url).exists():
+            raise StoreError(f"Expected a store that an engine has used, {url} does not exist; make a DataEngine with it.")
         store = open_store(url)
         settings = store.settings()
         if not settings:
@@ -227,6 +230,8 @@ class DataEngine:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
         self._collect(wait=True)
         self.new_labels = 0
+        if not len(self._window):
+            return RetrainReport(self.version, 0.0, 0, 0, False, "dropped: no labelled trace yet; report one first")
         return self._swap(self._retrainer.train(self._model or self._template))
 
     @property

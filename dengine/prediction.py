@@ -74,7 +74,8 @@ class ModelPrediction:
     folds : K, for a label-using transformer that does not cross-fit by itself.
 
     Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius` means the same in every
-    reducer; the scale of space k comes from fold k's traces, whose labels that space never saw.
+    reducer; the scale of space k comes from fold k's traces, whose labels that space never saw. One whose axis has a
+    unit of its own (`natural_scale`) is left as it is: where probabilities hardly differ, they are not to be spread.
     """
 
     def __init__(self, reducer: Any = "conv", classifier: WilsonRadiusClassifier | None = None, folds: int = 2) -> None:
@@ -106,7 +107,8 @@ class ModelPrediction:
         self.trace_shape = X.shape[1:]
         self.spaces.fit(X, y, folds, stop)
         points = self.spaces.embed_fitted(X, folds)
-        self.scale = _scale(points, folds, self.n_spaces)
+        own_unit = self.spaces.natural_scale
+        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else _scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds)
         return self.ready()

@@ -42,7 +42,7 @@ class Recipe:
     radius: float = 0.3
     fraction: float | None = None
     reject_fraction: float | None = None
-    folds: int = 2
+    folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
     max_steps: int = 60
@@ -129,7 +129,7 @@ def _escaped(character: str) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    "conv": Recipe("conv"),
+    "conv": Recipe("conv", radius=0.05),  # of a probability: the encoder's own unit
     "umap": Recipe("umap"),
     "pca": Recipe("pca"),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored.

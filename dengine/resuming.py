@@ -31,8 +31,10 @@ def resume(store: Store, template: AnyModel, window: Window) -> Resumed:
     if version is None:
         return Resumed(None, 0, len(labelled.seq))
     model = _restored(store, template, version.state, window.newest_seq)
-    _hold_since(model, store, version, labelled)
-    return Resumed(model, version.version, int((labelled.seq > version.last_seq).sum()))
+    trained_to = int(version.state["trained_on"][-1])
+    # A stored state holds what came in during its retrain; a foreign model was refitted without that.
+    _hold_since(model, store, version, labelled, version.last_seq if isinstance(model, ModelPrediction) else trained_to)
+    return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
 def _restored(store: Store, template: AnyModel, state: Mapping[str, NDArray[Any]], newest: int) -> AnyModel:
@@ -47,10 +49,10 @@ def _restored(store: Store, template: AnyModel, state: Mapping[str, NDArray[Any]
     return model.set_state(state) if isinstance(model, ModelPrediction) else model
 
 
-def _hold_since(model: AnyModel, store: Store, version: ModelVersion, labelled: Labelled) -> None:
+def _hold_since(model: AnyModel, store: Store, version: ModelVersion, labelled: Labelled, last_seq: int) -> None:
     added = store.points_since(version.last_seq, version.version)
     points = dict(zip(added.seq.tolist(), added.points, strict=True))
-    for i in np.flatnonzero(labelled.seq > version.last_seq):
+    for i in np.flatnonzero(labelled.seq > last_seq):
         hash_ = int(labelled.hashes[i])
         point = points.get(int(labelled.seq[i]))  # unknown: its decision was answered by an earlier version
         point = place(model, labelled.traces[i], hash_) if point is None else point

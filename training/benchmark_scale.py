@@ -32,7 +32,7 @@ BUDGET = 0.45
 
 
 def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """n labelled traces (n, C, T): bundled ones with 0.2 units of fresh sensor noise."""
+    """Labelled traces (n, C, T): bundled ones with 0.2 units of fresh sensor noise."""
     rows = rng.integers(len(data), size=n)
     X = as_traces(data.X[rows])
     return X + rng.normal(0.0, 0.2, X.shape).astype(np.float32), data.y[rows]

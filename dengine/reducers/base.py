@@ -60,6 +60,11 @@ class Spaces(Protocol):
         """K; 1 for a reducer that uses no labels."""
         ...
 
+    @property
+    def natural_scale(self) -> bool:
+        """Whether the embedding has a unit of its own, a probability say, that must not be scaled away."""
+        ...
+
     def fit(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Self:
         """Fit on traces (n, C, T), labels (n,) and folds (n,); space k uses no label of fold k."""
         ...
@@ -125,6 +130,11 @@ class OneSpace:
 
     def __init__(self, reducer: Any) -> None:
         self.reducer = reducer
+
+    @property
+    def natural_scale(self) -> bool:
+        """What the reducer says; an embedding without a word on it is scaled."""
+        return bool(getattr(self.reducer, "natural_scale", False))
 
     def fit(self, X: Floats, y: Ints | None = None, folds: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Fit on the traces alone."""
@@ -207,6 +217,11 @@ class CrossFitted(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sci
     def __init__(self, reducer: Any, folds: int = 2) -> None:
         self.reducer = reducer
         self.folds = folds
+
+    @property
+    def natural_scale(self) -> bool:
+        """What the reducer says of its clones."""
+        return bool(getattr(self.reducer, "natural_scale", False))
 
     @property
     def n_spaces(self) -> int:
