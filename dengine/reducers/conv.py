@@ -70,6 +70,9 @@ class ConvReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sci
     loss on rows outside fold k (`holdout_losses_` (K,)), so that a gate that reads it sees no label of fold k.
     """
 
+    net_: ConvEmbedding
+    _fitted_features: Tensor | None
+
     takes_traces = True
     single_tolerance = 1e-4
 
@@ -221,7 +224,7 @@ class ConvReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sci
             else NeighbourPlane(size, self.hidden, self.dim)
         )
         self.shape_ = (channels, samples)
-        self._fitted_features: Tensor | None = None
+        self._fitted_features = None
         self.net_ = ConvEmbedding(features, head).eval()
 
     def _check(self) -> None:
