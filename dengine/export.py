@@ -41,7 +41,7 @@ def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, tr
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
     Raises ExportError where nothing was trained yet, or the reducer or the interval cannot be scripted.
     """
-    model, spec, context = _parts(engine_or_model, trace)
+    model, spec, context = parts(engine_or_model, trace)
     decider = build_decider(model, spec, context["audit_rate"], context["seed"])
     frozen = torch.jit.freeze(script(decider.eval()), preserved_attrs=["decide", "learn"])
     metadata = describe(model, spec, context) | {"golden": _golden(frozen, spec)}
@@ -122,9 +122,10 @@ def sum_file(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
 
 
-def _parts(
+def parts(
     thing: DataEngine | ModelPrediction, spec: TraceSpec | None
 ) -> tuple[ModelPrediction, TraceSpec, dict[str, Any]]:
+    """What any exporter starts from: the fitted model, its trace contract, and what the file will say of the engine."""
     model = thing if isinstance(thing, ModelPrediction) else thing.model
     if model is None:
         raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")

@@ -71,7 +71,7 @@ class ExportedModel:
 
 def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
     """What a file says of itself, after checking its sum and without loading its code."""
-    return _metadata(_checked_bytes(Path(path)), Path(path))
+    return _metadata(checked_bytes(Path(path)), Path(path))
 
 
 def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
@@ -81,7 +81,7 @@ def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
     after loading where this machine does not reproduce the golden embedding.
     """
     target = Path(path)
-    content = _checked_bytes(target)
+    content = checked_bytes(target)
     metadata = _metadata(content, target)
     torch.set_num_threads(1)
     try:
@@ -98,8 +98,8 @@ def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
     return model
 
 
-def _checked_bytes(path: Path) -> bytes:
-    # libtorch does not notice flipped bits, so nothing is loaded before its sum is right.
+def checked_bytes(path: Path) -> bytes:
+    """A file's content; ExportError unless its sum is right. libtorch itself does not notice flipped bits."""
     try:
         content = path.read_bytes()
         words = sum_file(path).read_text(encoding="ascii").split()
@@ -121,16 +121,21 @@ def _metadata(content: bytes, path: Path) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             name = next(n for n in archive.namelist() if n.endswith(f"extra/{METADATA}"))
-            metadata: dict[str, Any] = json.loads(archive.read(name))
+            metadata = json.loads(archive.read(name))
     except (zipfile.BadZipFile, StopIteration, ValueError) as error:
         raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error
+    return checked_schema(metadata, path)
+
+
+def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:
+    """A description that this version can read; ExportError for a newer one."""
     schema = metadata.get("schema") if isinstance(metadata, dict) else None
     if not isinstance(schema, int) or schema > SCHEMA:
         made_by = metadata.get("dengine", "an unknown version") if isinstance(metadata, dict) else "something else"
         raise ExportError(
             f"{path} has schema {schema}, written by dengine {made_by}; this one reads up to {SCHEMA}: upgrade it."
         )
-    return metadata
+    return dict(metadata)
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:

@@ -13,6 +13,7 @@ import click
 
 from .. import __version__
 from ..errors import DengineError
+from .export import export, import_labels
 from .replaying import compare, replay
 from .running import run
 from .simulating import simulate
@@ -39,5 +40,5 @@ def main() -> None:
     """Let a robot cell start on its slow check, and earn its way off it."""
 
 
-for verb in (replay, compare, train, run, simulate, status):
+for verb in (replay, compare, train, run, simulate, status, export, import_labels):
     main.add_command(verb)
