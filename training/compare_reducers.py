@@ -26,8 +26,8 @@ POLICIES = ((0.1, 0.9), (0.05, 0.95))
 # The same number of tries for each reducer: its radius, the one setting that every reducer has.
 TRIES: dict[str, tuple[float, ...]] = {
     "conv": (0.03, 0.05, 0.07, 0.1),
-    "umap": (0.05, 0.1, 0.2, 0.4),
-    "pca": (0.05, 0.1, 0.2, 0.4),
+    "umap": (0.2, 0.3, 0.4, 0.6),
+    "pca": (0.1, 0.2, 0.3, 0.4),
     "rocket": (0.03, 0.05, 0.07, 0.1),
 }
 
