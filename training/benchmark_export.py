@@ -1,0 +1,205 @@
+"""What the exported file costs, and that it decides as the engine does; run it on an idle machine.
+
+    python training/benchmark_export.py --data insertion --reducer conv --cell build/cpp/dengine_cell --out out/
+
+Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
+parity over every trace of the data set and random ones, bad ones and audits among them; damaged files, each of which
+must be refused. Ends with exit code 1 where a decision differs or a damaged file is taken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
+from dengine.errors import ExportError
+from dengine.export import sum_file
+from dengine.importing import import_labelled, train_until_done
+from dengine.onnx_export import export_onnx, load_onnx
+from dengine.records import Action
+from dengine.store import MemoryStore
+from dengine.traces import as_traces
+
+BOUND_TOLERANCE = 1e-6
+AUDIT_RATE = 0.1
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row of the table."""
+
+    what: str
+    value: float
+    unit: str
+    target: str = ""
+
+
+def train(data: Dataset, recipe: Recipe, retrains: int) -> DataEngine:
+    """An engine that has every trace of a data set as a reference, and audits."""
+    store = MemoryStore()
+    import_labelled(store, data, recipe.with_policy(audit_rate=AUDIT_RATE))
+    engine = DataEngine.open(store)
+    train_until_done(engine, retrains)
+    return engine
+
+
+def random_traces(data: Dataset, n: int, rng: np.random.Generator) -> np.ndarray:
+    """(n, C, T): noise of every size, mixtures of recorded traces, and one bad one in ten."""
+    X = as_traces(data.X)
+    one, two = X[rng.integers(len(X), size=n)], X[rng.integers(len(X), size=n)]
+    share = rng.random((n, 1, 1)).astype(np.float32)
+    out = share * one + (1.0 - share) * two + rng.normal(0.0, 0.5, one.shape).astype(np.float32)
+    wild = rng.random(n) < 0.3
+    noise = rng.normal(size=(int(wild.sum()), *X.shape[1:])) * 10.0 ** rng.uniform(-3, 6, (int(wild.sum()), 1, 1))
+    out[wild] = noise.astype(np.float32)
+    for value in (np.nan, np.inf, -np.inf):
+        out[rng.random(n) < 0.025, 0, int(rng.integers(X.shape[2]))] = value
+    out[rng.random(n) < 0.025] = 1.5
+    return out
+
+
+def differing(found: list[Any], expected: list[Any]) -> int:
+    """Decisions that differ: action, reason or counts at all, bounds by more than the tolerance."""
+    return sum(
+        (a.action, a.reason, a.n_success, a.n_failure) != (b.action, b.reason, b.n_success, b.n_failure)
+        or abs(a.lower - b.lower) > BOUND_TOLERANCE
+        or abs(a.upper - b.upper) > BOUND_TOLERANCE
+        for a, b in zip(found, expected, strict=True)
+    )
+
+
+def microseconds(decide: Callable[[Any], Any], X: np.ndarray, calls: int) -> np.ndarray:
+    """(calls,) wall time of each call."""
+    taken = np.empty(calls)
+    for i in range(calls):
+        begin = time.perf_counter()
+        decide(X[i % len(X)])
+        taken[i] = 1e6 * (time.perf_counter() - begin)
+    return taken
+
+
+def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", "")) -> list[Finding]:
+    """Median and 99th percentile."""
+    return [
+        Finding(f"{name}, p{p}", float(np.percentile(taken, p)), "µs", t) for p, t in zip((50, 99), targets, strict=True)
+    ]
+
+
+def ask_cell(program: Path, file: Path, X: np.ndarray, expected: list[Any]) -> tuple[int, np.ndarray]:
+    """Decisions of the C++ program that differ, and the microseconds of each call."""
+    done = subprocess.run([program, file, "--binary"], input=X.tobytes(), capture_output=True, check=True)
+    lines = [line.split(",") for line in done.stdout.decode().splitlines()]
+    wrong = sum(
+        (w[0], w[1], int(w[4]), int(w[5])) != (d.action, d.reason, d.n_success, d.n_failure)
+        or abs(float(w[2]) - d.lower) > BOUND_TOLERANCE
+        or abs(float(w[3]) - d.upper) > BOUND_TOLERANCE
+        for w, d in zip(lines, expected, strict=True)
+    )
+    return wrong, np.array([float(w[-1]) for w in lines])
+
+
+def damage(content: bytes, rng: np.random.Generator) -> bytes:
+    """A flipped bit, a cut end, or two different blocks of 512 bytes exchanged."""
+    kind = int(rng.integers(3))
+    at = int(rng.integers(len(content)))
+    if kind == 0:
+        return content[:at] + bytes([content[at] ^ (1 << int(rng.integers(8)))]) + content[at + 1 :]
+    if kind == 1:
+        return content[:at]
+    blocks = [content[i : i + 512] for i in range(0, len(content), 512)]
+    while b"".join(blocks) == content:
+        i, j = rng.integers(len(blocks), size=2)
+        blocks[i], blocks[j] = blocks[j], blocks[i]
+    return b"".join(blocks)
+
+
+def taken_damaged(file: Path, n: int, folder: Path, cell: Path | None) -> int:
+    """Damaged files, of n, that were not refused, by Python or by the cell program."""
+    rng, content, copy, taken = np.random.default_rng(2), file.read_bytes(), folder / file.name, 0
+    sum_file(copy).write_bytes(sum_file(file).read_bytes())
+    for _ in track(range(n), description="damaging"):
+        copy.write_bytes(damage(content, rng))
+        try:
+            load_exported(copy)
+            taken += 1
+        except ExportError:
+            pass
+        if cell is not None:
+            taken += subprocess.run([cell, copy], input=b"", capture_output=True, check=False).returncode != 1
+    return taken
+
+
+def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
+    """Every row of the table."""
+    data, rng = load_dataset(args.data), np.random.default_rng(1)
+    engine = train(data, Recipe.load(args.reducer), args.retrains)
+    X, known = np.concatenate([as_traces(data.X), random_traces(data, args.random, rng)]), as_traces(data.X)
+    expected = [engine.decide(x) for x in track(X, description="engine")]
+    file = export_torchscript(engine, folder / "model.ts")
+    exported = load_exported(file)
+    first = microseconds(exported.decide, known, 1)[0]
+    audits = sum(d.audit for d in expected)
+    rows = [
+        Finding("file size", file.stat().st_size / 1e3, "kB", "< 1000"),
+        Finding("decisions compared", len(X), ""),
+        Finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
+        Finding("of them audits", audits, ""),
+        Finding("Python differs in", differing(exported.decide_many(X), expected), "", "0"),
+        Finding("first call after loading", first, "µs", "<= 1000"),
+        *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150", "<= 500")),
+    ]
+    if args.cell is not None:
+        wrong, _ = ask_cell(args.cell, file, X, expected)
+        times = 1 + args.calls // len(known)
+        _, taken = ask_cell(args.cell, file, np.concatenate([known] * times), expected[: len(known)] * times)
+        rows += [Finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120", "<= 400"))]
+    if args.onnx:
+        runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
+        model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
+        rows.append(Finding("onnxruntime differs in", differing(runtime.decide_many(X), model.decide_many(X)), ""))
+        rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
+    refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
+    return [*rows, Finding(f"taken of {args.damaged} damaged files", refused, "", "0")]
+
+
+def main() -> None:
+    """Parse, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
+    parser.add_argument("--retrains", type=int, default=3)
+    parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
+    parser.add_argument("--calls", type=int, default=5000, help="calls timed")
+    parser.add_argument("--damaged", type=int, default=500, help="damaged files tried")
+    parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")
+    parser.add_argument("--no-onnx", dest="onnx", action="store_false")
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "damaged").mkdir()
+        rows = measure(args, Path(folder))
+    args.out.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(rows).to_csv(args.out / "benchmark_export.csv", index=False)
+    table = Table("what", "value", "unit", "target", title=f"Exported decision: {args.reducer} on {args.data}")
+    for row in rows:
+        table.add_row(row.what, f"{row.value:,.0f}", row.unit, row.target)
+    Console(width=None if sys.stdout.isatty() else 100).print(table)
+    sys.exit(any(row.target == "0" and row.value > 0 for row in rows))
+
+
+if __name__ == "__main__":
+    main()
