@@ -122,9 +122,7 @@ def sum_file(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
 
 
-def parts(
-    thing: DataEngine | ModelPrediction, spec: TraceSpec | None
-) -> tuple[ModelPrediction, TraceSpec, dict[str, Any]]:
+def parts(thing: DataEngine | ModelPrediction, spec: TraceSpec | None) -> tuple[ModelPrediction, TraceSpec, dict[str, Any]]:
     """What any exporter starts from: the fitted model, its trace contract, and what the file will say of the engine."""
     model = thing if isinstance(thing, ModelPrediction) else thing.model
     if model is None:

@@ -65,12 +65,16 @@ static int run(const Options& options) {
 
     std::optional<Journal> journal;
     if (!options.journal.empty()) {
-        journal.emplace(options.journal, model.sum, size, [&](Input& known) { model.learn(known.samples.data(), *known.success); });
+        const auto learn = [&](Input& known) { model.learn(known.samples.data(), *known.success); };
+        journal.emplace(options.journal, model.sum, size, learn);
     }
     const Decision unknown{0, 0, 0.0, 1.0, 0, 0, std::vector<float>(model.width, std::numeric_limits<float>::quiet_NaN())};
     int malformed = 0;
     Input input;
-    for (long long number = 1; options.binary ? next_block(std::cin, size, input) : next_line(std::cin, options.learn, size, input); ++number) {
+    const auto next = [&] {
+        return options.binary ? next_block(std::cin, size, input) : next_line(std::cin, options.learn, size, input);
+    };
+    for (long long number = 1; next(); ++number) {
         if (!input.fault.empty()) {
             ++malformed;
             std::fprintf(stderr, "dengine_cell: trace %lld is malformed: %s\n", number, input.fault.c_str());

@@ -46,7 +46,9 @@ class Journal {
         while (std::getline(in, line)) {
             const bool cut = in.eof();  // no line end: the process was killed while it wrote
             parse_line(line, true, samples, input);
-            if (cut || !input.fault.empty() || !input.success) throw std::runtime_error(path_ + " has a line that was not finished; remove it");
+            if (cut || !input.fault.empty() || !input.success) {
+                throw std::runtime_error(path_ + " has a line that was not finished; remove it");
+            }
             learn(input);
         }
         return true;

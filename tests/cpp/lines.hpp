@@ -1,4 +1,4 @@
-// Traces in: a CSV line or a block of little-endian float32. Samples of several channels follow one another, channel by channel.
+// Traces in: a CSV line or a block of little-endian float32. Several channels follow one another.
 #pragma once
 
 #include <bit>
@@ -21,8 +21,11 @@ struct Input {
 
 inline std::string_view trimmed(std::string_view word) {
     const auto first = word.find_first_not_of(" \t\r");
-    return first == std::string_view::npos ? std::string_view{} : word.substr(first, word.find_last_not_of(" \t\r") - first + 1);
+    if (first == std::string_view::npos) return {};
+    return word.substr(first, word.find_last_not_of(" \t\r") - first + 1);
 }
+
+inline std::string quoted(std::string_view word) { return '"' + std::string(word.substr(0, 20)) + '"'; }
 
 // nan and inf are numbers here: a sensor that says so gets its reason from the model.
 inline bool parse(std::string_view word, float& out) {
@@ -44,12 +47,14 @@ inline void parse_line(std::string_view line, bool labelled, std::size_t expecte
         const auto word = trimmed(line.substr(0, comma));
         float value = 0.0F;
         if (labelled && column == 0) {
-            if (word != "" && word != "0" && word != "1") input.fault = "expected a label of 1, 0 or nothing, got \"" + std::string(word.substr(0, 20)) + "\"";
+            if (word != "" && word != "0" && word != "1") {
+                input.fault = "expected a label of 1, 0 or nothing, got " + quoted(word);
+            }
             if (word != "") input.success = word == "1";
         } else if (parse(word, value)) {
             input.samples.push_back(value);
         } else if (input.fault.empty()) {
-            input.fault = "expected a number in column " + std::to_string(column + 1) + ", got \"" + std::string(word.substr(0, 20)) + "\"";
+            input.fault = "expected a number in column " + std::to_string(column + 1) + ", got " + quoted(word);
         }
         if (comma == std::string_view::npos) break;
         line.remove_prefix(comma + 1);
@@ -75,6 +80,9 @@ inline bool next_block(std::istream& in, std::size_t expected, Input& input) {
     input.samples.resize(expected);
     in.read(reinterpret_cast<char*>(input.samples.data()), static_cast<std::streamsize>(expected * sizeof(float)));
     if (in.gcount() == 0) return false;
-    if (!in) input.fault = "expected " + std::to_string(expected * sizeof(float)) + " bytes, got " + std::to_string(in.gcount());
+    if (!in) {
+        const auto bytes = std::to_string(expected * sizeof(float));
+        input.fault = "expected " + bytes + " bytes, got " + std::to_string(in.gcount());
+    }
     return true;
 }

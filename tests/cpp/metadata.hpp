@@ -101,7 +101,8 @@ class Metadata {
 
     std::string word() {
         std::size_t n = 0;
-        while (n < rest_.size() && (std::isalnum(static_cast<unsigned char>(rest_[n])) || std::string_view("+-.").find(rest_[n]) != std::string_view::npos)) ++n;
+        const auto belongs = [](unsigned char c) { return std::isalnum(c) || c == '+' || c == '-' || c == '.'; };
+        while (n < rest_.size() && belongs(rest_[n])) ++n;
         if (n == 0) fail("a value");
         const std::string out(rest_.substr(0, n));
         rest_.remove_prefix(n);
@@ -119,7 +120,8 @@ class Metadata {
     }
 
     [[noreturn]] void fail(const std::string& expected) const {
-        throw std::runtime_error("its description is no JSON: expected " + expected + " before \"" + std::string(rest_.substr(0, 12)) + "\"");
+        const std::string near(rest_.substr(0, 12));
+        throw std::runtime_error("its description is no JSON: expected " + expected + " before \"" + near + "\"");
     }
 
     std::string_view rest_;

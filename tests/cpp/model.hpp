@@ -36,15 +36,19 @@ inline std::string checked_bytes(const std::string& path, std::string& sum) {
     const std::string bytes = read_file(path);
     std::istringstream(read_file(path + ".sha256")) >> sum;
     if (sum.size() != 64) throw std::runtime_error("its .sha256 holds no SHA-256 sum; copy it again");
-    if (sha256::hex(bytes) != sum) throw std::runtime_error("it is damaged or truncated: its SHA-256 differs; copy it again");
+    if (sha256::hex(bytes) != sum) {
+        throw std::runtime_error("it is damaged or truncated: its SHA-256 differs; copy it again");
+    }
     return bytes;
 }
 
 class Model {
   public:
-    explicit Model(const std::string& path) : module_(load(path)), metadata_(description()), decide_(module_.get_method("decide")) {
+    explicit Model(const std::string& path)
+        : module_(load(path)), metadata_(description()), decide_(module_.get_method("decide")) {
         if (metadata_.number("schema") > SCHEMA) {
-            throw std::runtime_error("it was written by a newer dengine, " + metadata_.text("dengine") + "; build a newer cell program");
+            const auto& version = metadata_.text("dengine");
+            throw std::runtime_error("it was written by a newer dengine, " + version + "; build a newer cell program");
         }
         channels = static_cast<std::int64_t>(metadata_.number("trace.channels"));
         samples = static_cast<std::int64_t>(metadata_.number("trace.samples"));
@@ -59,8 +63,9 @@ class Model {
         const auto result = decide_({tensor(x)});
         const auto& field = result.toTupleRef().elements();
         const at::Tensor z = field[6].toTensor().contiguous();
-        return {field[0].toInt(), field[1].toInt(), field[2].toDouble(), field[3].toDouble(), field[4].toInt(), field[5].toInt(),
-                {z.data_ptr<float>(), z.data_ptr<float>() + z.numel()}};
+        const float* first = z.const_data_ptr<float>();
+        return {field[0].toInt(), field[1].toInt(), field[2].toDouble(), field[3].toDouble(),
+                field[4].toInt(), field[5].toInt(), {first, first + z.numel()}};
     }
 
     // Make a verified trace a reference; returns how many are held.
@@ -79,7 +84,8 @@ class Model {
             module.eval();
             return module;
         } catch (const c10::Error& error) {
-            throw std::runtime_error(std::string("it has its checksum but is no loadable TorchScript: ") + error.what_without_backtrace());
+            const std::string why = error.what_without_backtrace();
+            throw std::runtime_error("it has its checksum but is no loadable TorchScript: " + why);
         }
     }
 
