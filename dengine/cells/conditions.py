@@ -93,9 +93,7 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
         "missed_grasp": replace(right, fault="missed_grasp"),
         "weak_grip": replace(right, fault="weak_grip", grip_n=weak_grip_n),
         "debris": replace(right, fault="debris", debris_mm=debris_mm),
-        "wrong_part": replace(
-            right, fault="wrong_part", extra_length_mm=extra_length_mm, extra_width_mm=extra_width_mm
-        ),
+        "wrong_part": replace(right, fault="wrong_part", extra_length_mm=extra_length_mm, extra_width_mm=extra_width_mm),
     }
     shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
     return faults[str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))]

@@ -14,6 +14,7 @@ _WHERE = {
     "conv": ("conv", "ConvReducer"),
     "umap": ("umap", "UMAPReducer"),
     "pca": ("linear", "PCAReducer"),
+    "rocket": ("rocket", "RocketReducer"),
 }
 
 

@@ -105,6 +105,7 @@ class FitReport:
 
     n_steps: int = 0
     holdout_loss: float = float("nan")
+    note: str = ""
 
 
 def uses_labels(reducer: Any) -> bool:
@@ -199,8 +200,9 @@ class _Native(OneSpace):
         return _float32(self.reducer.embed_own(X, folds))
 
     def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), as `embed_own`; an `embedding_` that it may have is its own affair."""
-        return self.embed_own(X, folds)
+        """(n, C, T) -> (n, d), from what the fit computed where the reducer kept it."""
+        fitted = getattr(self.reducer, "embed_fitted", self.reducer.embed_own)
+        return _float32(fitted(X, folds))
 
     def transform(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, d)."""
@@ -291,4 +293,5 @@ def _float32(Z: Any) -> Floats:
 
 
 def _report(reducer: Any) -> FitReport:
-    return FitReport(int(getattr(reducer, "n_steps_", 0)), float(getattr(reducer, "holdout_loss_", float("nan"))))
+    steps, loss = getattr(reducer, "n_steps_", 0), getattr(reducer, "holdout_loss_", float("nan"))
+    return FitReport(int(steps), float(loss), str(getattr(reducer, "note_", "")))

@@ -22,26 +22,79 @@ PATCH_SHARE = 20  # a patch is this part of a trace: a contact event, not a samp
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 
 
-class TraceFeatures(nn.Module):
-    """(B, C, T) raw traces -> (B, P) standardised features; holds every constant it needs.
+class Features(nn.Module):
+    """(B, C, T) raw traces -> (B, P) standardised features; holds every constant it needs, and reads no label.
 
-    channels, samples : C and T.  segments, filters, regions : S, F and R of the module's docstring.
+    A kind of features gives `raw` and `learn_filters`.
     """
 
     shift: Tensor
     scale: Tensor
-    kernel: Tensor
-    bias: Tensor
     offset: Tensor
     gain: Tensor
 
-    def __init__(self, channels: int, samples: int, segments: int, filters: int, regions: int) -> None:
+    def __init__(self, channels: int, n_features: int) -> None:
         super().__init__()
+        # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
+        self.register_buffer("shift", torch.zeros(channels, 1))
+        self.register_buffer("scale", torch.ones(channels, 1))
+        self.register_buffer("offset", torch.zeros(n_features))
+        self.register_buffer("gain", torch.ones(n_features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
+        f = torch.addcmul(self.offset, self.raw(x), self.gain)
+        return f.clamp(-4.0, 4.0)  # CLIP: a scripted method reads no global
+
+    def raw(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P), not standardised."""
+        raise NotImplementedError
+
+    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+        """Set what a kind learns from traces (n, C, T), their channels scaled."""
+        raise NotImplementedError
+
+    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
+        """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
+        wide = X.double()
+        centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
+        scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
+        self.scale.copy_(scale[:, None])
+        self.shift.copy_((-centre * scale)[:, None])
+        some = X[torch.from_numpy(rng.permutation(len(X))[:PATCH_TRACES])]
+        self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
+
+    def standardise(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Set the features' mean and deviation from raw features (n, P).
+
+        Returns those standardised, (n, P), and how they were before: ratio * f + shift, each (P,).
+        """
+        gain, offset = self.gain.clone(), self.offset.clone()
+        wide = raw.double()
+        deviation = wide.std(0, unbiased=False)
+        floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
+        self.gain.copy_(1.0 / (deviation + floor))
+        self.offset.copy_(-wide.mean(0) / (deviation + floor))
+        ratio = gain / self.gain
+        return torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP), ratio, offset - ratio * self.offset
+
+
+class ConvFeatures(Features):
+    """Segment statistics of the trace, and of learned filters over it.
+
+    channels, samples : C and T.  segments, filters, regions : S, F and R of the module's docstring.
+    """
+
+    kernel: Tensor
+    bias: Tensor
+
+    def __init__(self, channels: int, samples: int, segments: int, filters: int, regions: int) -> None:
         if samples < 2 * segments or samples < 4 * regions:
             raise SettingError(
                 f"Expected at least {max(2 * segments, 4 * regions)} samples for {segments} segments and "
                 f"{regions} regions, got {samples}; lower `segments` or record longer."
             )
+        super().__init__(channels, 4 * channels * segments + filters * regions)
         self.channels, self.segments, self.regions = channels, segments, regions
         self.length = samples // segments
         self.head = samples - segments * self.length  # left out at the start: the end of an insertion tells most
@@ -53,19 +106,8 @@ class TraceFeatures(nn.Module):
             raise SettingError(f"Expected at most {frames} regions for {samples} samples, got {regions}.")
         # Frames start late enough for the last one to end with the trace.
         self.skip = samples - self.patch - (regions * self.per_region - 1) * self.stride
-        n_features = 4 * channels * segments + filters * regions
-        # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
-        self.register_buffer("shift", torch.zeros(channels, 1))
-        self.register_buffer("scale", torch.ones(channels, 1))
         self.register_buffer("kernel", torch.zeros(filters, channels, self.patch))
         self.register_buffer("bias", torch.zeros(filters))
-        self.register_buffer("offset", torch.zeros(n_features))
-        self.register_buffer("gain", torch.ones(n_features))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
-        f = torch.addcmul(self.offset, self.raw(x), self.gain)
-        return f.clamp(-4.0, 4.0)  # CLIP: a scripted method reads no global
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P), not standardised."""
@@ -78,15 +120,9 @@ class TraceFeatures(nn.Module):
         h = h.view(x.size(0), self.kernel.size(0), self.regions, self.per_region).mean(3)  # (B, F, L) -> (B, F, R)
         return torch.cat([mean, deviation, pieces.amin(2), pieces.amax(2), h.flatten(1)], 1)
 
-    def learn(self, X: Tensor, rng: np.random.Generator) -> None:
-        """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
-        wide = X.double()
-        centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
-        scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
-        self.scale.copy_(scale[:, None])
-        self.shift.copy_((-centre * scale)[:, None])
-        some = X[torch.from_numpy(rng.permutation(len(X))[:PATCH_TRACES])]
-        patches = torch.addcmul(self.shift, some, self.scale).unfold(2, self.patch, self.stride)  # (n, C, L, patch)
+    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+        """Whitened principal components of the patches, overlapping, of traces (n, C, T)."""
+        patches = x.unfold(2, self.patch, self.stride)  # (n, C, L, patch)
         patches = patches.transpose(1, 2).flatten(2).flatten(0, 1)  # (n * L, C * patch)
         patches = patches[torch.from_numpy(rng.permutation(len(patches))[:PATCHES])].double()
         mean = patches.mean(0)
@@ -100,15 +136,6 @@ class TraceFeatures(nn.Module):
         kernel[:found] = _signed(axes[:found]) * gain[:found, None]
         self.kernel.copy_(kernel.view_as(self.kernel))
         self.bias.copy_(-kernel @ mean)
-
-    def standardise(self, raw: Tensor) -> Tensor:
-        """Set the features' mean and deviation from raw features (n, P), and return those standardised."""
-        wide = raw.double()
-        deviation = wide.std(0, unbiased=False)
-        floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
-        self.gain.copy_(1.0 / (deviation + floor))
-        self.offset.copy_(-wide.mean(0) / (deviation + floor))
-        return torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP)
 
 
 def _signed(axes: Tensor) -> Tensor:

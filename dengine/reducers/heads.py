@@ -9,13 +9,13 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
 
 NEWTON_STEPS = 12
+WORSE = 1.5  # a head whose held-out loss is this many times its last one's is not taken
 CONVERGED = 1e-5  # largest change of a weight
 PLANE_STEPS = 300
 GRAPH_ROWS = 2000  # all pairwise distances of 2000 rows take 30 ms
@@ -38,12 +38,15 @@ class CrossFittedScores(nn.Module):
 
     weight: Tensor
     bias: Tensor
+    losses: Tensor
 
     def __init__(self, n_features: int, folds: int, dim: int) -> None:
         super().__init__()
         self.folds, self.dim = folds, dim
         self.register_buffer("weight", torch.zeros(folds + 1, n_features))  # K heads, then the second axis
         self.register_buffer("bias", torch.zeros(folds + 1))
+        self.register_buffer("losses", torch.full((folds,), float("inf"), dtype=torch.float64))
+        self.kept: list[int] = []
 
     def forward(self, g: Tensor) -> Tensor:
         """(B, P) -> (B, K, d)."""
@@ -54,26 +57,40 @@ class CrossFittedScores(nn.Module):
         second = torch.tanh(s[:, self.folds :]) * 0.02  # seen in a picture, small against a radius of 0.05
         return torch.cat([p, second.unsqueeze(2).expand_as(p)], 2)
 
-    def train_on(
-        self, g: Tensor, y: Tensor, folds: Tensor, l2: float, stop: Stop | None
-    ) -> tuple[int, NDArray[np.float64]]:
-        """Newton steps from the present weights. Returns (steps, (K,) leave-one-out log losses)."""
+    def carry_over(self, ratio: Tensor, shift: Tensor) -> None:
+        """Give the scores they had when features were ratio * g + shift: standardised anew, not moved."""
+        self.bias += self.weight @ shift
+        self.weight *= ratio
+
+    def train_on(self, g: Tensor, y: Tensor, folds: Tensor, l2: float, stop: Stop | None) -> int:
+        """Newton steps from the present weights; returns how many.
+
+        Sets `losses` (K,), each head's leave-one-out log loss. A head whose loss is `WORSE` times what it was keeps its
+        earlier weights (`kept` names it): its own gate, since a common one would let fold k's labels choose head k.
+        """
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
-        heads = []
-        for k in range(self.folds):
-            outside = folds != k  # Fold k never trains head k, or its labels would count themselves.
-            if len(torch.unique(y[outside])) < 2:
-                raise SettingError(
-                    f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of one; "
-                    "collect more labels before the first fit."
-                )
-            start = torch.cat([self.weight[k], self.bias[k : k + 1]]).double()
-            heads.append(_NewtonHead(g[outside], y[outside].double(), start, l2))
+        heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
         steps = _interleave(heads, stop)
-        self.weight[: self.folds] = torch.stack([h.w[:-1] for h in heads]).float()
-        self.bias[: self.folds] = torch.stack([h.w[-1] for h in heads]).float()
+        self.kept = []
+        for k, head in enumerate(heads):
+            loss = head.leave_one_out_loss()
+            if loss > WORSE * float(self.losses[k]):  # false for the infinity before the first fit
+                self.kept.append(k)
+                continue
+            self.losses[k] = loss
+            self.weight[k], self.bias[k] = head.w[:-1].float(), head.w[-1].float()
         self._turn(g[:, :-1])
-        return steps, np.array([h.leave_one_out_loss() for h in heads])
+        return steps
+
+    def _head(self, k: int, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> "_NewtonHead":
+        # Fold k never trains head k, or its labels would count themselves.
+        if len(torch.unique(y[outside])) < 2:
+            raise SettingError(
+                f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of one; "
+                "collect more labels before the first fit."
+            )
+        start = torch.cat([self.weight[k], self.bias[k : k + 1]]).double()
+        return _NewtonHead(g[outside], y[outside].double(), start, l2)
 
     def _turn(self, g: Tensor) -> None:
         """The second axis: the first principal direction of the features, no label read, its sign as it was."""
@@ -169,6 +186,12 @@ class NeighbourPlane(nn.Module):
             self.linear.weight.copy_(unit)
             self.linear.bias.copy_(-unit.float() @ g.mean(0))
 
+    def carry_over(self, ratio: Tensor, shift: Tensor) -> None:
+        """Keep the points where they were when features were ratio * g + shift: standardised anew, not moved."""
+        for layer in (self.linear, self.inner):
+            layer.bias.add_(layer.weight @ shift)
+            layer.weight.mul_(ratio)
+
     def train_on(
         self, g: Tensor, neighbours: int, batch: int, generator: torch.Generator, stop: Stop | None
     ) -> tuple[int, float]:
@@ -199,3 +222,6 @@ def neighbour_edges(g: Tensor, neighbours: int, generator: torch.Generator) -> T
     k = min(neighbours, len(rows) - 1)
     nearest = torch.cdist(g[rows], g[rows]).topk(k + 1, largest=False).indices[:, 1:]  # (m, k), itself left out
     return torch.stack([rows.repeat_interleave(k), rows[nearest].flatten()], 1)
+
+
+Head = CrossFittedScores | NeighbourPlane

@@ -1,0 +1,104 @@
+"""MiniRocket's idea as a reducer: fixed convolution kernels, the share of positive values, cross-fitted heads.
+
+    x (B, C, T) -> 84 kernels of length 9, each at D dilations -> share of outputs over a bias     (B, 84*D)
+                -> standardise -> head k: P(success), from outside fold k                           (B, K, d)
+
+Nothing of a kernel is learned; its bias is a quantile of what it gives on the first traces it is fitted on, labels unread.
+So a trace's features are computed once and kept, and a retrain is the heads' closed form. The strongest cheap rival.
+Source: Dempster, Schmidt and Webb (2021), MiniRocket, KDD; arXiv:2012.08791. Here with one bias a kernel and dilation.
+"""
+
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F  # noqa: N812  # torch's own name for it
+
+from ..errors import SettingError
+from ..folds import content_hash
+from .feature_reducer import FeatureReducer, Floats
+from .features import Features
+
+LENGTH = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
+
+
+class RocketFeatures(Features):
+    """(B, C, T) raw traces -> (B, 84*D) standardised shares of positive values."""
+
+    kernel: Tensor
+    bias: Tensor
+
+    def __init__(self, channels: int, samples: int, dilations: int) -> None:
+        if samples < LENGTH:
+            raise SettingError(f"Expected at least {LENGTH} samples, got {samples}.")
+        widest = np.log2((samples - 1) / (LENGTH - 1)) if samples > LENGTH else 0.0
+        spread = np.unique(np.floor(2.0 ** np.linspace(0.0, max(0.0, widest), dilations)).astype(int))
+        kernels = _kernels()
+        super().__init__(channels, len(kernels) * len(spread))
+        self.dilations = [int(d) for d in spread]
+        self.register_buffer("kernel", kernels[:, None, :].repeat(1, channels, 1))  # (84, C, 9)
+        self.register_buffer("bias", torch.zeros(len(spread), len(kernels), 1))
+
+    def raw(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, 84*D), not standardised."""
+        x = torch.addcmul(self.shift, x, self.scale)
+        shares: list[Tensor] = []
+        for i, dilation in enumerate(self.dilations):
+            shares.append((self.convolve(x, dilation) > self.bias[i]).to(torch.float32).mean(2))
+        return torch.cat(shares, 1)
+
+    def convolve(self, x: Tensor, dilation: int) -> Tensor:
+        """(B, C, T) -> (B, 84, T), zeros beyond the ends."""
+        return F.conv1d(x, self.kernel, dilation=dilation, padding=4 * dilation)
+
+    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+        """Set each bias to a quantile of the kernel's output on one trace drawn at random; low-discrepancy quantiles."""
+        golden = (np.sqrt(5.0) + 1.0) / 2.0
+        rows = torch.arange(self.kernel.size(0))
+        for i, dilation in enumerate(self.dilations):
+            drawn = torch.from_numpy(rng.integers(len(x), size=len(rows)))
+            own = self.convolve(x[drawn], dilation)[rows, rows]  # (84, T): drawn trace j through kernel j
+            places = (np.arange(1, len(rows) + 1) + i * len(rows)) * golden % 1.0
+            order = torch.from_numpy((places * (own.size(1) - 1)).astype(np.int64))
+            self.bias[i] = own.sort(1).values.gather(1, order[:, None])
+
+
+class RocketReducer(FeatureReducer):
+    """Trace -> point, by MiniRocket's features and cross-fitted logistic heads.
+
+    dilations : D, kernels' spreads between 1 and the length of the trace.
+    dim, folds, l2, seed : as in `ConvReducer`.
+    """
+
+    def __init__(self, *, dim: int = 2, folds: int = 5, dilations: int = 3, l2: float = 1.0, seed: int = 0) -> None:
+        self.dim = dim
+        self.folds = folds
+        self.dilations = dilations
+        self.l2 = l2
+        self.seed = seed
+
+    def make_features(self, channels: int, samples: int) -> Features:
+        """Shares of positive values."""
+        self._kept: dict[int, Any] = {}
+        return RocketFeatures(channels, samples, self.dilations)
+
+    def raw_features(self, traces: Floats) -> Tensor:
+        """(n, C, T) -> (n, P): computed once a trace and kept, since no kernel or bias ever changes."""
+        hashes = content_hash(traces).tolist()
+        new = [i for i, h in enumerate(hashes) if h not in self._kept]
+        if new:
+            for i, row in zip(new, super().raw_features(traces[new]), strict=True):
+                self._kept[hashes[i]] = row
+        features = torch.stack([self._kept[h] for h in hashes])
+        self._kept = dict(zip(hashes, features, strict=True))  # what has left the window leaves here too
+        return features
+
+
+def _kernels() -> Tensor:
+    """(84, 9): every way to place three 2s among -1s; each kernel sums to zero, so offsets do not matter."""
+    kernels = torch.full((84, LENGTH), -1.0)
+    for row, places in enumerate(combinations(range(LENGTH), 3)):
+        kernels[row, list(places)] = 2.0
+    return kernels
