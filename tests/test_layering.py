@@ -53,8 +53,6 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "importing": 6,
     "journal": 6,
     "onnx_export": 6,
-    "journal": 6,
-    "onnx_export": 6,
     "cli": 7,
 }
 HEAVY = {  # at the top of a module only in those dedicated to it, which are themselves imported where they are used
