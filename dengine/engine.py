@@ -230,8 +230,6 @@ class DataEngine:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
         self._collect(wait=True)
         self.new_labels = 0
-        if not len(self._window):
-            return RetrainReport(self.version, 0.0, 0, 0, False, "dropped: no labelled trace yet; report one first")
         return self._swap(self._retrainer.train(self._model or self._template))
 
     @property

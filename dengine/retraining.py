@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .errors import DengineError
+from .errors import DengineError, SettingError
 from .prediction import ModelPrediction
 from .reducers.base import StopRule
 from .store import Labelled
@@ -134,6 +134,8 @@ def train_candidate(successor: AnyModel, data: Labelled, limits: Limits) -> Cand
     deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
     stop = StopRule(deadline, limits.max_steps)
     try:
+        if not len(data.seq):
+            raise SettingError("there is no labelled trace yet; report one first")
         successor.fit(data.traces, data.labels, hashes=data.hashes, stop=stop)
         reason = gate(successor)
     except DengineError as error:

@@ -121,7 +121,7 @@ def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text: str,
 
 
 def test_an_unknown_recipe_lists_the_known_ones() -> None:
-    with pytest.raises(SettingError, match=r"conv, umap, pca, paper.*covn is neither"):
+    with pytest.raises(SettingError, match=r"conv, umap, pca, rocket, paper.*covn is neither"):
         Recipe.load("covn")
 
 
