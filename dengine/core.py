@@ -24,13 +24,14 @@ class Core(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.register_buffer("scale", scale[:, None])
+        self.scaled = bool((scale != 1.0).any())
         self.judge = judge
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
         """(C, T) one trace -> (K, d), scaled."""
-        z: Tensor = self.encoder(x.unsqueeze(0))[0] / self.scale
-        return z
+        z: Tensor = self.encoder(x.unsqueeze(0))[0]
+        return z / self.scale if self.scaled else z
 
     @torch.jit.export
     def hold(self, x: Tensor, label: float, space: int) -> None:

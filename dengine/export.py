@@ -71,7 +71,7 @@ def describe(model: ModelPrediction, spec: TraceSpec, context: dict[str, Any]) -
     ring = model.index.ring
     held = ring.size()
     digest = hashlib.sha256()
-    for array in (ring.points[:, :held], ring.labels[:held], ring.spaces[:held]):
+    for array in (ring.points[:, :held], ring.labels[1, :held], ring.spaces[:held]):
         digest.update(np.ascontiguousarray(array.numpy()).tobytes())
     return {
         "schema": SCHEMA,

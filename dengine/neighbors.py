@@ -20,7 +20,7 @@ Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 class ReferenceRing(nn.Module):
     """A bounded block of labelled points; the oldest leaves first, whatever its label.
 
-    points (d, capacity) float32, one row a dimension; labels (capacity,) float32, 1.0 or 0.0;
+    points (d, capacity) float32, one row a dimension; labels (2, capacity) float32, ones, and 1.0 or 0.0;
     spaces (capacity,) int64; total () int64, points ever added.
     """
 
@@ -34,7 +34,7 @@ class ReferenceRing(nn.Module):
         self.dim = dim
         self.capacity = capacity
         self.register_buffer("points", torch.zeros(dim, capacity))
-        self.register_buffer("labels", torch.zeros(capacity))
+        self.register_buffer("labels", torch.ones(2, capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
         self.register_buffer("total", torch.zeros((), dtype=torch.int64))
 
@@ -49,7 +49,7 @@ class ReferenceRing(nn.Module):
         total = int(self.total.item())
         slot = total % self.capacity
         self.points[:, slot] = point
-        self.labels[slot] = label
+        self.labels[1, slot] = label
         self.spaces[slot] = space
         self.total.fill_(total + 1)
 
@@ -57,7 +57,7 @@ class ReferenceRing(nn.Module):
     def squared_distances(self, z: Tensor) -> Tensor:
         """(K, d) one query in every space -> (size,) squared distance to each point, in that point's own space."""
         n = self.size()
-        own = z.t().contiguous()  # (d, K)
+        own = z.t()  # (d, K)
         if z.size(0) > 1:
             own = own.index_select(1, self.spaces[:n])  # (d, size): a reference of fold k is met in space k only
         return (self.points[:, :n] - own).square_().sum(0)
@@ -76,10 +76,9 @@ class ReferenceRing(nn.Module):
             limit = float(distances.kthvalue(min(n, int(math_ceil(fraction * n))))[0].item())
             if not limit < float("inf"):
                 return 0, 0  # beyond all measure: at an infinite distance every reference would tie
-        inside = (distances <= limit).to(torch.float32)
-        k = int(torch.dot(inside, inside).item())  # exact below 2**24 points
-        n_success = int(torch.dot(inside, self.labels[:n]).item())
-        return n_success, k - n_success
+        inside = distances.clone().le_(limit)  # 1.0 or 0.0, without a mask in between
+        counts: list[float] = torch.mv(self.labels[:, :n], inside).tolist()  # exact below 2**24 points
+        return int(counts[1]), int(counts[0]) - int(counts[1])
 
 
 def math_ceil(x: float) -> int:
@@ -117,7 +116,7 @@ class RadiusIndex:
         keep = slice(max(0, len(z) - ring.capacity), None)  # of more than fit, the newest
         slots = (total + np.arange(len(z))[keep]) % ring.capacity
         ring.points[:, slots] = torch.from_numpy(z[keep].T)
-        ring.labels[slots] = torch.from_numpy(y[keep])
+        ring.labels[1, slots] = torch.from_numpy(y[keep])
         ring.spaces[slots] = torch.from_numpy(k[keep])
         ring.total.fill_(total + len(z))
 

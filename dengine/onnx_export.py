@@ -123,7 +123,7 @@ class Twin(nn.Module):
         places = torch.full((model.n_spaces, ring.dim, n), FAR)
         places[ring.spaces[:n], :, torch.arange(n)] = ring.points[:, :n].T
         self.register_buffer("places", places)
-        self.register_buffer("success", ring.labels[:n].to(torch.int64))
+        self.register_buffer("success", ring.labels[1, :n].to(torch.int64))
         self.held = n
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:

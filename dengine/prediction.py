@@ -185,7 +185,7 @@ class ModelPrediction:
             "trace_shape": np.array(self.trace_shape),
             "scale": self.scale,
             "points": ring.points[:, :n].numpy().copy(),
-            "labels": ring.labels[:n].numpy().astype(np.int8),
+            "labels": ring.labels[1, :n].numpy().astype(np.int8),
             "spaces": ring.spaces[:n].numpy().copy(),
             "total": ring.total.numpy().copy(),
         }
@@ -202,7 +202,7 @@ class ModelPrediction:
         self.index = RadiusIndex(len(state["points"]), self.classifier.capacity)
         ring, n = self.index.ring, state["points"].shape[1]
         ring.points[:, :n] = torch.from_numpy(np.array(state["points"]))
-        ring.labels[:n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
+        ring.labels[1, :n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
         ring.spaces[:n] = torch.from_numpy(np.array(state["spaces"]))
         ring.total.fill_(int(state["total"]))
         return self.ready()

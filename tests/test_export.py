@@ -390,7 +390,7 @@ def ring_of(exported: ExportedModel) -> dict[str, np.ndarray]:
     buffers = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
     return {
         "total": buffers["total"],
-        "labels": buffers["labels"],
+        "labels": buffers["labels"][1],
         "spaces": buffers["spaces"],
         "points": buffers["points"],
     }

@@ -74,7 +74,7 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
         model.add(x, y)
     ring, fold = model.index.ring, content_fold(data.X, 2)
     assert (ring.spaces[:200].numpy() == fold).all()
-    assert (ring.labels[:200].numpy() == data.y).all()
+    assert (ring.labels[1, :200].numpy() == data.y).all()
     own = model.spaces.embed_own(data.X[150:, None, :], fold[150:]) / model.scale[fold[150:], None]
     np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, own, atol=1e-5)
 
@@ -83,7 +83,7 @@ def test_counts_are_summed_over_the_spaces_by_brute_force(data: Dataset) -> None
     model = lda(3).fit(data.X[:150], data.y[:150])
     Z = model.spaces.embed(data.X[150:, None, :]) / model.scale[None, :, None]
     ring = model.index.ring
-    points, spaces, labels = (a[..., :150].numpy() for a in (ring.points, ring.spaces, ring.labels))
+    points, spaces, labels = (a[..., :150].numpy() for a in (ring.points, ring.spaces, ring.labels[1]))
     near = ((Z[:, spaces] - points.T[None]) ** 2).sum(axis=2) <= 0.5**2
     n_success, n_failure = model.count(data.X[150:])
     np.testing.assert_array_equal(n_success, (near & (labels == 1)).sum(axis=1))

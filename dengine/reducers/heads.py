@@ -14,6 +14,7 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
 
+SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 NEWTON_STEPS = 12
 WORSE = 1.5  # a head whose held-out loss is this many times its last one's is not taken
 CONVERGED = 1e-5  # largest change of a weight
@@ -38,24 +39,23 @@ class CrossFittedScores(nn.Module):
 
     weight: Tensor
     bias: Tensor
+    unit: Tensor
     losses: Tensor
 
     def __init__(self, n_features: int, folds: int, dim: int) -> None:
         super().__init__()
         self.folds, self.dim = folds, dim
-        self.register_buffer("weight", torch.zeros(folds + 1, n_features))  # K heads, then the second axis
-        self.register_buffer("bias", torch.zeros(folds + 1))
+        # Axis 2 is the same in every space; its copies cost less than an op to spread it.
+        self.register_buffer("weight", torch.zeros(folds * dim, n_features))
+        self.register_buffer("bias", torch.zeros(folds * dim))
+        self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
         self.register_buffer("losses", torch.full((folds,), float("inf"), dtype=torch.float64))
         self.kept: list[int] = []
 
     def forward(self, g: Tensor) -> Tensor:
         """(B, P) -> (B, K, d)."""
-        s = F.linear(g, self.weight, self.bias)  # (B, K + 1)
-        p = torch.sigmoid(s[:, : self.folds]).unsqueeze(2)  # (B, K, 1)
-        if self.dim == 1:
-            return p
-        second = torch.tanh(s[:, self.folds :]) * 0.02  # seen in a picture, small against a radius of 0.05
-        return torch.cat([p, second.unsqueeze(2).expand_as(p)], 2)
+        z = torch.sigmoid(F.linear(g, self.weight, self.bias)).mul_(self.unit)  # (B, K*d)
+        return z.view(-1, self.folds, self.dim)
 
     def carry_over(self, ratio: Tensor, shift: Tensor) -> None:
         """Give the scores they had when features were ratio * g + shift: standardised anew, not moved."""
@@ -78,8 +78,9 @@ class CrossFittedScores(nn.Module):
                 self.kept.append(k)
                 continue
             self.losses[k] = loss
-            self.weight[k], self.bias[k] = head.w[:-1].float(), head.w[-1].float()
-        self._turn(g[:, :-1])
+            self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
+        if self.dim == 2:
+            self._turn(g[:, :-1])
         return steps
 
     def _head(self, k: int, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> "_NewtonHead":
@@ -89,15 +90,17 @@ class CrossFittedScores(nn.Module):
                 f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of one; "
                 "collect more labels before the first fit."
             )
-        start = torch.cat([self.weight[k], self.bias[k : k + 1]]).double()
+        row = k * self.dim
+        start = torch.cat([self.weight[row], self.bias[row : row + 1]]).double()
         return _NewtonHead(g[outside], y[outside].double(), start, l2)
 
     def _turn(self, g: Tensor) -> None:
         """The second axis: the first principal direction of the features, no label read, its sign as it was."""
         centred = g - g.mean(0)
         sizes, axes = torch.linalg.eigh(centred.T @ centred / len(g))
-        direction = axes[:, -1] / sizes[-1].clamp(min=1e-12).sqrt()
-        self.weight[-1] = (direction if direction @ self.weight[-1].double() >= 0 else -direction).float()
+        direction = 2.0 * axes[:, -1] / sizes[-1].clamp(min=1e-12).sqrt()  # of one deviation at both sides, in the sigmoid
+        self.weight[1::2] = (direction if direction @ self.weight[1].double() >= 0 else -direction).float()
+        self.bias[1::2] = 0.0  # the features are centred
 
 
 class _NewtonHead:
