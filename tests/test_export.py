@@ -390,7 +390,7 @@ def ring_of(exported: ExportedModel) -> dict[str, np.ndarray]:
     buffers = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
     return {
         "total": buffers["total"],
-        "labels": buffers["labels"][1],
+        "labels": buffers["labels"],
         "spaces": buffers["spaces"],
         "points": buffers["points"],
     }
@@ -442,7 +442,7 @@ def test_the_oldest_reference_leaves_first_whatever_its_label(make_data: Callabl
         np.testing.assert_array_equal(ring["points"][:, 15:30], points[:, 15:30])  # the newest of the first ones stay
         assert (ring["points"][:, :15] != points[:, :15]).any(axis=0).all()  # the oldest fifteen have left
     np.testing.assert_array_equal(orders[0]["points"], orders[1]["points"])
-    np.testing.assert_array_equal(orders[0]["labels"], 1 - orders[1]["labels"])
+    np.testing.assert_array_equal(orders[0]["labels"][1], 1 - orders[1]["labels"][1])
 
 
 def test_a_faulty_trace_is_not_learned_from(file: Path, many: np.ndarray) -> None:
