@@ -11,6 +11,7 @@ from sklearn.utils import get_tags
 from dengine.errors import SettingError, TraceError
 from dengine.reducers.base import StopRule, content_fold
 from dengine.reducers.conv import ConvReducer
+from dengine.reducers.heads import CrossFittedScores
 
 BOTH = pytest.mark.parametrize("objective", ["supervised", "label_free"])
 STEPS = StopRule(max_steps=20)
@@ -259,3 +260,32 @@ def test_a_trace_of_another_shape_is_an_error_that_names_both():
 def test_no_traces_embed_to_no_points():
     reducer, X, _ = fitted()
     assert reducer.embed(X[:0]).shape == (0, 5, 2)
+
+
+def test_a_head_that_would_do_worse_than_the_base_rate_keeps_its_earlier_weights_and_the_others_do_not():
+    rng = np.random.default_rng(0)
+    g = torch.from_numpy(rng.normal(size=(2000, 50)).astype(np.float32))
+    y = torch.from_numpy((rng.random(2000) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64))
+    folds = torch.from_numpy(rng.integers(0, 2, 2000))
+    heads = CrossFittedScores(50, folds=2, dim=1)
+    heads.train_on(g, y, folds, 0.01, None)
+    learned = heads.weight.clone()
+    assert heads.kept == []
+    few = torch.cat(
+        [(folds == 0).nonzero()[:40, 0], (folds == 1).nonzero()[:900, 0]]
+    )  # head 1 sees forty rows, head 0 enough
+    heads.train_on(g[few], y[few], folds[few], 0.01, None)
+    assert heads.kept == [1]
+    assert torch.equal(heads.weight[1], learned[1])
+    assert not torch.equal(heads.weight[0], learned[0])
+
+
+def test_features_standardised_anew_leave_the_scores_of_a_warm_start_where_they_were():
+    X, y = traces(200)
+    reducer = ConvReducer(folds=2).fit(X[:100], y[:100])
+    before = reducer.embed(X)
+    with torch.no_grad():
+        features, head = reducer.net_.features, reducer.net_.head
+        _, ratio, shift = features.standardise(reducer.raw_features(X[:, None, :] if X.ndim == 2 else X))
+        head.carry_over(ratio, shift)
+    assert np.abs(reducer.embed(X)[..., 0] - before[..., 0]).max() < 0.02  # but for what is clipped

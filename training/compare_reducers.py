@@ -1,11 +1,11 @@
 """Reducers against each other, with as many tries for each: settings chosen on some seeds, reported on others.
 
-    python training/compare_reducers.py choose --data insertion --reducers conv,umap,pca --out out/
-    python training/compare_reducers.py report --data insertion --reducers conv,umap,pca --out out/
+    python training/compare_reducers.py choose --data insertion --reducers conv,umap,pca,rocket --out out/
+    python training/compare_reducers.py report --data insertion --reducers conv,umap,pca,rocket --out out/
 
 `choose` replays every try of TRIES on seeds 0 to 9 at alpha 0.1, LB 90 %, and names the one with the most certain
-decisions among those whose pooled precision and NPV meet LB. The recipes in models/recipes are what it chose on the
-screw-driving set at 400 samples. `report` replays the recipes as they are on seeds 100 to 129, at both policies.
+decisions among those whose pooled precision and NPV meet LB. `report` replays the recipes as they are, on seeds 100 to
+129, at both policies.
 Both write a row a replay to a CSV, appending, so that a long run can be done in parts.
 """
 
@@ -22,7 +22,6 @@ from rich.table import Table
 from dengine import Recipe, load_dataset
 from dengine.experiments.grid import run_replays
 
-POLICIES = ((0.1, 0.9), (0.05, 0.95))
 # The same number of tries for each reducer: its radius, the one setting that every reducer has.
 TRIES: dict[str, tuple[float, ...]] = {
     "conv": (0.03, 0.05, 0.07, 0.1),
@@ -80,17 +79,19 @@ def main() -> None:
     parser.add_argument("--samples", type=int)
     parser.add_argument("--cycles", type=int, default=1503)
     parser.add_argument("--reducers", default="conv,umap,pca")
+    parser.add_argument("--policies", default="0.1:0.9,0.05:0.95", help="alpha:LB, for report")
     parser.add_argument("--seeds", help="first:last, instead of 0:10 or 100:130")
     parser.add_argument("--n-jobs", type=int, default=-1)
     parser.add_argument("--out", type=Path, default=Path("out"))
     args = parser.parse_args()
     first, last = map(int, (args.seeds or ("0:10" if args.do == "choose" else "100:130")).split(":"))
+    policies = [tuple(map(float, pair.split(":"))) for pair in args.policies.split(",")]
     data = load_dataset(args.data, args.samples)
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{args.do}_{data.name}.csv"
     for reducer in args.reducers.split(","):
         recipes = tries(reducer) if args.do == "choose" else {
-            f"alpha {a}, LB {b}": Recipe.load(reducer).with_policy(alpha=a, lower_bound=b) for a, b in POLICIES
+            f"alpha {a}, LB {b}": Recipe.load(reducer).with_policy(alpha=a, lower_bound=b) for a, b in policies
         }  # fmt: skip
         rows = replays(data, recipes, range(first, last), args)
         rows.to_csv(path, mode="a", header=not path.exists(), index=False)

@@ -118,7 +118,7 @@ class FeatureReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
         self.holdout_losses_ = np.array(losses, dtype=np.float64)
         self.holdout_loss_ = float(self.holdout_losses_.mean())
         heads = ", ".join(str(k) for k in kept)
-        self.note_ = f"head {heads} kept its earlier weights, whose held-out loss was lower by far" if kept else ""
+        self.note_ = f"kept the earlier weights of head {heads}: new ones did worse than the base rate" if kept else ""
 
     def embed(self, X: ArrayLike) -> Floats:
         """(n, K, d) float32: every trace in every space."""

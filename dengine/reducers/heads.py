@@ -16,7 +16,6 @@ from ..errors import SettingError
 
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 NEWTON_STEPS = 12
-WORSE = 1.5  # a head whose held-out loss is this many times its last one's is not taken
 CONVERGED = 1e-5  # largest change of a weight
 PLANE_STEPS = 300
 GRAPH_ROWS = 2000  # all pairwise distances of 2000 rows take 30 ms
@@ -49,7 +48,7 @@ class CrossFittedScores(nn.Module):
         self.register_buffer("weight", torch.zeros(folds * dim, n_features))
         self.register_buffer("bias", torch.zeros(folds * dim))
         self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
-        self.register_buffer("losses", torch.full((folds,), float("inf"), dtype=torch.float64))
+        self.register_buffer("losses", torch.zeros(folds, dtype=torch.float64))
         self.kept: list[int] = []
 
     def forward(self, g: Tensor) -> Tensor:
@@ -65,19 +64,19 @@ class CrossFittedScores(nn.Module):
     def train_on(self, g: Tensor, y: Tensor, folds: Tensor, l2: float, stop: Stop | None) -> int:
         """Newton steps from the present weights; returns how many.
 
-        Sets `losses` (K,), each head's leave-one-out log loss. A head whose loss is `WORSE` times what it was keeps its
-        earlier weights (`kept` names it): its own gate, since a common one would let fold k's labels choose head k.
+        Sets `losses` (K,), each head's leave-one-out log loss. A head that says held-out labels worse than their base rate
+        does, and worse than its earlier weights, keeps those (`kept` names it): its own gate, outside fold k, since a
+        common one would let fold k's labels choose head k.
         """
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
         heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
         steps = _interleave(heads, stop)
         self.kept = []
         for k, head in enumerate(heads):
-            loss = head.leave_one_out_loss()
-            if loss > WORSE * float(self.losses[k]):  # false for the infinity before the first fit
+            self.losses[k] = head.leave_one_out_loss()
+            if self.losses[k] > max(head.first_loss, head.base_rate_loss()):
                 self.kept.append(k)
                 continue
-            self.losses[k] = loss
             self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
         if self.dim == 2:
             self._turn(g[:, :-1])
@@ -114,6 +113,7 @@ class _NewtonHead:
         self.ridge = torch.full_like(w, l2)
         self.ridge[-1] = 1e-3  # the base rate is not shrunk
         self.done = False
+        self.first_loss = float(F.binary_cross_entropy_with_logits(g @ w, y))
 
     def loss(self, w: Tensor) -> Tensor:
         return F.binary_cross_entropy_with_logits(self.g @ w, self.y, reduction="sum") + 0.5 * (self.ridge * w) @ w
@@ -133,6 +133,10 @@ class _NewtonHead:
             d = d / 2.0
         # Each head stops on its own: a common test would let fold k's labels choose head k's last step.
         self.done = bool(d.abs().max() < CONVERGED)
+
+    def base_rate_loss(self) -> float:
+        """Mean log loss of the labels' own mean: what knowing nothing of a trace costs."""
+        return float(F.binary_cross_entropy(self.y.mean().expand_as(self.y), self.y))
 
     def leave_one_out_loss(self) -> float:
         """Mean log loss of every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4)."""
