@@ -132,8 +132,11 @@ class DataEngine:
 
     # ------------------------------------------------------------------------------------------------- decide
 
-    def decide(self, trace: ArrayLike) -> Decision:
-        """Decide on one trace, (T,) or (channels, T). TraceError for a wrong shape; whatever else fails becomes VERIFY."""
+    def decide(self, trace: ArrayLike, *, wait: bool = False) -> Decision:
+        """Decide on one trace, (T,) or (channels, T). TraceError for a wrong shape; whatever else fails becomes VERIFY.
+
+        wait : return only when the decision is on the disk; by default it is there before any report on it returns.
+        """
         self._collect()
         x = as_trace(trace, self.trace)
         if self.trace is None:
@@ -142,6 +145,8 @@ class DataEngine:
         judgement, reason = (NOTHING_KNOWN, REASONS[fault]) if fault else self._judge(x)
         decision = self._conclude(judgement, reason, hash_)
         self.store.put_decision(decision, x, hash_, quarantined=bool(fault))
+        if wait:
+            self.store.flush()
         return decision
 
     def _judge(self, x: NDArray[np.float32]) -> tuple[Judgement, Reason]:

@@ -1,5 +1,6 @@
 """The one loop: decide, report, retrain, run, open. Real reducers, real stores, real executors."""
 
+import sqlite3
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -597,3 +598,11 @@ def test_closing_waits_for_a_retrain_and_keeps_it(data: Dataset, tmp_path: Path)
     with DataEngine.open(url) as engine:
         assert engine.version == 1
         assert len(engine.model.index) == 45
+
+
+def test_a_decision_that_waits_is_on_the_disk_when_it_returns(data: Dataset, tmp_path: Path) -> None:
+    engine = make(RECIPE, store=tmp_path / "engine.db")
+    decision = engine.decide(data.X[0], wait=True)
+    with sqlite3.connect(tmp_path / "engine.db") as other:
+        assert other.execute("SELECT id FROM decision").fetchall() == [(decision.id,)]
+    engine.close()
