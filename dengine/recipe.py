@@ -131,7 +131,7 @@ def _escaped(character: str) -> str:
 RECIPES: dict[str, Recipe] = {
     "conv": Recipe("conv", radius=0.05),  # of a probability: the encoder's own unit
     "umap": Recipe("umap"),
-    "pca": Recipe("pca"),
+    "pca": Recipe("pca", radius=0.2),
     "rocket": Recipe("rocket", radius=0.05),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9)),
