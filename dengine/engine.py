@@ -39,7 +39,7 @@ from .resuming import resume
 from .retraining import Limits, Retrainer, Trained
 from .store import Store, StoredDecision, open_store
 from .traces import REASONS, TraceGate, as_trace, spec_of
-from .window import AnyModel, Window, hold, place
+from .window import AnyModel, Window, hold, place, prepare
 
 log = logging.getLogger("dengine")
 NOTHING_KNOWN = Judgement(Action.VERIFY, 0.0, 1.0, 0, 0, None)
@@ -261,6 +261,7 @@ class DataEngine:
     def _swap(self, trained: Trained) -> RetrainReport:
         model, seq = trained.candidate.model, trained.seq
         if model is not None:
+            prepare(model, self._model)
             self._window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
             self._model, self.version = model, self.version + 1  # one reference is swapped
         report = RetrainReport(

@@ -14,10 +14,9 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import nn
 
 from .classifier import WilsonRadiusClassifier
-from .core import Core, EmbeddedCore, build_core
+from .core import Answering, Core, EmbeddedCore, build_core
 from .folds import content_hash, fold_of
 from .neighbors import Counts, RadiusIndex
 from .records import Action
@@ -83,7 +82,7 @@ class ModelPrediction:
         self.classifier = classifier or WilsonRadiusClassifier()
         self.folds = folds
         self.spaces: Spaces = in_spaces(copy.deepcopy(self.reducer), folds)
-        self._core: Core | EmbeddedCore | None = None
+        self._answering: Answering | None = None
 
     @property
     def n_spaces(self) -> int:
@@ -111,13 +110,17 @@ class ModelPrediction:
         self.scale = np.ones(self.n_spaces, np.float32) if own_unit else _scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds)
-        return self.ready()
+        self._answering = None  # built by `ready`, or when it is asked
+        return self
 
-    def ready(self) -> Self:
-        """Build the module that answers; the one that an export saves."""
-        self._core = build_core(self.spaces, self.scale, self.classifier.new_judge(self.index))
-        for _ in range(WARM_UP if isinstance(self._core, nn.Module) else 0):
-            self.judge(np.zeros(self.trace_shape, dtype=np.float32))
+    def ready(self, like: ModelPrediction | None = None) -> Self:
+        """Build the module that answers, the one that an export saves; from an earlier model's, where they are alike."""
+        mould = None if like is None else like._answering
+        judge = self.classifier.new_judge(self.index)
+        self._answering = build_core(self.spaces, self.scale, judge, mould)
+        if self._answering.structure is not None and (mould is None or mould.structure != self._answering.structure):
+            for _ in range(WARM_UP):
+                self.judge(np.zeros(self.trace_shape, dtype=np.float32))
         return self
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
@@ -141,10 +144,12 @@ class ModelPrediction:
 
     @property
     def core(self) -> Core | EmbeddedCore:
-        """The module that answers; raises where nothing was fitted."""
-        if self._core is None:
+        """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
+        if not hasattr(self, "index"):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
-        return self._core
+        answering = self._answering or self.ready()._answering
+        assert answering is not None  # ready made it; for the type checker
+        return answering.core
 
     def judge(self, x: NDArray[np.float32]) -> Judgement:
         """The whole judgement on one trace (C, T)."""
@@ -205,16 +210,12 @@ class ModelPrediction:
         ring.labels[1, :n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
         ring.spaces[:n] = torch.from_numpy(np.array(state["spaces"]))
         ring.total.fill_(int(state["total"]))
-        return self.ready()
+        self._answering = None
+        return self
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
-        return self.__dict__ | {"_core": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        if hasattr(self, "index"):
-            self.ready()
+        return self.__dict__ | {"_answering": None}
 
 
 def _scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:

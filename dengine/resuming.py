@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .prediction import ModelPrediction
 from .store import Labelled, ModelVersion, Store
-from .window import AnyModel, Window, hold, place
+from .window import AnyModel, Window, hold, place, prepare
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ def resume(store: Store, template: AnyModel, window: Window) -> Resumed:
     if version is None:
         return Resumed(None, 0, len(labelled.seq))
     model = _restored(store, template, version.state, window.newest_seq)
+    prepare(model, None)
     trained_to = int(version.state["trained_on"][-1])
     # A stored state holds what came in during its retrain; a foreign model was refitted without that.
     _hold_since(model, store, version, labelled, version.last_seq if isinstance(model, ModelPrediction) else trained_to)

@@ -81,6 +81,16 @@ class Window:
                 hold(model, point, int(data.labels[i]), hash_)
 
 
+def prepare(model: AnyModel, answering: AnyModel | None) -> None:
+    """Have a model ready to answer before it is asked; one that fails at it will verify, and say so, on every part."""
+    if not isinstance(model, ModelPrediction):
+        return
+    try:
+        model.ready(answering if isinstance(answering, ModelPrediction) else None)
+    except Exception:
+        log.exception("the model that was trained cannot be made to answer")
+
+
 def place(model: AnyModel, trace: NDArray[np.float32], hash_: int) -> NDArray[np.float32] | None:
     """Where a trace would live as a reference; None where the model fails on it, which must cost neither cell nor label."""
     try:

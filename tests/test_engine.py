@@ -25,6 +25,7 @@ from dengine import (
     TraceError,
     TraceSpec,
 )
+from dengine.core import Answering
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import audited, content_hash
 from dengine.sql_store import SqlStore
@@ -309,7 +310,7 @@ def test_a_reducer_that_fails_on_a_trace_loses_no_label(data: Dataset) -> None:
 
         embed = __call__
 
-    engine.model._core = Broken()
+    engine.model._answering = Answering(Broken())
     decision = engine.decide(data.X[60])
     assert decision.reason is Reason.MODEL_ERROR
     engine.report(decision.id, bool(data.y[60]))

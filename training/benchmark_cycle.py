@@ -34,16 +34,18 @@ def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any
     retrains = np.concatenate([replay(data, recipe, seed).retrain_seconds for seed in range(args.replays)])
     whole = retrain_on_all(data, recipe, args.repeats)
     deciding = {"decide": decide_times(filled_engine(data, recipe), data)}
-    deciding["decide, retraining in a thread"] = beside(data, recipe, ThreadPoolExecutor(1))
-    deciding["decide, retraining in a process"] = beside(
-        data, recipe, ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-    )
+    swaps = {}
+    for name, executor in (
+        ("thread", ThreadPoolExecutor(1)),
+        ("process", ProcessPoolExecutor(1, mp_context=get_context("spawn"))),
+    ):
+        deciding[f"decide, retraining in a {name}"], swaps[f"decide and swap, {name}"] = beside(data, recipe, executor)
     umap_fit, deciding["UMAP single transform"] = umap_times(data, args.umap_repeats)
     rows = [
         row(f"retrain, all of {args.replays} replays", retrains, BUDGET),
         row(f"retrain on {len(data)} traces", whole, BUDGET),
         row(f"UMAP fit on {len(data)} traces", umap_fit),
-        *(row(name, seconds) for name, seconds in deciding.items()),
+        *(row(name, seconds) for name, seconds in (deciding | swaps).items()),
         ratio("UMAP fit / retrain", umap_fit, whole, 6.0),
         ratio("UMAP single transform / decide", deciding["UMAP single transform"], deciding["decide"], 15.0),
     ]
@@ -77,22 +79,22 @@ def decide_times(engine: DataEngine, data: Dataset, times: int = 3) -> np.ndarra
     return np.array(seconds)
 
 
-def beside(data: Dataset, recipe: Recipe, executor: Executor) -> np.ndarray:
-    """Wall time of the decisions made while retrains run in the executor."""
+def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[np.ndarray, np.ndarray]:
+    """Wall time of the decisions made while retrains run in the executor, and of those that also swap a version in."""
     engine = filled_engine(data, recipe, executor)
-    seconds, cell = [], ReplayCell(data)
+    seconds, swapping, cell = [], [], ReplayCell(data)
     with executor:
         for i in range(len(data)):
             if not engine.retraining:
                 engine.start_retrain()
-            trace = cell.insert()
+            trace, version = cell.insert(), engine.version
             begin = time.perf_counter()
             engine.decide(trace)
             if i > 100:  # the pool starts its worker on the first
-                seconds.append(time.perf_counter() - begin)
+                (seconds if engine.version == version else swapping).append(time.perf_counter() - begin)
             time.sleep(0.002)  # a cell does other things between two parts
         engine.close()
-    return np.array(seconds)
+    return np.array(seconds), np.array(swapping)
 
 
 def umap_times(data: Dataset, repeats: int) -> tuple[np.ndarray, np.ndarray]:
@@ -134,7 +136,7 @@ def show(rows: list[dict[str, Any]], deciding: dict[str, np.ndarray], out: Path)
     for r in rows:
         numbers = (f"{r[key]:.3g}" if pd.notna(r[key]) else "" for key in ("median", "p99", "worst", "target"))
         table.add_row(r["what"], str(r["n"]), *numbers, r["unit"])
-    Console().print(table)
+    Console(width=110).print(table)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, seconds in deciding.items():

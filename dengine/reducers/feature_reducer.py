@@ -112,7 +112,7 @@ class FeatureReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
         head = cast(CrossFittedScores, self.net_.head)
         with torch.no_grad():
             self.n_steps_ = head.train_on(g, torch.from_numpy(labels), torch.from_numpy(folds), self.l2, stop)
-        self._tell(head.losses.numpy(), head.kept)
+        self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
 
     def _tell(self, losses: NDArray[Any], kept: list[int]) -> None:
         self.holdout_losses_ = np.array(losses, dtype=np.float64)

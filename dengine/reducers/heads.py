@@ -40,6 +40,7 @@ class CrossFittedScores(nn.Module):
     bias: Tensor
     unit: Tensor
     losses: Tensor
+    kept: Tensor
 
     def __init__(self, n_features: int, folds: int, dim: int) -> None:
         super().__init__()
@@ -49,7 +50,7 @@ class CrossFittedScores(nn.Module):
         self.register_buffer("bias", torch.zeros(folds * dim))
         self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
         self.register_buffer("losses", torch.zeros(folds, dtype=torch.float64))
-        self.kept: list[int] = []
+        self.register_buffer("kept", torch.zeros(folds, dtype=torch.bool))
 
     def forward(self, g: Tensor) -> Tensor:
         """(B, P) -> (B, K, d)."""
@@ -71,11 +72,10 @@ class CrossFittedScores(nn.Module):
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
         heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
         steps = _interleave(heads, stop)
-        self.kept = []
         for k, head in enumerate(heads):
             self.losses[k] = head.leave_one_out_loss()
-            if self.losses[k] > max(head.first_loss, head.base_rate_loss()):
-                self.kept.append(k)
+            self.kept[k] = bool(self.losses[k] > max(head.first_loss, head.base_rate_loss()))
+            if self.kept[k]:
                 continue
             self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
         if self.dim == 2:
