@@ -4,7 +4,7 @@ VENV ?= .venv
 # On a machine whose package index serves the CUDA build, name PyTorch's CPU index here:
 #   make demo PIP_FLAGS="--extra-index-url <the CPU index from pytorch.org/get-started>"
 PIP_FLAGS ?=
-PIP = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt $(PIP_FLAGS)
+PIP = $(VENV)/bin/python -m pip install --quiet --progress-bar off --disable-pip-version-check --constraint constraints.txt $(PIP_FLAGS)
 RUN = $(VENV)/bin/dengine
 OUT ?= out
 REPEATS ?= 200
@@ -17,7 +17,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) --editable .
+	$(PIP) --no-compile --editable .
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python

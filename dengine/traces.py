@@ -29,7 +29,8 @@ def as_trace(trace: ArrayLike, spec: TraceSpec | None) -> NDArray[np.float32]:
         raise TraceError(f"Expected one trace, (samples,) or (channels, samples), got shape {np.shape(trace)}.")
     if spec is not None:
         _check(x.shape, spec)
-    return np.ascontiguousarray(x)
+    x = np.ascontiguousarray(x)
+    return x if x.flags.writeable else x.copy()  # torch warns of what it could write to, a memory-mapped array for one
 
 
 def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32]:

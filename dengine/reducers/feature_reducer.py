@@ -23,6 +23,7 @@ from .heads import CrossFittedScores, Head, Stop
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 MIN_TRACES = 20
+TRAIN_TRACES = 4000  # that train the heads in one fit, so that it ends in time however many references there are
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
 
 
@@ -110,9 +111,17 @@ class FeatureReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
         if folds.shape != labels.shape or folds.min() < 0 or folds.max() >= self.folds:
             raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
         head = cast(CrossFittedScores, self.net_.head)
+        rows = torch.from_numpy(self._sample(len(g)))
         with torch.no_grad():
-            self.n_steps_ = head.train_on(g, torch.from_numpy(labels), torch.from_numpy(folds), self.l2, stop)
+            y_, folds_ = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
+            self.n_steps_ = head.train_on(g[rows], y_, folds_, self.l2, stop)
         self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
+
+    def _sample(self, n: int) -> Ints:
+        """Rows that train the heads: all, or of many a draw that is blind to labels and another at each fit."""
+        if n <= TRAIN_TRACES:
+            return np.arange(n)
+        return np.random.default_rng([self.seed, self.n_fits_]).permutation(n)[:TRAIN_TRACES]
 
     def _tell(self, losses: NDArray[Any], kept: list[int]) -> None:
         self.holdout_losses_ = np.array(losses, dtype=np.float64)

@@ -19,6 +19,7 @@ Floats = NDArray[np.float32]
 PATCH_TRACES = 256
 PATCHES = 5000  # enough for a covariance of 50 x 50, and 10 ms of work
 PATCH_SHARE = 20  # a patch is this part of a trace: a contact event, not a sample's noise
+LEARN_TRACES = 1000  # that set channel scales: more tell no more
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 
 
@@ -56,6 +57,7 @@ class Features(nn.Module):
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
+        X = X[torch.from_numpy(rng.permutation(len(X))[:LEARN_TRACES])]
         wide = X.double()
         centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
