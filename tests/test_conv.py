@@ -213,12 +213,14 @@ def test_the_scale_and_offset_of_a_channel_do_not_matter():
 
 
 def test_more_traces_move_the_map_less_and_less():
-    X, y = traces(640)
-    reducer = ConvReducer()
-    maps = [reducer.fit(X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
-    moves = [np.abs(b - a).mean() for a, b in pairwise(maps)]
-    assert moves[-1] < moves[0]
-    assert moves[-1] < 0.05
+    moves = np.zeros(3)
+    for seed in range(6):  # a doubling moves the map by luck too, so on the average of some streams
+        X, y = traces(640, seed=seed)
+        reducer = ConvReducer()
+        maps = [reducer.fit(X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
+        moves += [np.abs(b - a).mean() / 6 for a, b in pairwise(maps)]
+    assert moves[0] > moves[1] > moves[2]
+    assert moves[2] < 0.05
 
 
 def test_too_little_to_learn_from_is_said_clearly():
