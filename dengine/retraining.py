@@ -37,7 +37,7 @@ class Limits:
 
     budget: float | None = None
     max_steps: int | None = None
-    reserve: float = 0.2
+    reserve: float = 0.25
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ def show(stores: pd.DataFrame, umap: dict[int, float], certainty: pd.DataFrame, 
         table = Table(*frame.columns, title=title)
         for values in frame.itertuples(index=False):
             table.add_row(*(f"{v:,}" if isinstance(v, int | np.integer) else f"{v:.3g}" for v in values))
-        Console().print(table)
+        Console(width=130).print(table)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     axes.plot(stores["traces"], stores["retrain_max_s"], "o-", label="conv retrain, worst")
