@@ -57,7 +57,8 @@ class Features(nn.Module):
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
-        X = X[torch.from_numpy(rng.permutation(len(X))[:LEARN_TRACES])]
+        if len(X) > LEARN_TRACES:
+            X = X[torch.from_numpy(rng.permutation(len(X))[:LEARN_TRACES])]
         wide = X.double()
         centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
