@@ -9,7 +9,7 @@ RUN = $(VENV)/bin/dengine
 OUT ?= out
 REPEATS ?= 200
 
-.PHONY: setup demo test lint proof audit benchmark clean
+.PHONY: setup demo test lint proof audit clean
 
 setup: $(VENV)/.dev
 
