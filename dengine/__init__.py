@@ -5,88 +5,130 @@ Public names are imported when they are first used, so that `import dengine` cos
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ._lazy import lazy_names
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .bounds import (
-        INTERVALS,
-        binomial_interval,
-        clopper_pearson_interval,
-        jeffreys_interval,
-        wilson_interval,
-    )
     from .cells.base import Cell
     from .cells.replay import ReplayCell
-    from .cells.simulated import SimulatedCell
-    from .classifier import WilsonRadiusClassifier
+    from .cells.simulation.cell import SimulatedCell
     from .datasets import Dataset, load_dataset
+    from .decision.bounds import INTERVALS, binomial_interval, clopper_pearson_interval, jeffreys_interval, wilson_interval
+    from .decision.classifier import WilsonRadiusClassifier
+    from .decision.policy import Policy
+    from .decision.rule import DecisionRule
     from .engine import DataEngine
     from .errors import DengineError, TraceError
     from .experiments.grid import run_grid
     from .experiments.replay import Replay, replay
-    from .export import export_torchscript
-    from .exported import load_exported
-    from .policy import Policy
-    from .prediction import ModelPrediction
+    from .export.torchscript import export_torchscript, load_exported
+    from .model.prediction import ModelPrediction
     from .recipe import Recipe
     from .records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, Source, TraceSpec
     from .reducers import REDUCERS, make_reducer
-    from .reducers.base import CrossFitted
+    from .reducers.base import Reducer
+    from .reducers.conv import ConvReducer
+    from .reducers.cross_fitting import CrossFitted
+    from .reducers.pca import PcaReducer
+    from .reducers.rocket import RocketReducer
+    from .reducers.umap import UmapReducer
+    from .store.base import open_store
+    from .store.memory import MemoryStore
+    from .store.sql import SqlStore
 
 _WHERE = {
-    "bounds": (
+    "cells.base": ("Cell",),
+    "cells.replay": ("ReplayCell",),
+    "cells.simulation.cell": ("SimulatedCell",),
+    "datasets": (
+        "Dataset",
+        "load_dataset",
+    ),
+    "decision.bounds": (
         "INTERVALS",
         "binomial_interval",
         "clopper_pearson_interval",
         "jeffreys_interval",
         "wilson_interval",
     ),
-    "cells.base": ("Cell",),
-    "cells.replay": ("ReplayCell",),
-    "cells.simulated": ("SimulatedCell",),
-    "classifier": ("WilsonRadiusClassifier",),
-    "datasets": ("Dataset", "load_dataset"),
+    "decision.classifier": ("WilsonRadiusClassifier",),
+    "decision.policy": ("Policy",),
+    "decision.rule": ("DecisionRule",),
     "engine": ("DataEngine",),
-    "errors": ("DengineError", "TraceError"),
-    "export": ("export_torchscript",),
-    "exported": ("load_exported",),
+    "errors": (
+        "DengineError",
+        "TraceError",
+    ),
     "experiments.grid": ("run_grid",),
-    "experiments.replay": ("Replay", "replay"),
-    "policy": ("Policy",),
-    "prediction": ("ModelPrediction",),
+    "experiments.replay": (
+        "Replay",
+        "replay",
+    ),
+    "export.torchscript": (
+        "export_torchscript",
+        "load_exported",
+    ),
+    "model.prediction": ("ModelPrediction",),
     "recipe": ("Recipe",),
-    "records": ("Action", "Cycle", "Decision", "Outcome", "Reason", "RetrainReport", "Source", "TraceSpec"),
-    "reducers": ("REDUCERS", "make_reducer"),
-    "reducers.base": ("CrossFitted",),
+    "records": (
+        "Action",
+        "Cycle",
+        "Decision",
+        "Outcome",
+        "Reason",
+        "RetrainReport",
+        "Source",
+        "TraceSpec",
+    ),
+    "reducers": (
+        "REDUCERS",
+        "make_reducer",
+    ),
+    "reducers.base": ("Reducer",),
+    "reducers.conv": ("ConvReducer",),
+    "reducers.cross_fitting": ("CrossFitted",),
+    "reducers.pca": ("PcaReducer",),
+    "reducers.rocket": ("RocketReducer",),
+    "reducers.umap": ("UmapReducer",),
+    "store.base": ("open_store",),
+    "store.memory": ("MemoryStore",),
+    "store.sql": ("SqlStore",),
 }
-_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
 __all__ = [
     "INTERVALS",
     "REDUCERS",
     "Action",
     "Cell",
+    "ConvReducer",
     "CrossFitted",
     "Cycle",
     "DataEngine",
     "Dataset",
     "Decision",
+    "DecisionRule",
     "DengineError",
+    "MemoryStore",
     "ModelPrediction",
     "Outcome",
+    "PcaReducer",
     "Policy",
     "Reason",
     "Recipe",
+    "Reducer",
     "Replay",
     "ReplayCell",
     "RetrainReport",
+    "RocketReducer",
     "SimulatedCell",
     "Source",
+    "SqlStore",
     "TraceError",
     "TraceSpec",
+    "UmapReducer",
     "WilsonRadiusClassifier",
     "binomial_interval",
     "clopper_pearson_interval",
@@ -95,19 +137,10 @@ __all__ = [
     "load_dataset",
     "load_exported",
     "make_reducer",
+    "open_store",
     "replay",
     "run_grid",
     "wilson_interval",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
-        raise AttributeError(f"module 'dengine' has no attribute {name!r}")
-    value = getattr(import_module(f".{_MODULE_OF[name]}", __name__), name)
-    globals()[name] = value  # found once, plain from then on
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(__name__, _WHERE)

@@ -27,7 +27,3 @@ class StoreError(DengineError, RuntimeError):
 
 class ExportError(DengineError, RuntimeError):
     """A model that cannot be exported, or an exported file that must not be used."""
-
-
-class DengineWarning(UserWarning):
-    """Something worth knowing that does not stop the cell."""

@@ -2,6 +2,7 @@
 
     report = import_labelled("engine.db", "recorded.npz", recipe="conv")
     DataEngine.open("engine.db").retrain()
+    report = import_journal("engine.db", "cell.csv")       # what a cell program learned on its own
 
 A trace is imported once: its id comes from its content, so an import that was interrupted goes on where it stopped, and
 the same file twice counts no label twice. Traces that a cell recorded itself have other ids and are not recognised.
@@ -13,7 +14,8 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +24,11 @@ from numpy.typing import NDArray
 
 from .datasets import Dataset, load_dataset
 from .engine import DataEngine
-from .errors import SettingError, TraceError
+from .errors import DataError, StoreError, TraceError
 from .folds import content_hash
 from .recipe import Recipe
 from .records import Action, Decision, Reason, RetrainReport, Source, TraceSpec
-from .store import Store, open_store
+from .store.base import Store, open_store
 from .traces import REASONS, TraceGate, as_traces
 
 CHUNK = 500  # traces committed together
@@ -42,38 +44,6 @@ class ImportReport:
     resumed: bool
 
 
-def open_engine(
-    store: str | os.PathLike[str] | Store | None,
-    recipe: Recipe | str | None = None,
-    seed: int | None = None,
-    trace: TraceSpec | None = None,
-) -> tuple[DataEngine, bool]:
-    """Go on with a store that has been used, or start on a new one; True where it had been used.
-
-    recipe, seed : of a new engine; conv and 0 by default. A used store has its own, and asking it for others is an error.
-    """
-    opened = open_store(store)
-    if not opened.settings():
-        return DataEngine.from_recipe(recipe or "conv", opened, seed=seed or 0, trace=trace), False
-    engine = DataEngine.open(opened)
-    have = _flat(engine.recipe) | {"seed": engine.seed}
-    asked = (_flat(Recipe.load(recipe)) if recipe else {}) | ({} if seed is None else {"seed": seed})
-    changed = [name for name in asked if asked[name] != have.get(name)]
-    if changed:
-        engine.close()
-        stored, other = (", ".join(f"{name} {values.get(name)}" for name in changed) for values in (have, asked))
-        raise SettingError(
-            f"Expected the store's own settings ({stored}), got {other}; leave them out or name a new store."
-        )
-    return engine, True
-
-
-def _flat(recipe: Recipe) -> dict[str, Any]:
-    plain = asdict(recipe)
-    policy: dict[str, Any] = plain.pop("policy")
-    return plain | policy
-
-
 def import_labelled(
     store: str | os.PathLike[str] | Store,
     dataset: Any,
@@ -83,15 +53,16 @@ def import_labelled(
 ) -> ImportReport:
     """Put every labelled trace of a data set into a new or a used store, in order, in chunks that are all or none.
 
-    dataset : anything `load_dataset` takes.  recipe, seed : as in `open_engine`.
+    dataset : anything `load_dataset` takes.
+    recipe, seed : of a new store's engine, conv and 0 by default; a used store has its own, and others are a SettingError.
     on_traces : called with the number of traces that were just dealt with.
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
     data = load_dataset(dataset)
     spec = TraceSpec(data.X.shape[-1], data.rate_hz, 1 if data.X.ndim == 2 else data.X.shape[1], data.unit)
-    engine, resumed = open_engine(store, recipe, seed, spec)
+    engine = DataEngine.open_or_create(store, seed, recipe=recipe)
     try:
-        agreed = engine.trace or _agree(engine.store, spec)
+        agreed = engine.agree_on(spec)
         if agreed.rate_hz != spec.rate_hz:
             raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
         traces = as_traces(data.X, agreed)
@@ -100,7 +71,7 @@ def import_labelled(
         if not isinstance(store, Store):
             engine.close()
     imported, quarantined, known = (sum(column) for column in zip(*counts, strict=True))
-    return ImportReport(imported, quarantined, known, resumed)
+    return ImportReport(imported, quarantined, known, engine.resumed)
 
 
 def train_until_done(
@@ -120,10 +91,50 @@ def train_until_done(
     return reports
 
 
-def _agree(store: Store, spec: TraceSpec) -> TraceSpec:
-    # A used store whose engine never saw a trace: the import's first one sets the contract, as `decide` would have.
-    store.save_settings(store.settings() | {"trace": json.dumps(asdict(spec))})
-    return spec
+def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Dataset:
+    """The labelled traces of a cell program's journal, in order.
+
+    A line is `label,sample,sample,...`, several channels one after the other; lines that begin with # are comments.
+    DataError names the first line that does not fit the contract.
+    """
+    expected = 1 + spec.channels * spec.samples
+    rows: list[list[float]] = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in line.split(",")]
+        except ValueError as error:
+            raise DataError(f"Line {number} of {path} is no row of numbers: {error}.") from error
+        if len(row) != expected or row[0] not in (0.0, 1.0):
+            raise DataError(
+                f"Expected a label of 1 or 0 and {expected - 1} samples in line {number} of {path}, "
+                f"got {line.split(',')[0][:20]!r} and {len(row) - 1}; a last line that was cut can be removed."
+            )
+        rows.append(row)
+    if not rows:
+        raise DataError(f"{path} holds no labels yet.")
+    table = np.array(rows)
+    with np.errstate(over="ignore"):
+        X = table[:, 1:].astype(np.float32).reshape(len(rows), spec.channels, spec.samples)
+    return Dataset(X, table[:, 0].astype(np.int8), Path(path).name, spec.rate_hz, spec.unit)
+
+
+def import_journal(
+    store: str | os.PathLike[str], path: str | os.PathLike[str], on_traces: Callable[[int], None] | None = None
+) -> ImportReport:
+    """Put a journal's labels into the store of an engine, each once, however often its journal is imported."""
+    opened = open_store(store, must_exist=True)
+    try:
+        known = opened.settings()
+        if "trace" not in known:
+            raise StoreError(
+                f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
+            )
+        spec = TraceSpec(**json.loads(known["trace"]))
+        return import_labelled(opened, read_journal(path, spec), on_traces=on_traces)
+    finally:
+        opened.close()
 
 
 Part = tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.int64], list[str]]

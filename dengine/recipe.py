@@ -8,35 +8,44 @@ A run is its recipe, its data and its seed; nothing else changes what it decides
 
 from __future__ import annotations
 
+import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .decision.policy import Neighbourhood, Policy
 from .errors import SettingError
-from .policy import Neighbourhood, Policy
 
 Params = Mapping[str, bool | int | float | str]
+OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
+OBJECT = "object "  # before the class of a reducer that TOML cannot say
+RENAMED = {"dim": "n_components"}  # parameters of reducers as dengine 0.1 wrote them
+GONE = (("objective", "supervised"),)  # what went without saying then
 
 
 @dataclass(frozen=True)
 class Recipe:
     """Every setting of an engine; the reducer checks its own part.
 
-    reducer : a name in `REDUCERS`.  params : the reducer's own settings.
-    policy : the user's two numbers, the interval, the audit rate.
+    reducer : a name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer as it is.
+    params : the reducer's own settings, where it is a name.
+    policy : the user's two numbers, the interval, the rule, the audit rate.
     radius, fraction, reject_fraction : the neighbourhood, as in `Neighbourhood`.
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
-    max_steps : optimiser steps a retrain at most. A replay stops on them alone, so that a seed repeats exactly.
+    max_steps : optimiser steps that a retrain may take at most; None: as many as the reducer's own settings say. A replay
+        stops on steps alone and reads no clock, so that a seed repeats exactly.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
     """
 
-    reducer: str = "conv"
+    reducer: Any = "conv"
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
     radius: float = 0.3
@@ -45,12 +54,14 @@ class Recipe:
     folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
-    max_steps: int = 60
+    max_steps: int | None = None
     window: int = 10_000
 
     def __post_init__(self) -> None:
         for name, least in (("folds", 2), ("retrain_every", 1), ("max_steps", 0), ("window", 10)):
             value = getattr(self, name)
+            if name == "max_steps" and value is None:
+                continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
         if not self.budget > 0.0:
@@ -59,17 +70,31 @@ class Recipe:
             raise SettingError(f"Expected params to be a table of the reducer's settings, got {self.params!r}.")
         Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
 
+    @property
+    def name(self) -> str:
+        """What to call it in a table: its reducer."""
+        return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
+
     @classmethod
-    def load(cls, recipe: Recipe | str | Path) -> Recipe:
-        """A recipe by its name in `RECIPES`, from a TOML file's path, or as it is."""
+    def load(cls, recipe: Any) -> Recipe:
+        """A recipe by its name in `RECIPES`, from a TOML file's path, for a reducer of your own, or as it is.
+
+        A reducer of your own is `module:Class`, or a scikit-learn transformer; it gets the default settings.
+        """
         if isinstance(recipe, Recipe):
             return recipe
+        if not isinstance(recipe, str | os.PathLike):
+            return cls(recipe)
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]
         path = Path(recipe)
-        if not path.is_file():
-            raise SettingError(f"Expected a recipe among {', '.join(RECIPES)}, or a TOML file; {recipe} is neither.")
-        return cls.from_toml(path.read_text(encoding="utf-8"), where=str(path))
+        if path.is_file():
+            return cls.from_toml(path.read_text(encoding="utf-8"), where=str(path))
+        if OWN.fullmatch(str(recipe)):
+            return cls(str(recipe))
+        raise SettingError(
+            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; {recipe} is none."
+        )
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
@@ -84,22 +109,50 @@ class Recipe:
             raise SettingError(f"{where} has an unknown key {', '.join(unknown)}; known are {', '.join(sorted(known))}.")
         base = RECIPES.get(str(table.get("reducer", "conv")), cls())
         policy = table.pop("policy", {})
+        if isinstance(table.get("params"), Mapping):
+            kept = {name: value for name, value in table["params"].items() if (name, value) not in GONE}
+            table["params"] = {RENAMED.get(name, name): value for name, value in kept.items()}
         try:
             return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
         except TypeError as error:
             raise SettingError(f"{where}: {error}.") from error
 
     def to_toml(self) -> str:
-        """The recipe as TOML; a fixed radius is written as fraction = "none"."""
+        """The recipe as TOML; None is written as "none".
+
+        A reducer that is an object is written as `module:Class` and its parameters. Where those are no plain values, as in
+        a pipeline, it cannot come back from TOML: it must be handed in again, and is written as "object Class".
+        """
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("params", "policy")}
+        plain["reducer"], params = _named(self.reducer, self.params)
         policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
-        tables = {"": plain, "policy": policy, "params": dict(self.params)}
+        tables = {"": plain, "policy": policy, "params": dict(params)}
         # An empty [params] is written too: left out, it would mean those of the reducer's own recipe.
         return "\n".join(_table(name, values) for name, values in tables.items())
+
+    def with_settings(self, **asked: Any) -> Recipe:
+        """The same with what was asked for; None asks for nothing. A radius takes the place of a share of the store."""
+        changes = {name: value for name, value in asked.items() if value is not None}
+        if "radius" in changes:
+            changes |= {"fraction": None, "reject_fraction": None}
+        return replace(self, **changes)
 
     def with_policy(self, **changes: Any) -> Recipe:
         """The same with another alpha, lower_bound, interval or audit_rate."""
         return replace(self, policy=replace(self.policy, **changes))
+
+
+def _named(reducer: Any, params: Params) -> tuple[str, Params]:
+    """A reducer as TOML can say it: a name and plain parameters."""
+    if isinstance(reducer, str):
+        return reducer, params
+    kind = type(reducer)
+    own: dict[str, Any] = reducer.get_params(deep=False)
+    defaults = {name: each.default for name, each in signature(kind).parameters.items()}
+    plain = all(isinstance(v, bool | int | float | str) or (v is None and defaults.get(k) is None) for k, v in own.items())
+    if not plain or "<locals>" in kind.__qualname__ or kind.__module__ == "__main__":
+        return f"{OBJECT}{kind.__name__}", {}
+    return f"{kind.__module__}:{kind.__qualname__}", {name: value for name, value in own.items() if value is not None}
 
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:

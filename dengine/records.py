@@ -97,9 +97,9 @@ class RetrainReport:
     """One retrain, from taking the data to the new version answering.
 
     version : of the model that answers afterwards.
-    seconds : wall time of the whole retrain.
+    seconds : wall time from taking the data until the version answers; committing it to the store comes on top.
     n_traces : labelled traces the candidate was given.
-    n_steps : optimiser steps taken (0 for closed-form and foreign reducers).
+    n_steps : optimiser steps taken (0 for closed-form reducers and rivals).
     accepted : whether the candidate replaced the old version.
     reason : why, in words.
     """

@@ -9,53 +9,60 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .prediction import ModelPrediction
-from .store import Labelled, ModelVersion, Store
-from .window import AnyModel, Window, hold, place, prepare
+from .model.base import EngineModel
+from .retraining import Window
+from .store.base import Store
+from .store.records import Labelled, ModelVersion
 
 
 @dataclass(frozen=True)
 class Resumed:
     """Where an engine stood: the model that answered (None: no retrain yet), its version, labels since the last retrain."""
 
-    model: AnyModel | None
+    model: EngineModel | None
     version: int
     new_labels: int
 
 
-def resume(store: Store, template: AnyModel, window: Window) -> Resumed:
+def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
     labelled = store.labelled(window.capacity)
     window.extend(labelled)
     version = store.last_version()
     if version is None:
+        _tell(template, store, 0)
         return Resumed(None, 0, len(labelled.seq))
     model = _restored(store, template, version.state, window.newest_seq)
-    prepare(model, None)
+    model.prepare_safely(template)
     trained_to = int(version.state["trained_on"][-1])
-    # A stored state holds what came in during its retrain; a foreign model was refitted without that.
-    _hold_since(model, store, version, labelled, version.last_seq if isinstance(model, ModelPrediction) else trained_to)
+    # A stored state holds what came in during its retrain; a rival was refitted without that.
+    known_to = version.last_seq if model.keeps_references else trained_to
+    _add_since(model, store, version, labelled, known_to)
+    _tell(model, store, version.last_seq)
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
-def _restored(store: Store, template: AnyModel, state: Mapping[str, NDArray[Any]], newest: int) -> AnyModel:
+def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel:
     model = template.successor()
-    if isinstance(model, ModelPrediction) and any(name.startswith("reducer.") for name in state):
-        return model.set_state(state)
-    # A reducer without a state of its own is refitted on the very traces it was fitted on.
-    trained_on = state["trained_on"]
-    data = store.labelled(newest - int(trained_on[0]) + 1)
-    kept = np.isin(data.seq, trained_on)
-    model.fit(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
-    return model.set_state(state) if isinstance(model, ModelPrediction) else model
+    if model.needs_refit(state):  # on the very traces that it was fitted on
+        trained_on = state["trained_on"]
+        data = store.labelled(newest - int(trained_on[0]) + 1)
+        kept = np.isin(data.seq, trained_on)
+        model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
+    return model.set_state(state)
 
 
-def _hold_since(model: AnyModel, store: Store, version: ModelVersion, labelled: Labelled, last_seq: int) -> None:
+def _add_since(model: EngineModel, store: Store, version: ModelVersion, labelled: Labelled, last_seq: int) -> None:
     added = store.points_since(version.last_seq, version.version)
     points = dict(zip(added.seq.tolist(), added.points, strict=True))
     for i in np.flatnonzero(labelled.seq > last_seq):
         hash_ = int(labelled.hashes[i])
         point = points.get(int(labelled.seq[i]))  # unknown: its decision was answered by an earlier version
-        point = place(model, labelled.traces[i], hash_) if point is None else point
-        if point is not None:
-            hold(model, point, int(labelled.labels[i]), hash_)
+        point = model.place_safely(labelled.traces[i], hash_) if point is None else point
+        model.add_safely(point, int(labelled.labels[i]), hash_)
+
+
+def _tell(model: EngineModel, store: Store, last_seq: int) -> None:
+    evidence = store.evidence_since(last_seq)
+    for lower, upper, success in zip(evidence.lower, evidence.upper, evidence.success, strict=True):
+        model.tell(float(lower), float(upper), bool(success))

@@ -1,4 +1,4 @@
-"""A retrain inside its time budget: the data it sees, the candidate, the gate."""
+"""A retrain inside its time budget: the window it sees, the candidate, the gate, the swap's reserve."""
 
 from __future__ import annotations
 
@@ -7,31 +7,94 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from .errors import DengineError, SettingError
-from .prediction import ModelPrediction
+from .model.base import EngineModel
 from .reducers.base import StopRule
-from .store import Labelled
-from .window import AnyModel, Window
+from .store.records import Labelled
 
 log = logging.getLogger("dengine")
 SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
 MARGIN = 1.2  # the tail grows a little with each retrain
-ACCEPTED = "accepted"
+
+Clock = Callable[[], float]
+
+
+class Window:
+    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.total = 0
+        self._traces: NDArray[np.float32] | None = None
+        self._labels = np.zeros(0, dtype=np.int8)
+        self._hashes = np.zeros(0, dtype=np.int64)
+        self._seq = np.zeros(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return min(self.total, self.capacity)
+
+    @property
+    def newest_seq(self) -> int:
+        """Sequence number of the newest label; 0 before the first."""
+        return int(self._seq[(self.total - 1) % self.capacity]) if self.total else 0
+
+    def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+        """Take in one labelled trace (C, T); on a full window it takes the oldest one's place."""
+        self._grow(trace)
+        assert self._traces is not None  # for the type checker: _grow made it
+        slot = self.total % self.capacity
+        self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
+        self.total += 1
+
+    def extend(self, labelled: Labelled) -> None:
+        """Take in many, oldest first."""
+        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
+            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
+
+    def snapshot(self) -> Labelled:
+        """What is held, oldest first. Nobody writes to these arrays afterwards."""
+        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
+        order = (np.arange(n) + first) % self.capacity
+        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces[order]
+        return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
+
+    def _grow(self, trace: NDArray[np.float32]) -> None:
+        # Doubled as needed: a full window of 10,000 x 1000 samples is 40 MB, and most cells start with none.
+        room = 0 if self._traces is None else len(self._traces)
+        if self.total < room or room == self.capacity:
+            return
+        size = min(self.capacity, max(64, 2 * room))
+        grown = np.zeros((size, *trace.shape), dtype=np.float32)
+        if self._traces is not None:
+            grown[:room] = self._traces
+        self._traces = grown
+        self._labels = np.concatenate([self._labels, np.zeros(size - room, dtype=np.int8)])
+        self._hashes, self._seq = (
+            np.concatenate([a, np.zeros(size - room, dtype=np.int64)]) for a in (self._hashes, self._seq)
+        )
+
+    def catch_up(self, model: EngineModel, last_seq: int) -> None:
+        """Make every label after `last_seq` a reference of a model that was trained without it."""
+        if self.newest_seq <= last_seq:
+            return
+        data = self.snapshot()
+        for i in np.flatnonzero(data.seq > last_seq):
+            hash_ = int(data.hashes[i])
+            model.add_safely(model.place_safely(data.traces[i], hash_), int(data.labels[i]), hash_)
 
 
 @dataclass(frozen=True)
 class Limits:
     """What a retrain may use.
 
-    budget : seconds of wall time for the whole; None: no clock is read.
-    max_steps : optimiser steps; None: no limit.
-    reserve : seconds kept for what follows the last step: re-embedding, scripting, the swap. The default serves until
+    budget : seconds of wall time for the whole; None: time decides nothing.
+    max_steps : optimiser steps; None: as many as the reducer's own settings say.
+    reserve : seconds kept for what follows the last step: re-embedding, compiling, the swap. The default serves until
         a tail was measured.
     """
 
@@ -42,12 +105,13 @@ class Limits:
 
 @dataclass(frozen=True)
 class Candidate:
-    """The outcome of a training: a model to swap in, or the reason why not.
+    """The outcome of a training.
 
-    seconds : of the whole.  tail : of what followed the reducer's fit, the next retrain's reserve.
+    model : to swap in; None: dropped.  reason : why, in words.
+    seconds : of the whole.  tail : of what followed the reducer's last step, the next retrain's reserve.
     """
 
-    model: AnyModel | None
+    model: EngineModel | None
     reason: str
     n_steps: int
     seconds: float
@@ -56,24 +120,20 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Trained:
-    """A candidate, the labels it was trained on, and when that began."""
+    """A candidate, the labels it was trained on, and when that began by the retrainer's clock."""
 
     candidate: Candidate
     seq: NDArray[np.int64]
     begin: float
-    clock: Callable[[], float]
-
-    def elapsed(self) -> float:
-        """Seconds since the data were taken, without the time a finished candidate waited for the cell."""
-        return self.clock() - self.begin
 
 
 class Retrainer:
-    """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step."""
+    """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
 
-    def __init__(
-        self, window: Window, limits: Limits, executor: Executor | None, clock: Callable[[], float] = time.perf_counter
-    ) -> None:
+    clock : seconds, of any origin; with a process executor it must pickle, as `time.perf_counter` does.
+    """
+
+    def __init__(self, window: Window, limits: Limits, executor: Executor | None, clock: Clock = time.perf_counter) -> None:
         self.window = window
         self.limits = limits
         self.executor = executor
@@ -85,20 +145,21 @@ class Retrainer:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
         return self._pending is not None
 
-    def train(self, answering: AnyModel) -> Trained:
+    def train(self, answering: EngineModel) -> Trained:
         """Train in line."""
-        begin = self.clock()
-        data = self.window.snapshot()
-        return self._note(Trained(train_candidate(*self._order(answering, data)), data.seq, begin, self.clock))
+        begin, data = self.clock(), self.window.snapshot()
+        candidate = train_candidate(answering.successor(), data, self.limits, self.clock)
+        return self._note(Trained(candidate, data.seq, begin))
 
-    def start(self, answering: AnyModel) -> None:
+    def start(self, answering: EngineModel) -> None:
         """Train beside the cell."""
         assert self.executor is not None  # the caller asked; for the type checker
         data = self.window.snapshot()
-        self._pending = (self.executor.submit(_train_beside, *self._order(answering, data)), data.seq)
+        future = self.executor.submit(_train_beside, answering.successor(), data, self.limits, self.clock)
+        self._pending = (future, data.seq)
 
-    def finished(self, wait: bool = False) -> Trained | None:
-        """What was trained beside the cell, once it is done."""
+    def collect(self, wait: bool = False) -> Trained | None:
+        """What was trained beside the cell, once it is done; its time without the time that it waited for the cell."""
         if self._pending is None or not (wait or self._pending[0].done()):
             return None
         (future, seq), self._pending = self._pending, None
@@ -107,10 +168,7 @@ class Retrainer:
         except Exception as error:  # the worker died: recorded, and the old version goes on answering
             log.exception("a retrain in the executor failed")
             candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
-        return self._note(Trained(candidate, seq, self.clock() - candidate.seconds, self.clock))
-
-    def _order(self, answering: AnyModel, data: Labelled) -> tuple[AnyModel, Labelled, Limits]:
-        return answering.successor(), data, self.limits
+        return self._note(Trained(candidate, seq, self.clock() - candidate.seconds))
 
     def _note(self, trained: Trained) -> Trained:
         if trained.candidate.model is not None:
@@ -118,41 +176,36 @@ class Retrainer:
         return trained
 
 
-def _train_beside(*order: Any) -> Candidate:
+def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:
     torch.set_num_threads(1)  # per thread, and first thing in each
-    return train_candidate(*order)
+    return train_candidate(successor, data, limits, clock)
+
+
+def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:
+    """Train a successor on the data; a plain function of plain arguments, so that any executor can run it.
+
+    The gate reads no label. One on held-out loss belongs to each head, inside the reducer: here it would let fold k's
+    labels choose encoder k.
+    """
+    begin = clock()
+    deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
+    stop = StopRule(deadline, limits.max_steps, clock)
+    n_steps, reason = 0, ""
+    try:
+        if not len(data.seq):
+            raise SettingError("there is no labelled trace yet; report one first")
+        report = successor.train(data.traces, data.labels, hashes=data.hashes, stop=stop).report
+        n_steps, defect = report.n_steps, successor.defect()
+        model = None if defect else successor
+        reason = f"dropped: {defect}" if defect else "; ".join(filter(None, ("accepted", report.note)))
+    except DengineError as error:
+        model, reason = None, f"dropped: {error}"
+    except Exception as error:  # no exception inside a model reaches the cell: it is recorded
+        model, reason = None, _dropped(error)
+    end = clock()
+    return Candidate(model, reason, n_steps, end - begin, end - (stop.asked_at or begin))
 
 
 def _dropped(error: Exception) -> str:
     lines = str(error).splitlines() or [""]
     return f"dropped: {type(error).__name__}: {lines[0]}"
-
-
-def train_candidate(successor: AnyModel, data: Labelled, limits: Limits) -> Candidate:
-    """Train a successor on the data; a plain function of plain arguments, so that any executor can run it."""
-    begin = time.perf_counter()
-    deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
-    stop = StopRule(deadline, limits.max_steps)
-    try:
-        if not len(data.seq):
-            raise SettingError("there is no labelled trace yet; report one first")
-        successor.fit(data.traces, data.labels, hashes=data.hashes, stop=stop)
-        reason = gate(successor)
-    except DengineError as error:
-        reason = f"dropped: {error}"
-    except Exception as error:  # no exception inside a model reaches the cell: it is recorded
-        reason = _dropped(error)
-    end = time.perf_counter()
-    accepted = reason.startswith(ACCEPTED)
-    tail = end - (stop.asked_at or begin)
-    return Candidate(successor if accepted else None, reason, successor.report.n_steps, end - begin, tail)
-
-
-def gate(candidate: AnyModel) -> str:
-    """Say accepted, with what the fit has to tell, or why the candidate is dropped; reads no label.
-
-    A gate on held-out loss belongs to each head, inside the reducer: here it would let fold k's labels choose encoder k.
-    """
-    if isinstance(candidate, ModelPrediction) and not np.isfinite(candidate.index.ring.points.numpy()).all():
-        return "dropped: the embedding of a reference is not finite"
-    return f"{ACCEPTED}; {candidate.report.note}" if candidate.report.note else ACCEPTED

@@ -16,9 +16,7 @@ from .folds import CLAMP, QUANTUM, hash_weights
 from .records import Reason, TraceSpec
 
 REASONS = tuple(Reason)
-GOOD, NOT_FINITE, CONSTANT, SATURATED = (
-    REASONS.index(r) for r in (Reason.CERTAIN, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED)
-)
+NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
 
 
 def as_trace(trace: ArrayLike, spec: TraceSpec | None) -> NDArray[np.float32]:

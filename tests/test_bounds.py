@@ -16,7 +16,7 @@ from dengine import (
     jeffreys_interval,
     wilson_interval,
 )
-from dengine.bounds import normal_quantile
+from dengine.decision.bounds import normal_quantile
 from dengine.errors import SettingError
 
 ALPHAS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.5)

@@ -9,10 +9,10 @@ from sklearn.neighbors import RadiusNeighborsClassifier
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from dengine import INTERVALS, Action, Policy, WilsonRadiusClassifier
+from dengine.decision.neighbors import ReferenceRing
+from dengine.decision.policy import Neighbourhood
+from dengine.decision.rule import SCRIPTED_INTERVALS, make_judge, script
 from dengine.errors import SettingError
-from dengine.judge import SCRIPTED_INTERVALS, make_judge, script
-from dengine.neighbors import ReferenceRing
-from dengine.policy import Neighbourhood
 
 
 @parametrize_with_checks(

@@ -11,7 +11,7 @@ from sklearn.utils import get_tags
 from dengine.errors import SettingError, TraceError
 from dengine.reducers.base import StopRule, content_fold
 from dengine.reducers.conv import ConvReducer
-from dengine.reducers.heads import CrossFittedScores
+from dengine.reducers.logistic import CrossFittedScores
 
 BOTH = pytest.mark.parametrize("objective", ["supervised", "label_free"])
 STEPS = StopRule(max_steps=20)

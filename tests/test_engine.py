@@ -25,11 +25,9 @@ from dengine import (
     TraceError,
     TraceSpec,
 )
-from dengine.core import Answering
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import audited, content_hash
-from dengine.sql_store import SqlStore
-from dengine.store import MemoryStore
+from dengine.store import MemoryStore, SqlStore
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
 AUDITING = RECIPE.with_policy(audit_rate=0.3)
@@ -310,7 +308,7 @@ def test_a_reducer_that_fails_on_a_trace_loses_no_label(data: Dataset) -> None:
 
         embed = __call__
 
-    engine.model._answering = Answering(Broken())
+    engine.model._compiled = CompiledPredictor(Broken())
     decision = engine.decide(data.X[60])
     assert decision.reason is Reason.MODEL_ERROR
     engine.report(decision.id, bool(data.y[60]))

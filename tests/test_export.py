@@ -25,7 +25,7 @@ from dengine import (
 )
 from dengine.engine import DataEngine
 from dengine.errors import ExportError, TraceError
-from dengine.exported import ExportedModel, read_metadata
+from dengine.export import ExportedModel, read_metadata
 from dengine.folds import content_fold
 from dengine.records import Action, Reason
 
@@ -149,7 +149,7 @@ def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tm
     model = fitted(data)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     assert exported.trace.channels == 3
-    judged = model.judge_many(data.X)
+    judged = model.predict_many(data.X)
     assert [d[2:6] for d in exported.decide_many(data.X)] == [(j.lower, j.upper, j.n_success, j.n_failure) for j in judged]
 
 
@@ -410,7 +410,7 @@ def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
     assert set(ring["spaces"][120:180]) == {0, 1}
     for name, mine in ring.items():
         np.testing.assert_array_equal(mine, getattr(model.index.ring, name).numpy())
-    judged = model.judge_many(data.X)
+    judged = model.predict_many(data.X)
     assert [d[2:6] for d in exported.decide_many(data.X)] == [(j.lower, j.upper, j.n_success, j.n_failure) for j in judged]
 
 

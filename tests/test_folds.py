@@ -9,8 +9,8 @@ from hypothesis.extra import numpy as hnp
 from scipy import stats
 
 from dengine import TraceSpec
+from dengine.decision.rule import script
 from dengine.folds import audited, content_fold, content_hash, fold_of, hash_weights, toss
-from dengine.judge import script
 from dengine.traces import TraceGate
 
 any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)

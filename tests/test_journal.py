@@ -11,7 +11,7 @@ from dengine import Dataset, Recipe, TraceSpec, load_exported
 from dengine.cli.export import export, import_labels
 from dengine.engine import DataEngine
 from dengine.errors import DataError
-from dengine.journal import import_journal, read_journal
+from dengine.importing import import_journal, read_journal
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dengine.judge import script
-from dengine.neighbors import RadiusIndex, ReferenceRing, math_ceil
+from dengine.decision.neighbors import RadiusIndex, ReferenceRing, math_ceil
+from dengine.decision.rule import script
 
 
 def points(n: int, d: int = 2, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -15,8 +15,8 @@ pytest.importorskip("onnxscript")
 from dengine import Dataset, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier, export_torchscript  # noqa: E402  # after the skips
 from dengine.engine import DataEngine  # noqa: E402
 from dengine.errors import ExportError, TraceError  # noqa: E402
-from dengine.exported import load_exported  # noqa: E402
-from dengine.onnx_export import export_onnx, load_onnx  # noqa: E402
+from dengine.export.onnx import export_onnx, load_onnx  # noqa: E402
+from dengine.export.torchscript import load_exported  # noqa: E402
 from dengine.records import Action, Reason  # noqa: E402
 
 SPEC = TraceSpec(100, limit=500.0)

@@ -28,8 +28,8 @@ from dengine import (
 )
 from dengine.errors import SettingError
 from dengine.folds import content_fold
-from dengine.prediction import Model
-from dengine.reducers.base import OneSpace, in_spaces, uses_labels
+from dengine.model import Model
+from dengine.reducers.cross_fitting import LabelFree, as_reducer, uses_labels
 
 
 def classifier(**changes) -> WilsonRadiusClassifier:
@@ -121,8 +121,8 @@ def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Da
 def test_the_tag_decides_between_one_space_and_cross_fitting() -> None:
     assert uses_labels(LinearDiscriminantAnalysis())
     assert not uses_labels(PCA())
-    assert isinstance(in_spaces(LinearDiscriminantAnalysis(), 3), CrossFitted)
-    assert isinstance(in_spaces(PCA(), 3), OneSpace)
+    assert isinstance(as_reducer(LinearDiscriminantAnalysis(), 3), CrossFitted)
+    assert isinstance(as_reducer(PCA(), 3), LabelFree)
 
 
 def test_a_pipeline_that_uses_labels_works_when_it_is_cross_fitted_by_hand(data: Dataset) -> None:
@@ -179,11 +179,11 @@ def test_an_unfitted_model_says_what_to_do(data: Dataset) -> None:
 
 def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None:
     parent = ModelPrediction("pca", classifier()).fit(data.X[:100], data.y[:100])
-    before = parent.judge_many(data.X[100:])
+    before = parent.predict_many(data.X[100:])
     child = parent.successor().fit(data.X[50:], 1 - data.y[50:])
     child.add(data.X[0], 1)
-    assert parent.judge_many(data.X[100:]) == before
-    assert child.judge_many(data.X[100:]) != before
+    assert parent.predict_many(data.X[100:]) == before
+    assert child.predict_many(data.X[100:]) != before
 
 
 # -------------------------------------------------------------------------------------------- states and processes
@@ -200,10 +200,10 @@ def fitted(name: str, data: Dataset) -> ModelPrediction:
 def test_a_state_restores_every_judgement_bit_for_bit(data: Dataset) -> None:
     model = fitted("pca", data)
     restored = ModelPrediction("pca", classifier()).set_state(model.get_state())
-    assert restored.judge_many(data.X) == model.judge_many(data.X)
+    assert restored.predict_many(data.X) == model.predict_many(data.X)
     restored.add(data.X[160], 1)
     model.add(data.X[160], 1)
-    assert restored.judge_many(data.X) == model.judge_many(data.X)
+    assert restored.predict_many(data.X) == model.predict_many(data.X)
 
 
 def test_a_state_is_plain_arrays_and_a_copy(data: Dataset) -> None:
@@ -221,20 +221,20 @@ def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements
     state = model.get_state()
     assert not any(name.startswith("reducer.") for name in state)
     restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
-    assert restored.judge_many(data.X) == model.judge_many(data.X)
+    assert restored.predict_many(data.X) == model.predict_many(data.X)
 
 
 @pytest.mark.parametrize("name", ["pca", "lda"])
 def test_a_pickled_model_judges_the_same(name: str, data: Dataset) -> None:
     model = fitted(name, data)
-    assert pickle.loads(pickle.dumps(model)).judge_many(data.X) == model.judge_many(data.X)
+    assert pickle.loads(pickle.dumps(model)).predict_many(data.X) == model.predict_many(data.X)
 
 
 def test_a_model_trained_in_a_spawned_process_judges_as_one_trained_here(data: Dataset) -> None:
     here = lda().fit(data.X, data.y)
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         there = pool.submit(lda().fit, data.X, data.y).result()
-    assert there.judge_many(data.X) == here.judge_many(data.X)
+    assert there.predict_many(data.X) == here.predict_many(data.X)
 
 
 # ---------------------------------------------------------------------------------------------------- a rival

@@ -12,13 +12,13 @@ import pytest
 pytest.importorskip("mujoco")
 
 from dengine.cells.base import Cell
-from dengine.cells.conditions import Conditions, draw_conditions
-from dengine.cells.generate import save_traces, simulate, simulate_balanced
-from dengine.cells.insertion import CAUSES, insert_once
-from dengine.cells.parameters import CellParameters
-from dengine.cells.scenarios import JUMP_N, SCENARIOS, WEAR_FRICTION, find_scenario
-from dengine.cells.simulated import SimulatedCell
-from dengine.cells.world import push
+from dengine.cells.simulation.cell import SimulatedCell
+from dengine.cells.simulation.conditions import Conditions, draw_conditions
+from dengine.cells.simulation.generate import save_traces, simulate, simulate_balanced
+from dengine.cells.simulation.insertion import CAUSES, insert_once
+from dengine.cells.simulation.parameters import CellParameters
+from dengine.cells.simulation.scenarios import JUMP_N, SCENARIOS, WEAR_FRICTION, find_scenario
+from dengine.cells.simulation.world import push
 from dengine.errors import DengineError, SettingError
 from dengine.records import Outcome
 

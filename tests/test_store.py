@@ -20,8 +20,7 @@ from hypothesis.extra import numpy as hnp
 from dengine import sql_database
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.sql_store import SqlStore
-from dengine.store import MemoryStore, Store, open_store
+from dengine.store import MemoryStore, SqlStore, Store, open_store
 
 C, T = 2, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dengine.sql_store import SqlStore
+from dengine.store import SqlStore
 
 CHILD = """
 import sys, uuid
 import numpy as np
 from dengine.records import Action, Decision, Reason, Source
-from dengine.sql_store import SqlStore
+from dengine.store import SqlStore
 
 store = SqlStore(sys.argv[1])
 while True:

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
-from dengine.sql_store import SqlStore
+from dengine.store import SqlStore
 
 URL = os.environ.get("DENGINE_TEST_POSTGRES", "")
 pytestmark = pytest.mark.skipif(not URL, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")

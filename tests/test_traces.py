@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dengine import Reason, TraceError, TraceSpec
-from dengine.judge import script
+from dengine.decision.rule import script
 from dengine.traces import REASONS, TraceGate, as_trace, as_traces, spec_of
 
 LENGTHS, CHANNELS = (152, 800, 1000), (1, 2, 3, 6)

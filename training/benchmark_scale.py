@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from dengine.model.factory import model_of
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Source, load_dataset, make_reducer
-from dengine.factory import model_of
 from dengine.folds import content_hash
 from dengine.traces import as_traces
 

@@ -16,9 +16,9 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.model_selection import StratifiedKFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 
-from dengine.cells.generate import simulate
-from dengine.cells.parameters import RATE_HZ
-from dengine.cells.world import TIME_STEP_S
+from dengine.cells.simulation.generate import simulate
+from dengine.cells.simulation.parameters import RATE_HZ
+from dengine.cells.simulation.world import TIME_STEP_S
 from dengine.datasets import Dataset, load_dataset
 
 FOLDS = 5

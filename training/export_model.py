@@ -11,8 +11,8 @@ from pathlib import Path
 
 from dengine import DataEngine, Recipe, export_torchscript, load_dataset
 from dengine.export import sum_file
+from dengine.export.onnx import export_onnx
 from dengine.importing import import_labelled, train_until_done
-from dengine.onnx_export import export_onnx
 from dengine.store import MemoryStore
 
 FORMATS = {"torchscript": export_torchscript, "onnx": export_onnx}

@@ -20,10 +20,10 @@ import numpy as np
 from check_simulation import forest, halve_step, predict_folds, report_hardness, report_shortcuts, report_step
 from numpy.typing import NDArray
 
-from dengine.cells.generate import SimulatedTraces, save_traces, simulate, simulate_balanced
-from dengine.cells.insertion import CAUSES
-from dengine.cells.parameters import RATE_HZ, CellParameters
-from dengine.cells.scenarios import SCENARIOS
+from dengine.cells.simulation.generate import SimulatedTraces, save_traces, simulate, simulate_balanced
+from dengine.cells.simulation.insertion import CAUSES
+from dengine.cells.simulation.parameters import RATE_HZ, CellParameters
+from dengine.cells.simulation.scenarios import SCENARIOS
 from dengine.datasets import Dataset, load_dataset
 
 SUCCESSES, FAILURES = 803, 700  # as in the paper

@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import DataEngine, Outcome, Recipe, SimulatedCell
-from dengine.cells.parameters import RATE_HZ
-from dengine.cells.scenarios import SCENARIOS
+from dengine.cells.simulation.parameters import RATE_HZ
+from dengine.cells.simulation.scenarios import SCENARIOS
 from dengine.experiments.live import RunLog, watch
 
 COLOURS = {1.0: "#0072B2", 0.0: "#D55E00"}  # good, bad

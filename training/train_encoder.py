@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from dengine.model.factory import model_of
 from rich.console import Console
 from rich.table import Table
 from torchmetrics import MetricCollection
 from torchmetrics.classification import BinaryAccuracy, BinaryAUROC, BinaryCalibrationError
 
 from dengine import Dataset, ModelPrediction, Recipe, export_torchscript, load_dataset
-from dengine.factory import model_of
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.traces import as_traces

@@ -28,10 +28,8 @@ from .output import show, write_json
 def export(store: str, out: Path, form: str, as_json: bool) -> None:
     """Write the whole decision of a store's engine to one file for the cell controller."""
     from ..engine import DataEngine
-    from ..export import export_torchscript
-    from ..onnx_export import export_onnx
+    from ..export import export_onnx, export_torchscript
 
-    _must_exist(store)
     write = {"torchscript": export_torchscript, "onnx": export_onnx}[form]
     with DataEngine.open(store) as engine:
         path = write(engine, out)
@@ -50,9 +48,8 @@ def export(store: str, out: Path, form: str, as_json: bool) -> None:
 @json_option
 def import_labels(journal: Path, store: str, as_json: bool) -> None:
     """Take the labels that a cell program learned back into the store. Each line counts once."""
-    from ..journal import import_journal
+    from ..importing import import_journal
 
-    _must_exist(store)
     report = import_journal(store, journal)
     if as_json:
         write_json({"verb": "import-labels", "store": store, "journal": str(journal)} | asdict(report))
@@ -61,10 +58,3 @@ def import_labels(journal: Path, store: str, as_json: bool) -> None:
         f"Imported {report.imported} labels into {store}, {report.quarantined} more into quarantine; "
         f"{report.known} were known from an earlier import."
     )
-
-
-def _must_exist(store: str) -> None:
-    from ..errors import StoreError
-
-    if "://" not in store and not Path(store).is_file():  # opening it would make it
-        raise StoreError(f"Expected a store, found no file {store}; `dengine train` and `dengine run` make one.")

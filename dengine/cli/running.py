@@ -14,7 +14,7 @@ from .output import progress, show, write_json
 if TYPE_CHECKING:
     from ..cells.base import Cell
     from ..experiments.live import RunLog
-    from ..store import Store
+    from ..store.base import Store
 
 STRETCHES = 6
 
@@ -46,19 +46,19 @@ def run(
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
     on after its last part with a label in the store: no part is learned from twice.
     """
+    from ..engine import DataEngine
     from ..experiments.live import watch
-    from ..importing import open_engine
 
-    engine, resumed = open_engine(store, choice.load() if choice.asked else None, seed)
+    engine = DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None)
     with engine:
         cell, name = CELLS[kind](engine.store, engine.seed, data, samples, scenario, cycles)
         with progress(name, cycles, as_json) as advance:
             log = watch(engine, cell, cycles, lambda cycle: advance(1))
-    _report(log, cell, kind, f"{name}, {engine.recipe.reducer}{', resumed' if resumed else ''}", out, as_json)
+    _report(log, cell, kind, f"{name}, {engine.recipe.reducer}{', resumed' if engine.resumed else ''}", out, as_json)
 
 
 def _simulated(store: Store, seed: int, data: str, samples: int | None, scenario: str, cycles: int) -> tuple[Cell, str]:
-    from ..cells.simulated import SimulatedCell
+    from ..cells.simulation.cell import SimulatedCell
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]

@@ -19,8 +19,8 @@ from .output import progress, show, write_json
 @json_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, as_json: bool) -> None:
     """Simulate insertions in MuJoCo and write their force traces and labels."""
-    from ..cells.generate import save_traces
-    from ..cells.generate import simulate as simulate_traces
+    from ..cells.simulation.generate import save_traces
+    from ..cells.simulation.generate import simulate as simulate_traces
 
     with progress(f"simulating {scenario}", n, as_json) as advance:
         traces = simulate_traces(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -38,11 +37,9 @@ def status(store: str, as_json: bool) -> None:
 
 def _read(store: str) -> tuple[dict[str, str], dict[str, Any], list[RetrainReport]]:
     from ..errors import StoreError
-    from ..store import open_store
+    from ..store.base import open_store
 
-    if "://" not in store and not Path(store).is_file():  # opening it would make it
-        raise StoreError(f"Expected a store, found no file {store}; `dengine train` and `dengine run` make one.")
-    opened = open_store(store)
+    opened = open_store(store, must_exist=True)
     try:
         settings = opened.settings()
         if "recipe" not in settings:

@@ -1,0 +1,1 @@
+"""Replays of recorded streams, grids of them, their tables and pictures; live runs."""

@@ -4,31 +4,60 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from .._lazy import find_class, lazy_names
 from ..errors import SettingError
 
+if TYPE_CHECKING:
+    from .base import Reducer
+    from .conv import ConvReducer
+    from .cross_fitting import CrossFitted
+    from .pca import PcaReducer
+    from .rocket import RocketReducer
+    from .umap import UmapReducer
+
 _WHERE = {
-    "conv": ("conv", "ConvReducer"),
-    "umap": ("umap", "UMAPReducer"),
-    "pca": ("linear", "PCAReducer"),
-    "rocket": ("rocket", "RocketReducer"),
+    "base": ("Reducer",),
+    "conv": ("ConvReducer",),
+    "cross_fitting": ("CrossFitted",),
+    "pca": ("PcaReducer",),
+    "rocket": ("RocketReducer",),
+    "umap": ("UmapReducer",),
 }
+_CLASSES = {
+    "conv": "dengine.reducers.conv:ConvReducer",
+    "umap": "dengine.reducers.umap:UmapReducer",
+    "pca": "dengine.reducers.pca:PcaReducer",
+    "rocket": "dengine.reducers.rocket:RocketReducer",
+}
+
+__all__ = [
+    "REDUCERS",
+    "ConvReducer",
+    "CrossFitted",
+    "PcaReducer",
+    "Reducer",
+    "RocketReducer",
+    "UmapReducer",
+    "make_reducer",
+    "reducer_class",
+]
 
 
 def reducer_class(name: str) -> type:
-    """The class behind a name in `REDUCERS`, imported when it is asked for: UMAP alone takes seconds."""
-    if name not in _WHERE:
-        raise SettingError(f"Expected a reducer among {', '.join(_WHERE)}, got {name!r}.")
-    module, class_name = _WHERE[name]
-    found: type = getattr(import_module(f"{__name__}.{module}"), class_name)
+    """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for: UMAP alone takes seconds."""
+    if name not in _CLASSES and ":" not in name:
+        raise SettingError(f"Expected a reducer among {', '.join(_CLASSES)}, or module:Class of your own, got {name!r}.")
+    found = find_class(_CLASSES.get(name, name))
+    if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no fit and transform.")
     return found
 
 
 def make_reducer(name: str, **params: Any) -> Any:
-    """A reducer by its name in `REDUCERS`; SettingError for an unknown name or parameter."""
+    """A reducer by its name in `REDUCERS` or `module:Class`; SettingError for an unknown name or parameter."""
     found = reducer_class(name)
     allowed = signature(found).parameters
     unknown = sorted(set(params) - set(allowed))
@@ -37,4 +66,6 @@ def make_reducer(name: str, **params: Any) -> Any:
     return found(**params)
 
 
-REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _WHERE}
+REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _CLASSES}
+
+__getattr__, __dir__ = lazy_names(__name__, _WHERE)

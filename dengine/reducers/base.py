@@ -1,29 +1,29 @@
-"""What every reducer is to the engine: K embedding spaces, of which space k never saw a label of fold k.
+"""What a reducer is: trace -> embedding, and everything that the model asks of one.
 
-A reducer is a scikit-learn transformer: `fit(X, y=None)`, `transform(X) -> (n, d)`. `in_spaces` gives any of them the
-face that the model prediction works with (`Spaces`): one that uses no labels has one space, one that does is
-cross-fitted, and one that cross-fits by itself (`ConvReducer`) is taken as it is.
+A reducer of one's own is a subclass with `fit` and `transform`; the rest has defaults. `dengine.checks.check_reducer` runs
+the contract on it. Any scikit-learn transformer works as well, wrapped by `cross_fitting.as_reducer`.
+
+Embeddings have K spaces: a label may be counted for a query only in a space that never saw that label, so fold k's
+references live in space k, which was fitted without fold k's labels. A reducer that uses no labels has one space.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin, clone
-from sklearn.utils import get_tags
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin
+from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 
-from ..errors import SettingError
-from ..folds import content_fold
+from ..errors import SettingError, TraceError
 
 if TYPE_CHECKING:
     from torch import nn
-
-__all__ = ["CrossFitted", "OneSpace", "Spaces", "StopRule", "content_fold", "in_spaces", "uses_labels"]
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -52,53 +52,6 @@ class StopRule:
         return self.deadline is not None and self.asked_at >= self.deadline
 
 
-class Spaces(Protocol):
-    """A reducer as the model prediction sees it: K spaces, fold k's references living in space k."""
-
-    @property
-    def n_spaces(self) -> int:
-        """K; 1 for a reducer that uses no labels."""
-        ...
-
-    @property
-    def natural_scale(self) -> bool:
-        """Whether the embedding has a unit of its own, a probability say, that must not be scaled away."""
-        ...
-
-    def fit(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Self:
-        """Fit on traces (n, C, T), labels (n,) and folds (n,); space k uses no label of fold k."""
-        ...
-
-    def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, K, d), every trace in every space."""
-        ...
-
-    def embed_own(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), row i in space folds[i]: where references live."""
-        ...
-
-    def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
-        """`embed_own` of the very traces that were fitted, where the fit already placed them."""
-        ...
-
-    def module(self) -> nn.Module | None:
-        """The embedding as a scriptable module, (B, C, T) -> (B, K, d); None where there is none."""
-        ...
-
-    def get_state(self) -> State | None:
-        """Plain arrays that `set_state` restores bit for bit; None where only a refit can."""
-        ...
-
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore what `get_state` gave."""
-        ...
-
-    @property
-    def report(self) -> FitReport:
-        """What the last fit says of itself."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class FitReport:
     """What an iterative fit says of itself: steps taken, and a held-out loss that no counted label chose (NaN: none)."""
@@ -108,190 +61,138 @@ class FitReport:
     note: str = ""
 
 
-def uses_labels(reducer: Any) -> bool:
-    """Whether `fit` uses labels: scikit-learn's `target_tags.required`. A reducer without the tag is given none."""
-    return bool(get_tags(reducer).target_tags.required)
+class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
+    """A scikit-learn transformer of traces, (n, T) or (n, C, T), into points (n, d), and the model's view of it.
 
-
-def in_spaces(reducer: Any, folds: int) -> Spaces:
-    """The reducer with the face of `Spaces`, cross-fitted by `folds` clones where it uses labels.
-
-    A reducer that uses no labels is never handed any, so its one space is honest by construction.
-    """
-    if hasattr(reducer, "embed_own"):
-        spaces: Spaces = reducer if isinstance(reducer, CrossFitted | OneSpace) else _Native(reducer)
-        return spaces
-    return CrossFitted(reducer, folds) if uses_labels(reducer) else OneSpace(reducer)
-
-
-class OneSpace:
-    """A label-free transformer: one space serves every fold."""
-
-    n_spaces = 1
-
-    def __init__(self, reducer: Any) -> None:
-        self.reducer = reducer
-
-    @property
-    def natural_scale(self) -> bool:
-        """What the reducer says; an embedding without a word on it is scaled."""
-        return bool(getattr(self.reducer, "natural_scale", False))
-
-    def fit(self, X: Floats, y: Ints | None = None, folds: Ints | None = None, stop: StopRule | None = None) -> Self:
-        """Fit on the traces alone."""
-        self.reducer.fit(_as_expected(self.reducer, X))
-        return self
-
-    def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, 1, d)."""
-        return _float32(self.reducer.transform(_as_expected(self.reducer, X)))[:, None, :]
-
-    def embed_own(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d)."""
-        return self.embed(X)[:, 0]
-
-    def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d): UMAP's fit has placed its training traces, a transform would place them anew, slowly."""
-        placed = getattr(self.reducer, "embedding_", None)
-        return self.embed_own(X, folds) if placed is None else _float32(placed)
-
-    def transform(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, d)."""
-        return self.embed(X)[:, 0]
-
-    def module(self) -> nn.Module | None:
-        """The reducer's module, where it has one."""
-        return self.reducer.module() if hasattr(self.reducer, "module") else None
-
-    def get_state(self) -> State | None:
-        """The reducer's arrays, where it gives them."""
-        return self.reducer.get_state() if hasattr(self.reducer, "get_state") else None
-
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore the reducer's arrays."""
-        self.reducer.set_state(state)
-        return self
-
-    @property
-    def report(self) -> FitReport:
-        """What the reducer says of its last fit."""
-        return _report(self.reducer)
-
-
-class _Native(OneSpace):
-    """A reducer that cross-fits by itself."""
-
-    @property
-    def n_spaces(self) -> int:  # type: ignore[override]  # a constant for one space, a parameter here
-        """The reducer's own number of folds."""
-        return int(self.reducer.n_spaces)
-
-    def fit(self, X: Floats, y: Ints | None = None, folds: Ints | None = None, stop: StopRule | None = None) -> Self:
-        """Fit all spaces at once."""
-        self.reducer.fit(X, y, folds=folds, stop=stop)
-        return self
-
-    def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, K, d)."""
-        return _float32(self.reducer.embed(X))
-
-    def embed_own(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d)."""
-        return _float32(self.reducer.embed_own(X, folds))
-
-    def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), from what the fit computed where the reducer kept it."""
-        fitted = getattr(self.reducer, "embed_fitted", self.reducer.embed_own)
-        return _float32(fitted(X, folds))
-
-    def transform(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, d)."""
-        return _float32(self.reducer.transform(X))
-
-
-class CrossFitted(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
-    """Any label-using transformer, K times: clone k is fitted on every trace outside fold k.
-
-    reducer : the transformer; it is cloned, never fitted itself.
-    folds : K, 2 or more.
+    uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
+    own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
+    single_tolerance : how far a trace may move when it is embedded alone instead of in a batch, in units of the embedding's
+        root mean square radius.
     """
 
-    def __init__(self, reducer: Any, folds: int = 2) -> None:
-        self.reducer = reducer
-        self.folds = folds
+    uses_labels = False
+    own_unit = False
+    single_tolerance = 1e-4
 
-    @property
-    def natural_scale(self) -> bool:
-        """What the reducer says of its clones."""
-        return bool(getattr(self.reducer, "natural_scale", False))
+    @abstractmethod
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
+        """Fit on traces (n, T) or (n, C, T) and, where labels are used, y (n,), the larger value being the success.
+
+        Starts afresh: what an earlier fit learned is forgotten. `train` is the engine's way, which may go on from it.
+        """
+
+    @abstractmethod
+    def transform(self, X: ArrayLike) -> Floats:
+        """(n, T) or (n, C, T) -> (n, d); of several spaces their mean, for pictures, never counted in."""
 
     @property
     def n_spaces(self) -> int:
-        """K."""
-        return int(self.folds)
+        """K, embedding spaces."""
+        return 1
 
-    def fit(self, X: Floats, y: Ints | None = None, folds: Ints | None = None, stop: StopRule | None = None) -> Self:
-        """Fit the K clones; SettingError where one of them would see a single class."""
-        if self.folds < 2:
-            raise SettingError(f"Expected folds >= 2 for a reducer that uses labels, got {self.folds}.")
-        if y is None:
-            raise SettingError(f"{type(self.reducer).__name__} uses labels: expected y, got None.")
-        folds = content_fold(X, self.folds) if folds is None else folds
-        self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
-        for k, outside in self._outside(folds):
-            # Fold k never trains clone k, or its labels would count themselves.
-            if len(np.unique(y[outside])) < 2:
-                raise SettingError(f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of one.")
-            self.clones_[k].fit(_as_expected(self.reducer, X[outside]), y[outside])
-        return self
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+        """Fit for an engine, from where an earlier training ended if the kind can; returns the traces' own places (n, d).
 
-    def _outside(self, folds: Ints) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        return ((k, folds != k) for k in range(self.folds))
-
-    def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, K, d)."""
-        flat = _as_expected(self.reducer, X)
-        return np.stack([_float32(c.transform(flat)) for c in self.clones_], axis=1)
-
-    def embed_own(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), row i by clone folds[i]."""
-        return np.asarray(self.embed(X)[np.arange(len(X)), folds])
-
-    def embed_fitted(self, X: Floats, folds: Ints) -> Floats:
-        """(n, C, T) -> (n, d), as `embed_own`."""
+        X : (n, C, T).  y : (n,) 1 success, 0 failure.  folds : (n,) permanent folds; space k uses no label of fold k.
+        stop : asked before each step of a fit that has steps; None: until done.
+        Row i of the result lies in space folds[i], where it will live as a reference.
+        """
+        self.fit(X, y if self.uses_labels else None)
         return self.embed_own(X, folds)
 
-    def transform(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in."""
-        return np.asarray(self.embed(X).mean(axis=1))
+    def embed(self, X: Floats) -> Floats:
+        """(n, C, T) -> (n, K, d) float32, every trace in every space."""
+        return as_points(self.transform(X))[:, None, :]
 
-    def module(self) -> None:
-        """None: K arbitrary transformers have no common module."""
-        return
+    def embed_own(self, X: Floats, folds: Ints) -> Floats:
+        """(n, C, T) -> (n, d), row i in space folds[i]."""
+        return own_places(self.embed(X), folds)
 
-    def get_state(self) -> None:
-        """None: restored by a refit."""
-        return
+    def module(self) -> nn.Module | None:
+        """The embedding as a module that TorchScript compiles, (B, C, T) -> (B, K, d); None: it stays in Python."""
+        return None
+
+    def get_state(self) -> State | None:
+        """Plain arrays that `set_state` restores bit for bit; None where only a refit can."""
+        return None
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Never called: there is no state to restore."""
-        raise NotImplementedError("CrossFitted is restored by a refit.")
+        """Become what `get_state` was taken from; the parameters must be the same."""
+        raise NotImplementedError(f"{type(self).__name__} gives no state, so it is restored by a refit.")
 
     @property
     def report(self) -> FitReport:
-        """Closed-form as far as anybody knows."""
+        """What the last fit says of itself."""
         return FitReport()
 
+    def check_traces(self, X: Any, *, reset: bool = False) -> Floats:
+        """Traces (n, T) or (n, C, T), arrays or data frames, as (n, C, T) float32; ValueError for a NaN or another shape.
 
-def _as_expected(reducer: Any, X: Floats) -> Floats:
-    """Traces as a transformer takes them: ours take (n, C, T), scikit-learn's take rows."""
-    return X if getattr(reducer, "takes_traces", False) else X.reshape(len(X), -1)
+        reset : whether these traces set the shape that later ones must have, as in `fit`.
+        """
+        if not reset:
+            check_is_fitted(self)
+        shape = np.shape(X)
+        if len(shape) == 3:
+            x = check_array(X, dtype=np.float32, order="C", allow_nd=True, ensure_min_samples=int(reset), estimator=self)
+            if 0 in x.shape[1:]:
+                raise TraceError(f"Expected traces with samples, got shape {shape}.")
+            if reset:
+                self.n_features_in_ = x.shape[1] * x.shape[2]
+        else:
+            x = validate_data(self, X, reset=reset, dtype=np.float32, order="C", ensure_min_samples=int(reset))[:, None, :]
+        if reset:
+            self.trace_shape_ = x.shape[1:]
+        elif x.shape[1:] != self.trace_shape_:
+            channels, samples = self.trace_shape_
+            raise TraceError(
+                f"Expected traces of {channels} channels x {samples} samples, as in fit, got {x.shape[1]} x {x.shape[2]}; "
+                "resample, or fit a fresh clone."
+            )
+        return np.asarray(x)
+
+    @property
+    def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
+        return int(self.get_params(deep=False)["n_components"])
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.required = self.uses_labels
+        tags.transformer_tags.preserves_dtype = ["float32"]
+        return tags
 
 
-def _float32(Z: Any) -> Floats:
+def as_points(Z: Any) -> Floats:
+    """An embedding as float32, (n, d)."""
     return np.ascontiguousarray(Z, dtype=np.float32)
 
 
-def _report(reducer: Any) -> FitReport:
-    steps, loss = getattr(reducer, "n_steps_", 0), getattr(reducer, "holdout_loss_", float("nan"))
-    return FitReport(int(steps), float(loss), str(getattr(reducer, "note_", "")))
+def own_places(Z: Floats, folds: Ints) -> Floats:
+    """(n, K, d) -> (n, d), row i of space folds[i]; of one space, all of it."""
+    own = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
+    return np.ascontiguousarray(Z[np.arange(len(Z)), own])
+
+
+def binary_labels(y: Any, n: int, name: str) -> Ints:
+    """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are."""
+    if y is None:
+        raise SettingError(f"{name} uses labels: requires y to be passed, but the target y is None.")
+    labels = np.asarray(y)
+    classes = np.unique(labels)
+    if labels.shape != (n,) or len(classes) > 2:
+        raise SettingError(
+            f"Expected {n} labels of two classes, 1 = success and 0 = failure, got shape {labels.shape} "
+            f"and {len(classes)} classes."
+        )
+    if np.isin(classes, (0, 1)).all():
+        return labels.astype(np.int64)
+    return np.asarray(labels == classes[-1], dtype=np.int64)
+
+
+def seed_of(random_state: Any) -> int | None:
+    """scikit-learn's `random_state` (None, an integer or a RandomState) as a seed for NumPy's and torch's generators."""
+    if random_state is None or isinstance(random_state, int | np.integer):
+        return None if random_state is None else int(random_state)
+    if isinstance(random_state, np.random.RandomState):
+        return int(random_state.randint(2**31 - 1))
+    raise SettingError(f"Expected random_state None, an integer or a RandomState, got {random_state!r}.")

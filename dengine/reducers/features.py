@@ -85,7 +85,7 @@ class Features(nn.Module):
 class ConvFeatures(Features):
     """Segment statistics of the trace, and of learned filters over it.
 
-    channels, samples : C and T.  segments, filters, regions : S, F and R of the module's docstring.
+    channels, samples : C and T.  segments, filters, regions : S, F and R of the module's docstring, S and R at most.
     """
 
     kernel: Tensor
@@ -93,20 +93,19 @@ class ConvFeatures(Features):
     regions: Tensor
 
     def __init__(self, channels: int, samples: int, segments: int, filters: int, regions: int) -> None:
-        if samples < 2 * segments or samples < 4 * regions:
-            raise SettingError(
-                f"Expected at least {max(2 * segments, 4 * regions)} samples for {segments} segments and "
-                f"{regions} regions, got {samples}; lower `segments` or record longer."
-            )
+        if samples < 2:
+            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
+        patch = max(2, samples // PATCH_SHARE)
+        stride = max(1, patch // 4)
+        frames = (samples - patch) // stride + 1
+        # A short trace has fewer segments and regions: a deviation wants two samples, a region four and a frame.
+        segments = min(segments, samples // 2)
+        regions = max(1, min(regions, samples // 4, frames))
         super().__init__(channels, 4 * channels * segments + filters * regions)
         self.channels, self.segments = channels, segments
         self.length = samples // segments
         self.head = samples - segments * self.length  # left out at the start: the end of an insertion tells most
-        self.patch = max(2, samples // PATCH_SHARE)
-        self.stride = max(1, self.patch // 4)
-        frames = (samples - self.patch) // self.stride + 1
-        if frames < regions:
-            raise SettingError(f"Expected at most {frames} regions for {samples} samples, got {regions}.")
+        self.patch, self.stride = patch, stride
         per_region = frames // regions
         # Frames start late enough for the last one to end with the trace.
         self.skip = samples - self.patch - (regions * per_region - 1) * self.stride

@@ -18,8 +18,9 @@ from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
 from ..folds import content_hash
-from .feature_reducer import FeatureReducer, Floats
+from .base import Floats
 from .features import Features
+from .scored import FeatureReducer
 
 LENGTH = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
 
@@ -31,8 +32,8 @@ class RocketFeatures(Features):
     bias: Tensor
 
     def __init__(self, channels: int, samples: int, dilations: int) -> None:
-        if samples < LENGTH:
-            raise SettingError(f"Expected at least {LENGTH} samples, got {samples}.")
+        if samples < 2:
+            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         widest = np.log2((samples - 1) / (LENGTH - 1)) if samples > LENGTH else 0.0
         spread = np.unique(np.floor(2.0 ** np.linspace(0.0, max(0.0, widest), dilations)).astype(int))
         kernels = _kernels()
@@ -69,15 +70,25 @@ class RocketReducer(FeatureReducer):
     """Trace -> point, by MiniRocket's features and cross-fitted logistic heads.
 
     dilations : D, kernels' spreads between 1 and the length of the trace.
-    dim, folds, l2, seed : as in `ConvReducer`.
+    n_components, folds, l2, max_iter, random_state : as in `ConvReducer`.
     """
 
-    def __init__(self, *, dim: int = 2, folds: int = 5, dilations: int = 3, l2: float = 1.0, seed: int = 0) -> None:
-        self.dim = dim
+    def __init__(
+        self,
+        *,
+        n_components: int = 2,
+        folds: int = 5,
+        dilations: int = 3,
+        l2: float = 1.0,
+        max_iter: int = 12,
+        random_state: Any = 0,
+    ) -> None:
+        self.n_components = n_components
         self.folds = folds
         self.dilations = dilations
         self.l2 = l2
-        self.seed = seed
+        self.max_iter = max_iter
+        self.random_state = random_state
 
     def make_features(self, channels: int, samples: int) -> Features:
         """Shares of positive values."""

@@ -6,16 +6,17 @@ import warnings
 from typing import Any, Self
 
 import numpy as np
-from sklearn.base import BaseEstimator, TransformerMixin
+from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from ..errors import SettingError
+from .base import Floats, Ints, Reducer, StopRule, as_points
 
 
-class UMAPReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
-    """umap-learn's UMAP under a seed: fitted on one thread, so that a run repeats exactly.
+class UmapReducer(Reducer):
+    """umap-learn's UMAP: with a random_state fitted on one thread, so that a run repeats exactly.
 
-    dim : of the embedding.  n_neighbors, min_dist, n_epochs : as in umap-learn.  seed : of its random state.
+    n_components : of the embedding.  n_neighbors, min_dist, n_epochs, random_state : as in umap-learn.
     It is refitted, not warm-started; a trace transformed alone moves by up to 0.1 against the same in a batch.
     Source: McInnes, Healy and Melville (2018), arXiv:1802.03426.
     """
@@ -23,38 +24,50 @@ class UMAPReducer(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sci
     single_tolerance = 0.3
 
     def __init__(
-        self, *, dim: int = 2, n_neighbors: int = 15, min_dist: float = 0.1, n_epochs: int | None = None, seed: int = 0
+        self,
+        *,
+        n_components: int = 2,
+        n_neighbors: int = 15,
+        min_dist: float = 0.1,
+        n_epochs: int | None = None,
+        random_state: Any = 0,
     ) -> None:
-        self.dim = dim
+        self.n_components = n_components
         self.n_neighbors = n_neighbors
         self.min_dist = min_dist
         self.n_epochs = n_epochs
-        self.seed = seed
+        self.random_state = random_state
 
-    def fit(self, X: Any, y: Any = None) -> Self:
-        """Fit on rows X (n, features); labels are ignored. SettingError for fewer rows than n_neighbors + 1."""
-        X = np.asarray(X, dtype=np.float32)
-        if len(X) <= self.n_neighbors:
-            raise SettingError(f"UMAP needs more than n_neighbors = {self.n_neighbors} traces, got {len(X)}.")
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
+        """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for fewer than n_neighbors + 1 traces."""
+        traces = self.check_traces(X, reset=True)
+        if len(traces) <= self.n_neighbors:
+            raise SettingError(
+                f"UMAP needs more than n_neighbors = {self.n_neighbors} traces, got n_samples = {len(traces)}."
+            )
         from umap import UMAP
 
         with _Quiet():
             self.umap_ = UMAP(
-                n_components=self.dim,
+                n_components=self.n_components,
                 n_neighbors=self.n_neighbors,
                 min_dist=self.min_dist,
                 n_epochs=self.n_epochs,
-                random_state=self.seed,
+                random_state=self.random_state,
                 n_jobs=1,
-            ).fit(X)
-        self.embedding_ = np.asarray(self.umap_.embedding_, dtype=np.float32)
+            ).fit(traces.reshape(len(traces), -1))
         return self
 
-    def transform(self, X: Any) -> Any:
-        """(n, features) -> (n, dim) float32."""
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+        """Fit; the fit has placed its traces, a transform would place them anew, slowly."""
+        return as_points(self.fit(X).umap_.embedding_)
+
+    def transform(self, X: ArrayLike) -> Floats:
+        """(n, T) or (n, C, T) -> (n, n_components) float32."""
         check_is_fitted(self, "umap_")
+        traces = self.check_traces(X)
         with _Quiet():
-            return np.asarray(self.umap_.transform(np.asarray(X, dtype=np.float32)), dtype=np.float32)
+            return np.asarray(self.umap_.transform(traces.reshape(len(traces), -1)), dtype=np.float32)
 
 
 class _Quiet(warnings.catch_warnings):

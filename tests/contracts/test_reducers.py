@@ -15,7 +15,8 @@ from dengine.errors import SettingError
 from dengine.folds import content_fold
 from dengine.recipe import RECIPES
 from dengine.reducers import reducer_class
-from dengine.reducers.base import StopRule, in_spaces, uses_labels
+from dengine.reducers.base import StopRule
+from dengine.reducers.cross_fitting import as_reducer, uses_labels
 
 STEPS = 8
 QUICK: dict[str, dict[str, Any]] = {"umap": {"n_epochs": 40, "n_neighbors": 8}}
@@ -31,7 +32,7 @@ def new(name: str, seed: int = 0) -> Any:
 
 def fit(name: str, data: Dataset, seed: int = 0) -> Any:
     X = data.X if data.X.ndim == 3 else data.X[:, None, :]
-    spaces = in_spaces(new(name, seed), 2)
+    spaces = as_reducer(new(name, seed), 2)
     return spaces.fit(X, data.y, content_fold(X, spaces.n_spaces), StopRule(max_steps=STEPS))
 
 
@@ -129,7 +130,7 @@ def test_embedding_does_not_change_the_traces(name: str, fitted, queries) -> Non
 def test_its_module_scripts_and_embeds_as_it_does(name: str, fitted, queries) -> None:
     import torch
 
-    from dengine.judge import script
+    from dengine.decision.rule import script
 
     module = fitted(name).module()
     if module is None:
@@ -147,7 +148,7 @@ def test_its_state_is_plain_arrays_that_restore_it_bit_for_bit(name: str, fitted
         assert name == "umap", f"{name} has no state: it would have to be refitted at every start"
         return
     assert all(isinstance(v, np.ndarray) and not v.dtype.hasobject for v in state.values())
-    restored = in_spaces(new(name), 2).set_state(state)
+    restored = as_reducer(new(name), 2).set_state(state)
     np.testing.assert_array_equal(restored.embed(queries), fitted(name).embed(queries))
 
 

@@ -12,7 +12,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, ReplayCell, WilsonRadiusClassifier, replay
 from dengine.experiments.replay import collect
 from dengine.recipe import RECIPES
-from dengine.reducers.base import OneSpace
+from dengine.reducers.cross_fitting import LabelFree
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 CYCLES = 1503
@@ -46,7 +46,7 @@ def test_labels_of_noise_yield_next_to_nothing_certain(name: str, make_data, pro
 # ------------------------------------------------------------------------------------------- caught when it cheats
 
 
-class SeesEverything(OneSpace):
+class SeesEverything(LabelFree):
     """Dishonest on purpose: one space, fitted on the very labels that are then counted in it."""
 
     def fit(self, X, y=None, folds=None, stop=None):

@@ -1,0 +1,145 @@
+"""A simulated robot cell that a `DataEngine` can drive: bin, gripper, fixture and height check in MuJoCo.
+
+    from dengine import DataEngine, SimulatedCell
+    cell = SimulatedCell(seed=0)
+    for cycle in DataEngine().run(cell, cycles=600): ...
+    print(cell.report())
+
+Nothing waits: the cell's clock counts the seconds that production would have taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DengineError, SettingError
+from ...records import Outcome
+from .insertion import Insertion, insert_once, streams
+from .parameters import CHANNELS, CellParameters
+from .scenarios import find_scenario
+
+
+@dataclass(frozen=True, slots=True)
+class CellReport:
+    """What a simulated run came to; the counts are of cycles.
+
+    clock_s : simulated seconds of production.
+    finished : good parts that were passed on, verified or not. verifications : height checks done.
+    stops : failed parts passed on that stopped the system. escapes : failed parts passed on in silence.
+    sent_back : good parts that were sent back to the bin unverified.
+    parts_per_hour : finished parts by the clock.
+    seconds_saved : against verifying every cycle: the checks left out, less the stops, less a verified cycle for each
+        good part sent back, which the line has to make good. Negative where the model cost more than it gave.
+    """
+
+    cycles: int
+    clock_s: float
+    finished: int
+    verifications: int
+    stops: int
+    escapes: int
+    sent_back: int
+    parts_per_hour: float
+    seconds_saved: float
+
+
+class SimulatedCell:
+    """A `Cell` whose parts, forces and heights come from physics, and whose clock is simulated.
+
+    parameters : every physical setting, see `CellParameters`.
+    scenario : what changes while it runs, a name in `SCENARIOS`.
+    seed : the same seed gives the same insertions, whatever is decided about them.
+    channels : `"z"` for traces of (1000,), `"all"` for (6, 1000).
+    cycles : length of the run a scenario is laid over; "half way" is half of it. The cell goes on after it.
+    """
+
+    def __init__(
+        self,
+        parameters: CellParameters | None = None,
+        scenario: str = "nominal",
+        seed: int = 0,
+        channels: str = "z",
+        cycles: int = 600,
+    ) -> None:
+        if channels not in CHANNELS:
+            raise SettingError(f"Expected channels of {', '.join(CHANNELS)}; got {channels!r}; choose one of these.")
+        if cycles < 1:
+            raise SettingError(f"Expected cycles of at least 1, got {cycles}; give the length of the run.")
+        self.parameters = parameters or CellParameters()
+        self.scenario, self.seed, self.channels, self.cycles = scenario, seed, channels, cycles
+        self.clock = 0.0
+        self.last: Insertion | None = None  # the truth about the part in the cell: for reports, never for an engine
+        self._change = find_scenario(scenario)
+        self._waiting = False
+        self._done = self._finished = self._verifications = self._stops = self._escapes = self._sent_back = 0
+
+    @property
+    def truth(self) -> bool:
+        """Whether the part just inserted is good."""
+        if self.last is None:
+            raise DengineError("Expected insert() before truth, got truth of an empty cell; insert a part.")
+        return self.last.success
+
+    def insert(self) -> NDArray[np.float32]:
+        """Pick a part, push it into the fixture, return the force: newtons at 500 Hz for 2 s."""
+        if self._waiting:
+            raise DengineError("Expected verify(), proceed() or reject() after insert(), got insert(); call one.")
+        changed = self._change(self.parameters, self._done, self.cycles)
+        insertion = insert_once(changed, self.seed, self._done, self.channels)
+        self.last, self._waiting = insertion, True
+        self.clock += self.parameters.cycle_s
+        self._done += 1
+        return insertion.trace
+
+    def verify(self) -> bool:
+        """Check the height; a good part goes on, a bad one back to the bin."""
+        success = self._take("verify").success
+        self.clock += self.parameters.verify_s
+        self._verifications += 1
+        self._finished += success
+        return success
+
+    def proceed(self) -> Outcome:
+        """Pass the part on unverified. A bad one stops the system, but for its silent share."""
+        success = self._take("proceed").success
+        chance = float(streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
+        if success:
+            self._finished += 1
+            return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
+        if chance < self.parameters.silent_share:
+            self._escapes += 1
+            return Outcome.UNKNOWN
+        self.clock += self.parameters.stop_s
+        self._stops += 1
+        return Outcome.STOPPED
+
+    def reject(self) -> None:
+        """Send the part back to the bin unverified; a good one has to be picked and inserted once more."""
+        self._sent_back += self._take("reject").success
+
+    def report(self) -> CellReport:
+        """Where the run stands, truth included."""
+        p = self.parameters
+        left_out = self._done - self._waiting - self._verifications
+        lost = p.stop_s * self._stops + (p.cycle_s + p.verify_s) * self._sent_back
+        return CellReport(
+            cycles=self._done,
+            clock_s=self.clock,
+            finished=self._finished,
+            verifications=self._verifications,
+            stops=self._stops,
+            escapes=self._escapes,
+            sent_back=self._sent_back,
+            parts_per_hour=3600 * self._finished / self.clock if self.clock else 0.0,
+            seconds_saved=p.verify_s * left_out - lost,
+        )
+
+    def _take(self, call: str) -> Insertion:
+        """The part in the fixture; each can be taken once."""
+        if self.last is None or not self._waiting:
+            raise DengineError(f"Expected insert() before {call}(), got {call}() with no part waiting; insert one.")
+        self._waiting = False
+        return self.last

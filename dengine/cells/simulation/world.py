@@ -1,0 +1,194 @@
+"""The simulated world: gripper, part and fixture in MuJoCo, and one force-limited push.
+
+    forces, height_mm = push(conditions)
+
+Lengths inside MuJoCo are metres. The rim of the fixture is z = 0 and its seat z = -DEPTH_MM. The hole is built from
+boxes, because MuJoCo turns colliding meshes into their convex hulls and would close it.
+Source: Todorov, Erez and Tassa (2012), MuJoCo: A physics engine for model-based control, IROS.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DengineError, SettingError
+from .parameters import RATE_HZ, SAMPLES
+
+if TYPE_CHECKING:
+    from .conditions import Conditions
+
+TIME_STEP_S = 0.0005
+DEPTH_MM = 12.0
+WIDTH_MM = 16.0  # of a right part, square
+LENGTH_MM = 40.0
+PROTRUSION_MM = 30.0  # how far a right part sticks out of the gripper, nominally
+_WALL_MM = 14.0
+_BAND_N = 8.0  # the push slows down over the last newtons before its limit
+_SETTLE_SAMPLES = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """What one push left behind.
+
+    wrench : (1000, 6) float64, what the sensor would read without its faults: newtons and newton metres; pushing is +z.
+    height_mm : of the part's top over its nominal seated height; of the bare floor where there was no part.
+    slip_mm : how far the part slid up in the gripper.
+    """
+
+    wrench: NDArray[np.float64]
+    height_mm: float
+    slip_mm: float
+
+
+def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
+    """Lower the gripper at its speed until the target or the force limit holds it; record at 500 Hz for 2 s."""
+    mujoco, steps = _mujoco(), round(1 / RATE_HZ / time_step_s)
+    if not math.isclose(steps * time_step_s, 1 / RATE_HZ):
+        raise SettingError(f"Expected a time step that divides 2 ms, got {time_step_s} s; take 0.0005 or half of it.")
+    model = _build(mujoco, fixture_xml(conditions, time_step_s))
+    data = mujoco.MjData(model)
+    wrench = _drive(mujoco, model, data, conditions, steps)
+    if conditions.fault == "missed_grasp":
+        return Push(wrench, height_mm=-LENGTH_MM, slip_mm=0.0)
+    top_mm = 1000 * float(data.site("top").xpos[2])
+    slip_mm = 1000 * float(data.joint("in_hand").qpos[0])
+    return Push(wrench, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
+
+
+def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> NDArray[np.float64]:
+    """Run the push under its controller; the reading is zeroed before the motion, with the part in hand."""
+    settled = np.zeros(6)
+    for _ in range(_SETTLE_SAMPLES):
+        mujoco.mj_step(model, data, steps)
+    settled += data.sensordata
+    travel_m = (conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm) / 1000
+    period_s, delay_samples = 1 / RATE_HZ, conditions.delay_s * RATE_HZ
+    target_m, wrench = 0.0, np.empty((SAMPLES, 6))
+    for sample in range(SAMPLES):
+        if sample >= delay_samples:
+            room = (conditions.force_limit_n - wrench[sample - 1, 2]) / _BAND_N if sample else 1.0
+            target_m += min(1.0, max(-1.0, room)) * conditions.speed_mm_s / 1000 * period_s
+        data.ctrl[0] = -min(target_m, travel_m)
+        mujoco.mj_step(model, data, steps)
+        wrench[sample] = settled - data.sensordata  # pushing is positive
+    return wrench
+
+
+def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
+    """MJCF of the cell under these conditions."""
+    c = conditions
+    tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
+    k_lateral, k_axial, k_angular = 1000 * c.lateral_n_mm, 1000 * c.axial_n_mm, c.angular_nm_rad
+    return f"""
+<mujoco model="simulated insertion">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{time_step_s}" cone="elliptic" impratio="10" integrator="implicitfast" iterations="30"/>
+  <default><geom solref="0.002 1" solimp="0.99 0.999 0.0001" friction="{c.friction} 0.001 0.0001" condim="3"/></default>
+  <worldbody>
+    {_fixture(c)}
+    <body name="carriage" pos="0 0 {tool_z}" gravcomp="1">
+      <joint name="drive" type="slide" axis="0 0 1" damping="20"/>
+      <inertial pos="0 0 0" mass="4" diaginertia="0.02 0.02 0.02"/>
+      <body name="wrist" gravcomp="1">
+        <joint type="slide" axis="1 0 0" stiffness="{k_lateral}" damping="{_damping(k_lateral, 1.0)}"/>
+        <joint type="slide" axis="0 1 0" stiffness="{k_lateral}" damping="{_damping(k_lateral, 1.0)}"/>
+        <joint type="slide" axis="0 0 1" stiffness="{k_axial}" damping="{_damping(k_axial, 1.0)}"/>
+        <joint type="hinge" axis="1 0 0" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="hinge" axis="0 1 0" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
+        <joint type="hinge" axis="0 0 1" stiffness="{k_angular}" damping="{_damping(k_angular, 0.004)}"/>
+        <inertial pos="0 0 0" mass="0.2" diaginertia="0.0003 0.0003 0.0003"/>
+        <body name="tool" gravcomp="1">
+          <inertial pos="0 0 -0.03" mass="0.6" diaginertia="0.0006 0.0006 0.0003"/>
+          <site name="sensor"/>
+          {_part(c)}
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="drive" kp="80000" kv="1200" timeconst="0.01"/>
+  </actuator>
+  <sensor><force site="sensor"/><torque site="sensor"/></sensor>
+</mujoco>"""
+
+
+def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
+    """Viscous damping of a spring at this share of the critical one."""
+    return 2 * ratio * math.sqrt(stiffness * inertia)
+
+
+def _part(c: Conditions) -> str:
+    """The part in the gripper: dry friction holds it until the push exceeds the grip."""
+    if c.fault == "missed_grasp":
+        return ""
+    half = (WIDTH_MM + c.extra_width_mm) / 2000
+    length = (LENGTH_MM + c.extra_length_mm) / 1000
+    tip = -(PROTRUSION_MM + c.extra_length_mm / 2) / 1000
+    tilt_x, tilt_y, yaw = (math.radians(angle) for angle in (c.tilt_x_deg, c.tilt_y_deg, c.yaw_deg))
+    return f"""
+          <body name="part" pos="{c.offset_x_mm / 1000} {c.offset_y_mm / 1000} -0.06" euler="{tilt_x} {tilt_y} {yaw}">
+            <joint name="in_hand" type="slide" axis="0 0 1" frictionloss="{c.grip_n}" range="-0.012 0.012" damping="20"
+                   solreffriction="0.002 1" solimpfriction="0.9999 0.9999 0.001" solreflimit="0.002 1"/>
+            <geom type="box" size="{half} {half} {length / 2}" pos="0 0 {tip + length / 2}" mass="{c.part_mass_kg}"/>
+            <site name="top" pos="0 0 {tip + length}"/>
+          </body>"""
+
+
+def _fixture(c: Conditions) -> str:
+    """Four walls with a 45 degree chamfer, a floor, and what may lie on it."""
+    half, chamfer, depth = (WIDTH_MM + c.clearance_mm) / 2000, c.chamfer_mm / 1000, DEPTH_MM / 1000
+    walls = "\n".join(_wall(side, half, chamfer, depth) for side in range(4))
+    floor = f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>'
+    return f"{walls}\n{floor}\n{_debris(c, depth)}"
+
+
+def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
+    """One side of the hole, drawn for +x and turned about z by quarter turns."""
+    wall = _WALL_MM / 1000
+    reach = half + chamfer + wall
+    face = chamfer / math.sqrt(2)  # half the length of the sloping face
+    thick = 0.004
+    slope_x = half + chamfer / 2 + thick / math.sqrt(2)
+    slope_z = -chamfer / 2 - thick / math.sqrt(2)
+    low = (depth - chamfer) / 2
+    return f"""
+    <body euler="0 0 {side * math.pi / 2}">
+      <geom type="box" size="{(reach - half) / 2} {reach} {low}" pos="{(reach + half) / 2} 0 {-chamfer - low}"/>
+      <geom type="box" size="{wall / 2} {reach} {chamfer / 2}" pos="{reach - wall / 2} 0 {-chamfer / 2}"/>
+      <geom type="box" size="{face} {half + chamfer} {thick}" pos="{slope_x} 0 {slope_z}" euler="0 {-math.pi / 4} 0"/>
+    </body>"""
+
+
+def _debris(c: Conditions, depth: float) -> str:
+    """A chip on the floor: a small box, more or less soft."""
+    if c.debris_mm <= 0:
+        return ""
+    half, soft = c.debris_mm / 2000, f"{c.debris_softness_s} 1"
+    position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + half}"
+    return f'<geom type="box" size="0.003 0.003 {half}" pos="{position}" solref="{soft}" priority="1"/>'
+
+
+def _build(mujoco: Any, xml: str) -> Any:
+    try:
+        return mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        raise SettingError(
+            f"Expected sizes, masses and springs above zero in the cell's parameters, got a world that MuJoCo refuses "
+            f"({error}); raise the one that is zero."
+        ) from error
+
+
+def _mujoco() -> Any:
+    try:
+        import mujoco
+    except ImportError as error:
+        raise DengineError(
+            "Expected MuJoCo for the simulated cell, found none; install it with: pip install dengine[sim]"
+        ) from error
+    return mujoco

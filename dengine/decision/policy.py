@@ -1,0 +1,102 @@
+"""The user's two numbers, and what follows from them: which neighbours count, and how a bound becomes an action."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from numbers import Real
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .._lazy import find_class
+from ..errors import SettingError
+from ..records import Action
+from .bounds import INTERVALS, Bounds, normal_quantile
+
+if TYPE_CHECKING:
+    from .rule import DecisionRule
+
+ACTIONS = tuple(Action)
+RULES = {"local": "dengine.decision.rule:DecisionRule"}
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """How certain the model must be before it may decide.
+
+    alpha : two-sided error level of the interval, in (0, 1).
+    lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
+    interval : a name in `INTERVALS`.
+    guarantee : the rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a `DecisionRule` of your
+        own. "local" is the paper's: it speaks of the ball around one trace, at one look.
+    audit_rate : share of certain decisions that are verified all the same, in [0, 1); needed for a guarantee on rejects,
+        since a rejected part gives no feedback of its own.
+    Raises SettingError for a value out of its range.
+    """
+
+    alpha: float = 0.05
+    lower_bound: float = 0.95
+    interval: str = "wilson"
+    audit_rate: float = 0.0
+    guarantee: str = "local"
+
+    def __post_init__(self) -> None:
+        normal_quantile(self.alpha)
+        if not 0.5 < self.lower_bound < 1.0:
+            raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
+        if self.interval not in INTERVALS:
+            raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {self.interval!r}.")
+        if not 0.0 <= self.audit_rate < 1.0:
+            raise SettingError(f"Expected 0 <= audit_rate < 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
+        if ":" not in self.guarantee and self.guarantee not in RULES:
+            raise SettingError(f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {self.guarantee!r}.")
+
+    def rule(self) -> DecisionRule:
+        """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
+        from .rule import DecisionRule  # torch is imported where it is used
+
+        found = find_class(RULES.get(self.guarantee, self.guarantee))
+        if not issubclass(found, DecisionRule):
+            raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
+        return found(self.alpha, self.lower_bound, self.interval)
+
+    def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
+        """(lower, upper) of the success probability, by the policy's interval and alpha."""
+        return INTERVALS[self.interval](n_success, n_failure, self.alpha)
+
+    def action(self, lower: float, upper: float) -> Action:
+        """What one bound allows, by the paper's rule."""
+        from .rule import action_of
+
+        return ACTIONS[action_of(float(lower), float(upper), self.lower_bound, 1.0 - self.lower_bound)]
+
+    def actions(self, lower: ArrayLike, upper: ArrayLike) -> NDArray[Any]:
+        """What each bound allows, by the paper's rule: an object array of `Action`, of the bounds' shape."""
+        return np.asarray(np.frompyfunc(self.action, 2, 1)(lower, upper), dtype=object)
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbourhood:
+    """Which references count for a query; chosen without looking at any label.
+
+    radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
+    fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
+    reject_fraction : a second, smaller share that a rejection is judged by; None: the same ball for both. Successes and
+        failures rarely come in equal numbers, and a ball wide enough to certify the many blurs the few.
+    """
+
+    radius: float = 0.3
+    fraction: float | None = None
+    reject_fraction: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.radius, Real) and self.radius > 0.0 and math.isfinite(self.radius)):
+            raise SettingError(f"Expected a finite radius > 0, got {self.radius!r}.")
+        for name in ("fraction", "reject_fraction"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, Real) and 0.0 < value <= 1.0):
+                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {value!r}.")
+        if self.reject_fraction is not None and self.fraction is None:
+            raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")

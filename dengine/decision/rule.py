@@ -1,0 +1,144 @@
+"""The decision rule: counts -> interval -> action. The one place where a bound meets the user's tolerance.
+
+    >>> rule = Policy(alpha=0.1, lower_bound=0.9).rule()
+    >>> rule(40, 0)                      # 40 successes, no failure: (1, 0.93..., 1.0), accept
+
+The functions and the modules here compile to TorchScript: the engine, the scikit-learn classifier and the exported file
+run the same lines. A rule can be asked (`forward`), told what became of a decision (`tell`) and restored (its buffers,
+by `state_dict`); the paper's rule learns nothing from being told.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from ..records import Action
+from .bounds import INTERVALS, normal_quantile
+from .neighbors import ReferenceRing
+
+if TYPE_CHECKING:
+    from .policy import Neighbourhood
+
+VERIFY, ACCEPT, REJECT = (list(Action).index(a) for a in (Action.VERIFY, Action.ACCEPT, Action.REJECT))
+
+
+def action_of(lower: float, upper: float, accept_at: float, reject_at: float) -> int:
+    """The position in `Action` that a bound allows: 1 accept, 2 reject, else 0 verify."""
+    if lower >= accept_at:
+        return 1
+    return 2 if upper <= reject_at else 0
+
+
+def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+    """`bounds.wilson_interval` of two scalars, at the normal quantile z."""
+    k = float(n_success + n_failure)
+    if k == 0.0:
+        return 0.0, 1.0
+    rate = n_success / k
+    centre = (n_success + z * z / 2.0) / (k + z * z)
+    half = z / (k + z * z) * math.sqrt(n_success * n_failure / k + z * z / 4.0)
+    return max(0.0, min(centre - half, rate)), min(1.0, max(centre + half, rate))
+
+
+def binomial_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+    """`bounds.binomial_interval` of two scalars, at the normal quantile z."""
+    k = float(n_success + n_failure)
+    if k == 0.0:
+        return 0.0, 1.0
+    rate = n_success / k
+    half = z / math.sqrt(k) * math.sqrt(n_success * n_failure / (k * k))
+    return max(0.0, min(rate - half, rate)), min(1.0, max(rate + half, rate))
+
+
+@dataclass(frozen=True)
+class TableBound:
+    """Any of `INTERVALS` on two scalars, for those that need SciPy's special functions; it does not compile."""
+
+    interval: str
+    alpha: float
+
+    def __call__(self, n_success: int, n_failure: int, z: float) -> tuple[float, float]:
+        """(lower, upper); z is not used."""
+        lower, upper = INTERVALS[self.interval](n_success, n_failure, self.alpha)
+        return float(lower), float(upper)
+
+
+Bound = Callable[[int, int, float], tuple[float, float]]
+SCALAR_BOUNDS: dict[str, Bound] = {"wilson": wilson_bound, "binomial": binomial_bound}
+
+
+class DecisionRule(nn.Module):
+    """The paper's rule, and the base of any other: accept where lower >= LB, reject where upper <= 1 - LB.
+
+    alpha, lower_bound, interval : as in `Policy`.
+    compiles : whether TorchScript can compile the class; one that says False answers in Python and is not exported.
+
+    A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers: the compiled module shares
+    them, a store keeps them with each version, and `DataEngine.open` restores them and tells what came afterwards.
+    """
+
+    compiles = True
+
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
+        super().__init__()
+        self.alpha = float(alpha)
+        self.accept_at = float(lower_bound)
+        self.reject_at = 1.0 - float(lower_bound)
+        self.interval = interval
+        self.z = float(normal_quantile(alpha))
+        self.scriptable = self.compiles and interval in SCALAR_BOUNDS  # what an export needs
+        self.bound: Bound = SCALAR_BOUNDS.get(interval, TableBound(interval, float(alpha)))
+
+    def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
+        """Counts in a ball -> action (0 verify, 1 accept, 2 reject), lower, upper."""
+        lower, upper = self.bound(n_success, n_failure, self.z)
+        return self.action(lower, upper), lower, upper
+
+    def action(self, lower: float, upper: float) -> int:
+        """What a bound allows at this moment: the position in `Action`."""
+        return action_of(lower, upper, self.accept_at, self.reject_at)
+
+    @torch.jit.export
+    def tell(self, lower: float, upper: float, success: bool) -> None:
+        """What became of a part: the bound that it was decided by, before its label was known, and the label."""
+
+
+class RadiusNeighbours(nn.Module):
+    """Counts the references around one embedded trace and asks the rule.
+
+    Two looks, one for each tail of the interval: the wide ball may accept; where it does not, the narrow one may reject.
+    The counts and the bound that come back are those of the ball that decided, so the action follows from them alone.
+    """
+
+    def __init__(self, ring: ReferenceRing, neighbourhood: "Neighbourhood", rule: DecisionRule) -> None:
+        super().__init__()
+        self.ring = ring
+        self.rule = rule
+        self.radius = float(neighbourhood.radius)
+        self.fraction = float(neighbourhood.fraction or 0.0)
+        self.reject_fraction = float(neighbourhood.reject_fraction or 0.0)
+
+    def forward(self, z: Tensor) -> tuple[int, float, float, int, int]:
+        """(K, d) float32 scaled embedding -> action (0 verify, 1 accept, 2 reject), lower, upper, n_success, n_failure."""
+        distances = self.ring.squared_distances(z)
+        n_success, n_failure = self.ring.count_near(distances, self.radius, self.fraction)
+        action, lower, upper = self.rule(n_success, n_failure)
+        if action == 0 and self.reject_fraction > 0.0:
+            few_success, few_failure = self.ring.count_near(distances, self.radius, self.reject_fraction)
+            few_action, few_lower, few_upper = self.rule(few_success, few_failure)
+            if few_action == 2:
+                return 2, few_lower, few_upper, few_success, few_failure
+        return action, lower, upper, n_success, n_failure
+
+
+def script(module: nn.Module) -> Any:
+    """`torch.jit.script` without its deprecation notice: it works in the supported range of torch."""
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
+        return torch.jit.script(module)

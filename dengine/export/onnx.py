@@ -1,0 +1,242 @@
+"""The decision as ONNX, for the day that TorchScript is gone or a controller runs onnxruntime.
+
+    >>> export_onnx(engine, "model.onnx")          # model.onnx and model.onnx.sha256
+    >>> load_onnx("model.onnx").decide(trace)
+
+A pure-tensor twin of the decision that TorchScript carries, checked against it when it is written. What ONNX cannot
+carry: references that grow, so nothing is learned in the cell, and the content hash, so there are no audits.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+
+from ..decision.rule import DecisionRule
+from ..errors import ExportError
+from ..model.base import Exportable
+from ..model.module import FIELDS
+from ..records import Reason, TraceSpec
+from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
+from .file import METADATA, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
+from .torchscript import ACTIONS, REASONS, TOLERANCE, ExportedDecision
+
+NEEDED = ("onnx", "onnxruntime", "onnxscript")
+FAR = 1e9  # where an empty slot waits: no ball reaches it
+OPSET = 18
+CERTAIN, UNCERTAIN = REASONS.index(Reason.CERTAIN), REASONS.index(Reason.UNCERTAIN)
+CHECKED = 64  # random traces that the file is held against before it is kept
+BOUND_TOLERANCE = 1e-6
+EDGE = 2  # another runtime adds in another order: a reference on the ball's very surface may fall on either side
+
+
+def export_onnx(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:
+    """Write `path` and `path`.sha256: the decision of a `DataEngine` or a fitted `ModelPrediction` as ONNX.
+
+    Raises ExportError where the engine audits, nothing was trained yet, the reducer or the interval has no module, a
+    package is missing, or onnxruntime does not decide as the model does.
+    """
+    onnx = _package("onnx")
+    source = source_of(engine_or_model, trace)
+    if source.audit_rate > 0.0:
+        raise ExportError(
+            "ONNX carries no audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0."
+        )
+    decision_module(source)  # the same refusals as for TorchScript
+    twin = Twin(source).eval()
+    metadata = describe(source) | {"format": "onnx", "learns": False}
+
+    def write(partial: Path) -> None:
+        program = _to_onnx(twin, source.trace)
+        onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata)})
+        content = program.SerializeToString()
+        _check(OnnxModel(content, metadata), source.model, source.trace)
+        partial.write_bytes(content)
+
+    return write_checked(Path(path), write)
+
+
+def load_onnx(path: str | os.PathLike[str]) -> OnnxModel:
+    """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used."""
+    onnx = _package("onnx")
+    target = Path(path)
+    content = checked_bytes(target)
+    try:
+        properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
+        metadata = json.loads(properties[METADATA])
+    except Exception as error:  # protobuf's own errors have no common base
+        raise ExportError(f"{target} is not a dengine export in ONNX: it holds no {METADATA}.") from error
+    return OnnxModel(content, checked_schema(metadata, target))
+
+
+class OnnxModel:
+    """An ONNX decision in onnxruntime; the face of `ExportedModel` without `learn` and `save`."""
+
+    def __init__(self, content: bytes, metadata: dict[str, Any]) -> None:
+        runtime = _package("onnxruntime")
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        self.session = runtime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        self.metadata = metadata
+        self.trace = TraceSpec(**metadata["trace"])
+        warm = np.linspace(-1.0, 1.0, self.trace.channels * self.trace.samples)
+        self.decide(warm.reshape(self.trace.channels, self.trace.samples))
+
+    def decide(self, trace: ArrayLike) -> ExportedDecision:
+        """Decide on one trace, (T,) or (C, T); TraceError for a wrong shape."""
+        found = self.session.run(None, {"trace": as_trace(trace, self.trace)})
+        action, reason, lower, upper, n_success, n_failure, z = found
+        whole = int(n_success), int(n_failure)
+        return ExportedDecision(ACTIONS[int(action)], REASONS[int(reason)], float(lower), float(upper), *whole, z)
+
+    def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
+        """Decide on each trace of (n, T) or (n, C, T)."""
+        return [self.decide(x) for x in as_traces(X, self.trace)]
+
+
+class Twin(nn.Module):
+    """The decision without a branch: trace (C, T) float32 -> the tensors named in `FIELDS`. References do not change."""
+
+    def __init__(self, source: Exportable) -> None:
+        super().__init__()
+        model, index, limit = source.model, source.model.index, source.trace.limit
+        around = model.classifier.around(index, model.rule)
+        self.rule: DecisionRule = model.rule
+        self.radius, self.fraction, self.reject_fraction = around.radius, around.fraction, around.reject_fraction
+        self.limit = float("inf") if limit is None else limit
+        self.encoder = model.spaces.module()
+        self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])
+        # A reference of space k stands far away in every other space: one subtraction, no gathering.
+        places = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
+        places[index.spaces, :, np.arange(len(index))] = index.points
+        self.register_buffer("places", torch.from_numpy(places))
+        self.register_buffer("success", torch.from_numpy(index.labels.astype(np.int64)))
+        self.n_references = len(index)
+
+    def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
+        """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
+        fault = self.fault(trace)
+        good = fault == 0
+        z = self.encoder(torch.where(good, trace, torch.zeros_like(trace)).unsqueeze(0))[0] / self.scale  # (K, d)
+        distances = (self.places - z[:, :, None]).square().sum(1).amin(0)  # (n,): in its own space it is nearest
+        action, lower, upper, n_success, n_failure = self.counted(distances)
+        verify, empty = torch.zeros_like(action), torch.zeros_like(lower)
+        action = torch.where(good, action, verify)
+        certain = torch.where(action == 0, UNCERTAIN, CERTAIN)
+        return (
+            action,
+            torch.where(good, certain, fault),
+            torch.where(good, lower, empty),
+            torch.where(good, upper, empty + 1.0),
+            torch.where(good, n_success, verify),
+            torch.where(good, n_failure, verify),
+            torch.where(good, z, float("nan")),
+        )
+
+    def fault(self, x: Tensor) -> Tensor:
+        """`TraceGate`'s reason, () int64; 0 where there is none."""
+        low, high = x.min(), x.max()
+        finite = (x.abs() < float("inf")).all()
+        saturated = torch.where(torch.maximum(high, -low) >= self.limit, SATURATED, 0)
+        return torch.where(finite, torch.where(low == high, CONSTANT, saturated), NOT_FINITE)
+
+    def counted(self, distances: Tensor) -> tuple[Tensor, ...]:
+        """`RadiusNeighbours.forward` on (n,) squared distances."""
+        wide = self.look(distances, self.fraction)
+        if self.reject_fraction == 0.0:
+            return wide
+        narrow = self.look(distances, self.reject_fraction)
+        rejects = (wide[0] == 0) & (narrow[0] == 2)
+        return tuple(torch.where(rejects, few, many) for few, many in zip(narrow, wide, strict=True))
+
+    def look(self, distances: Tensor, fraction: float) -> tuple[Tensor, ...]:
+        """action, lower, upper, n_success, n_failure of one ball."""
+        inside = self.inside(distances, fraction)
+        n_success = (inside & (self.success == 1)).to(torch.int64).sum()
+        n_failure = (inside & (self.success == 0)).to(torch.int64).sum()
+        lower, upper = self.bound(n_success.to(torch.float64), n_failure.to(torch.float64))
+        accepts, rejects = lower >= self.rule.accept_at, upper <= self.rule.reject_at
+        return torch.where(accepts, 1, torch.where(rejects, 2, 0)), lower, upper, n_success, n_failure
+
+    def inside(self, distances: Tensor, fraction: float) -> Tensor:
+        """(n,) bool, as `ReferenceRing.count_near`."""
+        if fraction == 0.0:
+            return distances <= self.radius * self.radius
+        k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
+        limit = distances.topk(k, largest=False)[0].max()
+        return (distances <= limit) & (limit < float("inf"))
+
+    def bound(self, n_success: Tensor, n_failure: Tensor) -> tuple[Tensor, Tensor]:
+        """`DecisionRule.bound` of two () float64; no neighbours: (0, 1)."""
+        empty = n_success + n_failure == 0.0
+        k = torch.where(empty, 1.0, n_success + n_failure)
+        rate, z = n_success / k, self.rule.z
+        if self.rule.interval == "wilson":
+            centre = (n_success + z * z / 2.0) / (k + z * z)
+            half = z / (k + z * z) * (n_success * n_failure / k + z * z / 4.0).sqrt()
+        else:
+            centre, half = rate, z / k.sqrt() * (n_success * n_failure / (k * k)).sqrt()
+        lower = torch.minimum(centre - half, rate).clamp(min=0.0)
+        upper = torch.maximum(centre + half, rate).clamp(max=1.0)
+        return torch.where(empty, 0.0, lower), torch.where(empty, 1.0, upper)
+
+
+def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:
+    """By way of torch.export, which does not need TorchScript."""
+    example = (torch.linspace(-1.0, 1.0, spec.channels * spec.samples).reshape(spec.channels, spec.samples),)
+    with _silence():
+        program = torch.onnx.export(
+            twin, example, dynamo=True, input_names=["trace"], output_names=list(FIELDS), opset_version=OPSET, verbose=False
+        )
+    if program is None:
+        raise ExportError("torch gave no ONNX program; export torchscript instead.")
+    return program.model_proto
+
+
+def _check(found: OnnxModel, model: Any, spec: TraceSpec) -> None:
+    """Hold the file against the model that answers, on random traces of every size."""
+    rng = np.random.default_rng(0)
+    shape = (CHECKED, spec.channels, spec.samples)
+    X = (rng.normal(size=shape) * 10.0 ** rng.uniform(-2, 2, (CHECKED, 1, 1))).astype(np.float32)
+    X = X if spec.limit is None else np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
+    for one, known in zip(found.decide_many(X), model.predict_many(X), strict=True):
+        near = np.allclose(one.embedding, known.embedding, rtol=TOLERANCE, atol=TOLERANCE)
+        moved = abs(one.n_success - known.n_success) + abs(one.n_failure - known.n_failure)
+        apart = abs(one.lower - known.lower) + abs(one.upper - known.upper)
+        if not near or moved > EDGE or (moved == 0 and (one.action != known.action or apart > BOUND_TOLERANCE)):
+            raise ExportError(f"onnxruntime does not decide as the model does: {one} for {known}; export torchscript.")
+
+
+def _package(name: str) -> ModuleType:
+    missing = [needed for needed in NEEDED if find_spec(needed) is None]
+    if missing:
+        raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")
+    return import_module(name)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    # The exporter reports every package that it could use and does not need.
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(level)

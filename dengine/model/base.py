@@ -1,0 +1,188 @@
+"""Two contracts: what a rival method must give, and what the engine drives.
+
+A rival is anything with the five methods of `Model`; `rival.RivalAdapter` makes an `EngineModel` of it. Our own model,
+`prediction.ModelPrediction`, is both.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..decision.policy import Policy
+from ..errors import ExportError
+from ..records import Action, TraceSpec
+from ..reducers.base import FitReport, Floats, Ints, State, StopRule
+
+log = logging.getLogger("dengine")
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What a model says of one trace; fields as in `Decision`."""
+
+    action: Action
+    lower: float
+    upper: float
+    n_success: int
+    n_failure: int
+    embedding: tuple[tuple[float, ...], ...] | None
+
+
+NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None)
+
+
+@runtime_checkable
+class Model(Protocol):
+    """What a rival method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""
+
+    def fit(self, X: Any, y: Any) -> Any:
+        """Train anew on labelled traces."""
+        ...
+
+    def add(self, x: Any, y: Any) -> Any:
+        """Take in one labelled trace (C, T) between two trainings."""
+        ...
+
+    def count(self, X: Any) -> tuple[Any, Any]:
+        """(n_success, n_failure) behind each prediction."""
+        ...
+
+    def predict_interval(self, X: Any) -> tuple[Any, Any]:
+        """(lower, upper) of each success probability."""
+        ...
+
+    def decide(self, X: Any) -> Any:
+        """An `Action` for each trace."""
+        ...
+
+
+class EngineModel(ABC):
+    """What the engine drives: it predicts, takes references, trains a successor, and is stored.
+
+    keeps_references : whether its state and the points stored with labels restore its references. A rival keeps what it
+        likes, and is restored by a refit.
+    """
+
+    keeps_references = True
+
+    @property
+    @abstractmethod
+    def user_model(self) -> Any:
+        """What `DataEngine.model` shows: the model as its author knows it."""
+
+    @property
+    @abstractmethod
+    def policy(self) -> Policy | None:
+        """The numbers that it decides by; None for a rival's own rule."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What to call it in a status or a table."""
+
+    @abstractmethod
+    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Learn from traces (n, C, T), labels (n,) and content hashes (n,), from where an earlier training ended."""
+
+    @abstractmethod
+    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
+        """What it says of one trace (C, T)."""
+
+    @abstractmethod
+    def reference_point(
+        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
+    ) -> Floats:
+        """Where a trace (C, T) with this content hash lies as a reference.
+
+        embedding : its (K, d) embedding by this very model, where a prediction has computed it already.
+        """
+
+    @abstractmethod
+    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+        """Make a labelled trace a reference, by its point."""
+
+    @abstractmethod
+    def successor(self) -> EngineModel:
+        """A model to train next, from where this one is; nothing that training changes is shared, so this one goes on."""
+
+    def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
+        """Be ready to answer at once, in the place of `previous`."""
+
+    def tell(self, lower: float, upper: float, success: bool) -> None:  # noqa: B027  # a default: nothing to learn
+        """What became of a part: the bound that it was decided by, before its label was known, and the label."""
+
+    def defect(self) -> str:
+        """Why it must not answer after a training, label-free reasons only; "" where there is nothing against it."""
+        return ""
+
+    @property
+    def report(self) -> FitReport:
+        """What the last training says of itself."""
+        return FitReport()
+
+    def get_state(self) -> State:
+        """Plain arrays for the store."""
+        return {}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore what `get_state` gave."""
+        return self
+
+    def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
+        """Whether a training on the very traces of that state must come before `set_state`."""
+        return True
+
+    def exported(self, trace: TraceSpec | None) -> Exportable:
+        """What an exporter starts from; ExportError where there is nothing that can be exported."""
+        raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
+
+    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these three.
+
+    def prepare_safely(self, previous: EngineModel) -> None:
+        """`prepare`; one that fails at it will verify, and say so, on every part."""
+        try:
+            self.prepare(previous)
+        except Exception:
+            log.exception("the model that was trained cannot be made to answer")
+
+    def place_safely(
+        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
+    ) -> Floats | None:
+        """`reference_point`, or None where it fails."""
+        try:
+            return self.reference_point(x, hash_, embedding)
+        except Exception:
+            log.exception("the model cannot place a labelled trace; the next version learns it from the store")
+            return None
+
+    def add_safely(self, point: Floats | None, y: int, hash_: int) -> None:
+        """`add_reference`, where there is a point; a model that fails at it goes on without."""
+        if point is None:
+            return
+        try:
+            self.add_reference(point, y, hash_)
+        except Exception:
+            log.exception("the model cannot take a labelled trace; the next version learns it from the store")
+
+
+@dataclass(frozen=True, slots=True)
+class Exportable:
+    """What an exporter starts from.
+
+    model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
+    model_version, recipe : what the file says of the engine; 0 and "" without one.
+    """
+
+    model: Any
+    trace: TraceSpec
+    audit_rate: float = 0.0
+    seed: int = 0
+    model_version: int = 0
+    recipe: str = ""

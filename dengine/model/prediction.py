@@ -1,0 +1,265 @@
+"""The model prediction: reducer, references and rule together, with honest counting.
+
+A label may be counted for a query only in an embedding that never saw that label. So the reducer spans K spaces, fold k's
+references live in space k, a query is embedded in all K, and its counts are summed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from inspect import signature
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+
+from ..decision.classifier import WilsonRadiusClassifier
+from ..decision.neighbors import Counts, RadiusIndex
+from ..decision.policy import Policy
+from ..decision.rule import DecisionRule
+from ..errors import ExportError
+from ..folds import content_hash, fold_of
+from ..recipe import Recipe
+from ..records import Action, TraceSpec
+from ..reducers import make_reducer, reducer_class
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule
+from ..reducers.cross_fitting import as_reducer
+from ..traces import as_traces
+from .base import EngineModel, Exportable, Prediction
+from .module import CompiledPredictor, compile_predictor
+
+ACTIONS = tuple(Action)
+WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
+
+
+class ModelPrediction(EngineModel):
+    """Reducer + references + rule, from traces.
+
+    reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
+    classifier : a `WilsonRadiusClassifier` holding radius and policy; it is cloned, never fitted itself.
+    folds : K, for a label-using transformer that does not cross-fit by itself.
+    rule : what turns counts into an action; None: the classifier's policy.
+
+    Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius` means the same in every
+    reducer; the scale of space k comes from fold k's traces, whose labels that space never saw. One whose axis has a
+    unit of its own (`Reducer.own_unit`) is left as it is: where probabilities hardly differ, they are not to be spread.
+    """
+
+    def __init__(
+        self,
+        reducer: Any = "conv",
+        classifier: WilsonRadiusClassifier | None = None,
+        folds: int = 2,
+        rule: DecisionRule | None = None,
+    ) -> None:
+        self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
+        self.classifier = classifier or WilsonRadiusClassifier()
+        self.folds = folds
+        self.rule = rule or self.classifier.policy().rule()
+        self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
+        self._compiled: CompiledPredictor | None = None
+
+    @classmethod
+    def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
+        """The untrained model that a recipe describes."""
+        policy = recipe.policy
+        classifier = WilsonRadiusClassifier(
+            radius=recipe.radius,
+            alpha=policy.alpha,
+            lower_bound=policy.lower_bound,
+            interval=policy.interval,
+            fraction=recipe.fraction,
+            reject_fraction=recipe.reject_fraction,
+            capacity=recipe.window,
+        )
+        return cls(_reducer_of(recipe, seed), classifier, recipe.folds, policy.rule())
+
+    @property
+    def user_model(self) -> ModelPrediction:
+        """Itself."""
+        return self
+
+    @property
+    def policy(self) -> Policy:
+        """The classifier's numbers."""
+        return self.classifier.policy()
+
+    @property
+    def name(self) -> str:
+        """Its reducer."""
+        return type(self.reducer).__name__
+
+    @property
+    def n_spaces(self) -> int:
+        """K, embedding spaces."""
+        return self.spaces.n_spaces
+
+    @property
+    def report(self) -> FitReport:
+        """What the last fit says of itself."""
+        return self.spaces.report
+
+    def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
+        self.spaces = as_reducer(clone(self.reducer), self.folds)
+        return self.train(X, y, hashes=hashes, stop=stop)
+
+    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Train the reducer, warm where it can be, and make every trace a reference.
+
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) content hashes where they are known.
+        Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
+        """
+        X, y = as_traces(X), np.asarray(y, dtype=np.int64)
+        folds = fold_of(content_hash(X) if hashes is None else hashes, self.n_spaces)
+        points = self.spaces.train(X, y, folds, stop)
+        self.trace_shape = X.shape[1:]
+        own_unit = self.spaces.own_unit
+        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else _scale(points, folds, self.n_spaces)
+        self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
+        self.index.add(points / self.scale[folds, None], y, folds)
+        self._compiled = None  # built by `prepare`, or when it is asked
+        return self
+
+    def prepare(self, previous: EngineModel) -> None:
+        """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
+        if isinstance(previous, ModelPrediction):
+            self.rule = previous.rule
+            self._compile(previous._compiled)
+
+    def _compile(self, mould: CompiledPredictor | None = None) -> CompiledPredictor:
+        around = self.classifier.around(self.index, self.rule)
+        self._compiled = compile_predictor(self.spaces, self.scale, around, mould)
+        if self._compiled.structure is not None and (mould is None or mould.structure != self._compiled.structure):
+            for _ in range(WARM_UP):
+                self.predict_one(np.zeros(self.trace_shape, dtype=np.float32))
+        return self._compiled
+
+    @property
+    def predictor(self) -> Any:
+        """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
+        if "index" not in vars(self):
+            raise ValueError("Expected a fitted model; call fit(X, y) first.")
+        return (self._compiled or self._compile()).predictor
+
+    def add(self, x: ArrayLike, y: ArrayLike) -> Self:
+        """Take in one labelled trace, (T,) or (C, T), as a reference."""
+        X = as_traces(np.asarray(x)[None])
+        hash_ = int(content_hash(X)[0])
+        self.add_reference(self.reference_point(X[0], hash_), int(np.asarray(y)), hash_)
+        return self
+
+    def reference_point(
+        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
+    ) -> Floats:
+        """(C, T) -> (d,): where the trace lives as a reference, in its own fold's space."""
+        if embedding is not None:
+            return np.array(embedding[self._fold(hash_)], dtype=np.float32)
+        with torch.inference_mode():
+            return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
+
+    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+        """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
+        self.index.add(point[None], np.array([y]), np.array([self._fold(hash_)]))
+
+    def _fold(self, hash_: int) -> int:
+        return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
+
+    def tell(self, lower: float, upper: float, success: bool) -> None:
+        """Tell the rule what became of a part."""
+        self.rule.tell(lower, upper, success)
+
+    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
+        """The whole prediction on one trace (C, T)."""
+        with torch.inference_mode():
+            action, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x))
+        embedding = tuple(tuple(row) for row in z.tolist())
+        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding)
+
+    def predict_many(self, X: ArrayLike) -> list[Prediction]:
+        """The prediction on each trace of (n, T) or (n, C, T)."""
+        return [self.predict_one(x) for x in as_traces(X)]
+
+    def count(self, X: ArrayLike) -> Counts:
+        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
+        found = self.predict_many(X)
+        return np.array([p.n_success for p in found], dtype=np.int64), np.array([p.n_failure for p in found], np.int64)
+
+    def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(lower, upper), each (n,): the bound on each trace's success probability."""
+        found = self.predict_many(X)
+        return np.array([p.lower for p in found]), np.array([p.upper for p in found])
+
+    def decide(self, X: ArrayLike) -> NDArray[Any]:
+        """(n,) array of `Action`."""
+        return np.array([p.action for p in self.predict_many(X)], dtype=object)
+
+    def successor(self) -> ModelPrediction:
+        """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
+        new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule)
+        new.spaces = copy.deepcopy(self.spaces)
+        return new
+
+    def defect(self) -> str:
+        """Whether a reference has no finite place."""
+        return "" if np.isfinite(self.index.points).all() else "the embedding of a reference is not finite"
+
+    def get_state(self) -> State:
+        """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
+        state = {"trace_shape": np.array(self.trace_shape), "scale": self.scale} | self.index.get_state()
+        state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
+        return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore references and rule, and the reducer unless it was refitted, so that decisions repeat bit for bit."""
+        if not self.needs_refit(state):
+            self.spaces.set_state(_part(state, "reducer."))
+        self.trace_shape = tuple(int(n) for n in state["trace_shape"])
+        self.scale = np.asarray(state["scale"])
+        self.index = RadiusIndex.from_state(state, self.classifier.capacity)
+        for name, value in _part(state, "rule.").items():
+            self.rule.get_buffer(name).copy_(torch.from_numpy(np.array(value)))
+        self._compiled = None
+        return self
+
+    def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
+        """Whether the reducer gave no arrays of its own."""
+        return not _part(state, "reducer.")
+
+    def exported(self, trace: TraceSpec | None) -> Exportable:
+        """The model as an exporter takes it; without a contract, one of its traces' shape."""
+        if "trace_shape" not in vars(self):
+            raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")
+        channels, samples = self.trace_shape
+        return Exportable(self, trace or TraceSpec(samples=samples, channels=channels))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A scripted module does not travel between processes; the receiver builds its own.
+        return self.__dict__ | {"_compiled": None}
+
+
+def _reducer_of(recipe: Recipe, seed: int) -> Any:
+    """A recipe's reducer: an object as it is, or one made by name with the seed and the folds, where it knows them."""
+    if not isinstance(recipe.reducer, str):
+        return recipe.reducer
+    known = signature(reducer_class(recipe.reducer)).parameters
+    # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
+    own = {name: value for name, value in (("random_state", seed), ("folds", recipe.folds)) if name in known}
+    return make_reducer(recipe.reducer, **own | dict(recipe.params))
+
+
+def _part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
+def _scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
+    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread."""
+    scale = np.ones(n_spaces, dtype=np.float32)
+    for k in range(n_spaces):
+        own = points[folds == k]
+        rms = float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(own) else 0.0
+        scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
+    return scale

@@ -1,0 +1,70 @@
+"""A rival method inside the same loop: anything with `fit, add, count, predict_interval, decide`."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..decision.policy import Policy
+from ..records import Action
+from ..reducers.base import Floats, Ints, StopRule
+from .base import EngineModel, Model, Prediction
+
+
+def as_engine_model(model: Model) -> EngineModel:
+    """A model as the engine drives it: our own as it is, a rival adapted."""
+    return model if isinstance(model, EngineModel) else RivalAdapter(model)
+
+
+class RivalAdapter(EngineModel):
+    """Makes an `EngineModel` of a rival. It decides by its own rule, and it is trained on a deep copy."""
+
+    keeps_references = False
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+
+    @property
+    def user_model(self) -> Any:
+        """The rival itself."""
+        return self.model
+
+    @property
+    def policy(self) -> Policy | None:
+        """None: a rival has a rule of its own."""
+        return None
+
+    @property
+    def name(self) -> str:
+        """Its class."""
+        return type(self.model).__name__
+
+    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Train the rival; it sets its own stop."""
+        self.model.fit(X, y)
+        return self
+
+    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
+        """The rival's own decision on one trace (C, T), with its evidence."""
+        X = x[None]
+        (lower,), (upper,) = self.model.predict_interval(X)
+        (n_success,), (n_failure,) = self.model.count(X)
+        action = Action(self.model.decide(X)[0])
+        return Prediction(action, float(lower), float(upper), int(n_success), int(n_failure), None)
+
+    def reference_point(
+        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
+    ) -> Floats:
+        """The trace itself: a rival keeps what it likes of it."""
+        return x
+
+    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+        """Hand one labelled trace over."""
+        self.model.add(point, y)
+
+    def successor(self) -> RivalAdapter:
+        """A deep copy, to train while this one answers."""
+        return RivalAdapter(copy.deepcopy(self.model))

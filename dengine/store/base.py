@@ -1,0 +1,108 @@
+"""Where an engine remembers: the `Store` protocol, and `open_store`, which opens what a user names.
+
+    store = open_store("engine.db")      # SqlStore; `open_store(None)` is a MemoryStore, which forgets
+
+The database behind `SqlStore` lives in `sql.py`, so that importing this module costs numpy and no more.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StoreError
+from ..records import Decision, RetrainReport, Source
+from .memory import MemoryStore
+from .records import AddedPoints, Evidence, Labelled, ModelVersion, StoredDecision
+
+__all__ = ["AddedPoints", "Labelled", "MemoryStore", "ModelVersion", "Store", "StoredDecision", "open_store"]
+
+
+@runtime_checkable
+class Store(Protocol):
+    """What an engine needs of its memory. Everything belongs to one cell, `cell_id`."""
+
+    cell_id: str
+
+    def settings(self) -> dict[str, str]:
+        """What `save_settings` was given; {} for a new store."""
+
+    def save_settings(self, settings: Mapping[str, str]) -> None:
+        """Replace the settings by these."""
+
+    def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
+        """Take a decision and its trace, (C, T) or (T,), without waiting for the disk."""
+
+    def flush(self) -> None:
+        """Return when every decision so far is committed."""
+
+    def get_decision(self, decision_id: str) -> StoredDecision | None:
+        """Return the decision with its trace, queued ones included; None where it is unknown."""
+
+    def put_label(
+        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None
+    ) -> int:
+        """Commit a label, with its decision, before returning its sequence number 1, 2, ...
+
+        point : (d,) where the trace joined the references of `model_version`; None where it did not.
+        """
+
+    def put_labelled(
+        self,
+        decisions: Sequence[Decision],
+        traces: NDArray[np.float32],
+        hashes: NDArray[np.int64],
+        labels: NDArray[np.int8],
+        source: Source,
+    ) -> NDArray[np.int64]:
+        """Import labelled traces, all or none; returns their sequence numbers."""
+
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
+        """Record a retrain; a dropped candidate has no state."""
+
+    def last_version(self) -> ModelVersion | None:
+        """Return the newest accepted version."""
+
+    def retrains(self) -> list[RetrainReport]:
+        """Return every retrain, oldest first."""
+
+    def labelled(self, limit: int | None = None) -> Labelled:
+        """Return the newest `limit` labelled traces, all where it is None."""
+
+    def points_since(self, seq: int, model_version: int) -> AddedPoints:
+        """Return the points of `model_version` that came with labels after `seq`."""
+
+    def evidence_since(self, seq: int) -> Evidence:
+        """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
+
+    def status(self) -> dict[str, Any]:
+        """Count decisions, labels and versions."""
+
+    def close(self) -> None:
+        """Flush and let go."""
+
+
+def open_store(store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False) -> Store:
+    """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
+
+    must_exist : a file that is not there is a StoreError; by default it is made.
+    """
+    if store is None:
+        return MemoryStore()
+    if isinstance(store, str | os.PathLike):
+        if must_exist and "://" not in str(store) and not Path(store).is_file():
+            raise StoreError(
+                f"Expected a store that an engine has used, found no file {store}; "
+                "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
+            )
+        from .sql import SqlStore  # SQLAlchemy is imported where it is used
+
+        return SqlStore(os.fspath(store))
+    if not isinstance(store, Store):
+        raise StoreError(f"Expected None, a file, a URL or a Store, got {type(store).__name__}; see `Store`.")
+    return store

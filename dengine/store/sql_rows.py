@@ -1,0 +1,148 @@
+"""From records to rows and back: decisions, traces and labels, and arrays as bytes."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StoreError
+from ..records import Action, Reason, RetrainReport, Source
+from .records import DecidedTrace, StoredDecision
+
+CHUNK = 500  # rows sent or fetched at a time
+
+T = TypeVar("T")
+
+
+def decision_row(cell_id: str, item: DecidedTrace) -> dict[str, Any]:
+    """Return the row of the table `decision`."""
+    decision = item.decision
+    return {
+        "cell_id": cell_id,
+        "id": decision.id,
+        "time": item.time,
+        "action": decision.action.value,
+        "predicted": decision.predicted.value,
+        "lower": float(decision.lower),
+        "upper": float(decision.upper),
+        "n_success": int(decision.n_success),
+        "n_failure": int(decision.n_failure),
+        "embedding": None if decision.embedding is None else json.dumps(decision.embedding, default=float),
+        "model_version": int(decision.model_version),
+        "reason": decision.reason.value,
+        "audit": bool(decision.audit),
+        "propensity": float(decision.propensity),
+        "content_hash": item.content_hash,
+        "quarantined": item.quarantined,
+    }
+
+
+def trace_row(cell_id: str, item: DecidedTrace) -> dict[str, Any]:
+    """Return the row of the table `trace`."""
+    channels, samples = item.trace.shape
+    return {
+        "cell_id": cell_id,
+        "decision_id": item.decision.id,
+        "channels": channels,
+        "samples": samples,
+        "data": pack(item.trace),
+    }
+
+
+def imported_row(cell_id: str, item: DecidedTrace, seq: int, success: bool, source: Source) -> dict[str, Any]:
+    """Return the row of the table `label` for a decision that came with its label."""
+    return {
+        "cell_id": cell_id,
+        "decision_id": item.decision.id,
+        "seq": seq,
+        "time": item.time,
+        "success": success,
+        "source": source.value,
+        "model_version": int(item.decision.model_version),
+        "point": None,
+        "content_hash": item.content_hash,
+        "quarantined": False,
+    }
+
+
+def version_row(
+    cell_id: str, report: RetrainReport, last_seq: int, time: float, state: Mapping[str, NDArray[Any]] | None
+) -> dict[str, Any]:
+    """Return the row of the table `model_version`, without the number of the retrain."""
+    return {
+        "cell_id": cell_id,
+        "version": int(report.version),
+        "time": time,
+        "seconds": float(report.seconds),
+        "n_traces": int(report.n_traces),
+        "n_steps": int(report.n_steps),
+        "accepted": bool(report.accepted),
+        "reason": report.reason,
+        "last_seq": last_seq,
+        "state": None if state is None else to_npz(state),
+    }
+
+
+def read_decision(row: Any) -> StoredDecision:
+    """Read a row of `decision` joined with its trace, and with its label where it has one."""
+    return StoredDecision(
+        id=row.id,
+        action=Action(row.action),
+        predicted=Action(row.predicted),
+        audit=row.audit,
+        reason=Reason(row.reason),
+        lower=row.lower,
+        upper=row.upper,
+        embedding=None if row.embedding is None else tuple(tuple(point) for point in json.loads(row.embedding)),
+        model_version=row.model_version,
+        trace=unpack_trace(row),
+        content_hash=row.content_hash,
+        quarantined=row.quarantined,
+        success=row.success,
+        source=None if row.source is None else Source(row.source),
+    )
+
+
+def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
+    """Return the rows in parts of at most CHUNK."""
+    return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
+
+
+def pack(values: NDArray[np.float32]) -> bytes:
+    """Return the values as little-endian float32, without their shape."""
+    return values.astype("<f4", copy=False).tobytes()
+
+
+def unpack(blob: bytes) -> NDArray[np.float32]:
+    """Read what `pack` wrote, flat."""
+    return np.frombuffer(blob, dtype="<f4").astype(np.float32)
+
+
+def unpack_trace(row: Any) -> NDArray[np.float32]:
+    """Return the (C, T) trace of a row with `channels`, `samples` and `data`."""
+    return unpack(row.data).reshape(row.channels, row.samples)
+
+
+def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
+    """Return arrays as an npz file; written member by member, since `np.savez` reserves the name `file`."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, values in state.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
+    """Read what `to_npz` wrote; a pickle in it is refused."""
+    try:
+        with np.load(io.BytesIO(blob), allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise StoreError(f"Expected a version of plain arrays in {name}: {error}; restore it from a copy.") from error

@@ -1,0 +1,112 @@
+"""The tables of a store in a database; every row belongs to a cell. A change of them is a new SCHEMA."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+
+SCHEMA = "1"
+SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
+
+METADATA = sa.MetaData()
+SETTING = sa.Table(
+    "setting",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("key", sa.String, primary_key=True),
+    sa.Column("value", sa.String, nullable=False),
+)
+DECISION = sa.Table(
+    "decision",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("id", sa.String, primary_key=True),
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("action", sa.String, nullable=False),
+    sa.Column("predicted", sa.String, nullable=False),
+    sa.Column("lower", sa.Double),
+    sa.Column("upper", sa.Double),
+    sa.Column("n_success", sa.BigInteger, nullable=False),
+    sa.Column("n_failure", sa.BigInteger, nullable=False),
+    sa.Column("embedding", sa.Text),  # JSON, (K, d)
+    sa.Column("model_version", sa.BigInteger, nullable=False),
+    sa.Column("reason", sa.String, nullable=False),
+    sa.Column("audit", sa.Boolean, nullable=False),
+    sa.Column("propensity", sa.Double),
+    sa.Column("content_hash", sa.BigInteger, nullable=False),
+    sa.Column("quarantined", sa.Boolean, nullable=False),
+)
+TRACE = sa.Table(  # apart from `decision`, so that counting decisions does not read traces
+    "trace",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("decision_id", sa.String, primary_key=True),
+    sa.Column("channels", sa.Integer, nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    sa.Column("data", sa.LargeBinary, nullable=False),  # float32, little-endian, (channels, samples)
+)
+LABEL = sa.Table(
+    "label",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("decision_id", sa.String, primary_key=True),
+    sa.Column("seq", sa.BigInteger, nullable=False),
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("success", sa.Boolean, nullable=False),
+    sa.Column("source", sa.String, nullable=False),
+    sa.Column("model_version", sa.BigInteger, nullable=False),  # whose space `point` lives in
+    sa.Column("point", sa.LargeBinary),  # float32, little-endian, (d,)
+    sa.Column("content_hash", sa.BigInteger, nullable=False),  # this and the next repeat `decision`, for the index
+    sa.Column("quarantined", sa.Boolean, nullable=False),
+    sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
+    sa.Index("label_training", "cell_id", "quarantined", "seq"),
+)
+VERSION = sa.Table(  # every retrain, dropped candidates included
+    "model_version",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    sa.Column("version", sa.BigInteger, nullable=False),
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("seconds", sa.Double, nullable=False),
+    sa.Column("n_traces", sa.BigInteger, nullable=False),
+    sa.Column("n_steps", sa.BigInteger, nullable=False),
+    sa.Column("accepted", sa.Boolean, nullable=False),
+    sa.Column("reason", sa.Text, nullable=False),
+    sa.Column("last_seq", sa.BigInteger, nullable=False),
+    sa.Column("state", sa.LargeBinary),  # npz without pickles
+    sa.Index("version_accepted", "cell_id", "accepted", "retrain"),
+)
+
+
+def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
+    """Create the tables in an empty database, or check that they are ours; then enter the cell.
+
+    name : of the database, for the error.
+    """
+    if connection.dialect.name == "postgresql":  # two cells may create the tables at the same moment
+        connection.execute(sa.text("SELECT pg_advisory_xact_lock(7236482514)"))
+    found, ours = set(sa.inspect(connection).get_table_names()), set(METADATA.tables)
+    # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
+    if found & ours or (found and connection.dialect.name == "sqlite"):
+        _check_schema(connection, found, name)
+    else:
+        METADATA.create_all(connection)
+    entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
+    if connection.execute(entered).first() is None:
+        connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})
+
+
+def _check_schema(connection: sa.Connection, found: set[str], name: str) -> None:
+    held = "tables of another program: " + ", ".join(sorted(found))
+    columns = {c["name"] for c in sa.inspect(connection).get_columns("setting")} if "setting" in found else set()
+    if columns == set(SETTING.c.keys()):
+        # The one query over all cells: the tables are theirs in common.
+        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
+        held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
+    if held != f"schema {SCHEMA}":
+        raise StoreError(
+            f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
+            "open it with the dengine that wrote it, or name a new file or database."
+        )

@@ -1,0 +1,106 @@
+"""The model that answers, and how a new version takes its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .model.base import EngineModel
+from .records import RetrainReport
+from .resuming import resume
+from .retraining import Retrainer, Trained
+from .store.base import Store
+from .store.records import StoredDecision
+
+Point = NDArray[np.float32]
+
+
+class ModelVersions:
+    """The versions of one engine's model: at most one answers, at most one is being trained.
+
+    template : untrained; what the first version is trained from.
+    answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
+    new_labels : since the last retrain began.
+    """
+
+    def __init__(self, template: EngineModel, retrainer: Retrainer, store: Store, clock: Callable[[], float]) -> None:
+        self.template = template
+        self.retrainer = retrainer
+        self.store = store
+        self.clock = clock
+        self.answering: EngineModel | None = None
+        self.version, self.new_labels = 0, 0
+        self._news: RetrainReport | None = None
+
+    @property
+    def newest(self) -> EngineModel:
+        """The model that answers, or the untrained one."""
+        return self.answering or self.template
+
+    def resume(self) -> None:
+        """Go on from the store."""
+        resumed = resume(self.store, self.template, self.retrainer.window)
+        self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
+
+    def reference_point(self, known: StoredDecision) -> Point | None:
+        """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
+        if self.answering is None:
+            return None
+        # What this very version embedded when it decided need not be embedded again.
+        embedding = known.embedding if known.model_version == self.version else None
+        return self.answering.place_safely(known.trace, known.content_hash, embedding)
+
+    def learn(self, known: StoredDecision, success: bool, point: Point | None, seq: int) -> None:
+        """Take in a label that is stored: tell the rule, make the trace a reference, give it to the next retrain."""
+        self.newest.tell(known.lower, known.upper, success)
+        self.newest.add_safely(point, int(success), known.content_hash)
+        self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
+        self.new_labels += 1
+
+    def retrain(self) -> RetrainReport:
+        """Train and swap, in line."""
+        self.collect(wait=True)
+        self.new_labels = 0
+        return self._swap(self.retrainer.train(self.newest))
+
+    def start_retrain(self) -> RetrainReport | None:
+        """Train beside the cell where there is an executor, unless it is at it; else in line."""
+        self.collect()
+        if self.retrainer.executor is None:
+            return self.retrain()
+        if not self.retrainer.busy:
+            self.new_labels = 0
+            self.retrainer.start(self.newest)
+        return None
+
+    def collect(self, wait: bool = False) -> None:
+        """Swap in what an executor has finished."""
+        trained = self.retrainer.collect(wait)
+        if trained is not None:
+            self._swap(trained)
+
+    def _swap(self, trained: Trained) -> RetrainReport:
+        model, seq = trained.candidate.model, trained.seq
+        if model is not None:
+            model.prepare_safely(self.newest)
+            self.retrainer.window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
+            self.answering, self.version = model, self.version + 1  # one reference is swapped
+        report = RetrainReport(
+            version=self.version,
+            seconds=self.clock() - trained.begin,  # until the version answers; storing it comes on top
+            n_traces=len(seq),
+            n_steps=trained.candidate.n_steps,
+            accepted=model is not None,
+            reason=trained.candidate.reason,
+        )
+        state = None if model is None else model.get_state() | {"trained_on": seq}
+        self.store.put_version(report, self.retrainer.window.newest_seq, state)
+        self._news = report
+        return report
+
+    def take_news(self) -> RetrainReport | None:
+        """The newest retrain, once."""
+        news, self._news = self._news, None
+        return news
