@@ -4,14 +4,14 @@
     for cycle in engine.run(cell, cycles=1503):
         ...
 
-One loop for replay, simulation and a live cell. Source of the method: the paper's section "Data engine".
+One loop for replay, simulation and a live cell. Source: the paper's section "Data engine".
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Self
@@ -29,7 +29,7 @@ from .model.prediction import ModelPrediction
 from .model.rival import as_engine_model
 from .recipe import Recipe
 from .records import Action, Cycle, Decision, Outcome, RetrainReport, TraceSpec
-from .retraining import Limits, Retrainer, Window
+from .retraining import Clock, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, refuse_idle
 from .store.base import Store, open_store
 from .store.records import DecidedTrace, StoredDecision, stored_decision
@@ -37,7 +37,6 @@ from .traces import as_trace, spec_of
 from .versions import ModelVersions
 
 StoreLike = str | os.PathLike[str] | Store
-Clock = Callable[[], float]
 
 
 class DataEngine:

@@ -28,6 +28,7 @@ from dengine.errors import ExportError, TraceError
 from dengine.export import ExportedModel, read_metadata
 from dengine.folds import content_fold
 from dengine.records import Action, Reason
+from dengine.reducers import Reducer
 
 SAMPLES = 100
 LIMIT = 500.0
@@ -149,8 +150,8 @@ def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tm
     model = fitted(data)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     assert exported.trace.channels == 3
-    judged = model.predict_many(data.X)
-    assert [d[2:6] for d in exported.decide_many(data.X)] == [(j.lower, j.upper, j.n_success, j.n_failure) for j in judged]
+    known = model.predict_many(data.X)
+    assert [d[2:6] for d in exported.decide_many(data.X)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
 
 
 def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
@@ -344,7 +345,7 @@ def test_nothing_trained_is_nothing_to_export(tmp_path: Path) -> None:
         export_torchscript(engine, tmp_path / "model.ts")
     with pytest.raises(ExportError, match="Nothing was trained yet"):
         export_torchscript(ModelPrediction("pca"), tmp_path / "model.ts")
-    with pytest.raises(ExportError, match="a foreign model stays in Python"):
+    with pytest.raises(ExportError, match="a rival method stays in Python"):
         export_torchscript(type("Thing", (), {"model": object()})(), tmp_path / "model.ts")
 
 
@@ -360,29 +361,23 @@ class TwoSpaces(torch.nn.Module):
         return torch.stack([z, z.flip(1) * 0.5 + 1.0], 1)
 
 
-class TwoSpacesReducer:
+class TwoSpacesReducer(Reducer):
     """A reducer that cross-fits by itself, as the conv reducer does; labels tell it nothing."""
 
     n_spaces = 2
 
-    def fit(self, X: np.ndarray, y: Any = None, folds: Any = None, stop: Any = None) -> "TwoSpacesReducer":
+    def fit(self, X: np.ndarray, y: Any = None) -> "TwoSpacesReducer":
         return self
+
+    def transform(self, X: np.ndarray) -> np.ndarray:
+        return self.embed(X).mean(axis=1)
 
     def embed(self, X: np.ndarray) -> np.ndarray:
         with torch.inference_mode():
             return self.module()(torch.from_numpy(X)).numpy()
 
-    def embed_own(self, X: np.ndarray, folds: np.ndarray) -> np.ndarray:
-        return self.embed(X)[np.arange(len(X)), folds]
-
     def module(self) -> torch.nn.Module:
         return TwoSpaces()
-
-    def get_state(self) -> dict[str, np.ndarray]:
-        return {}
-
-    def set_state(self, state: Any) -> "TwoSpacesReducer":
-        return self
 
 
 def ring_of(exported: ExportedModel) -> dict[str, np.ndarray]:
@@ -410,8 +405,8 @@ def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
     assert set(ring["spaces"][120:180]) == {0, 1}
     for name, mine in ring.items():
         np.testing.assert_array_equal(mine, getattr(model.index.ring, name).numpy())
-    judged = model.predict_many(data.X)
-    assert [d[2:6] for d in exported.decide_many(data.X)] == [(j.lower, j.upper, j.n_success, j.n_failure) for j in judged]
+    known = model.predict_many(data.X)
+    assert [d[2:6] for d in exported.decide_many(data.X)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
 
 
 def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path: Path) -> None:

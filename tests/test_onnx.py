@@ -71,7 +71,7 @@ def test_an_interval_without_a_module_is_refused(data: Dataset, tmp_path: Path) 
 
 
 def test_a_missing_package_names_the_extra(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dengine.onnx_export.find_spec", lambda name: None if name == "onnxscript" else object())
+    monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object())
     with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
         export_onnx(fitted(data), tmp_path / "model.onnx")
 

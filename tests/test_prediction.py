@@ -94,9 +94,9 @@ def test_counts_are_summed_over_the_spaces_by_brute_force(data: Dataset) -> None
 def test_duplicates_of_a_trace_never_train_the_space_they_are_counted_in(data: Dataset) -> None:
     twice = np.concatenate([data.X, data.X])
     fold = content_fold(twice, 2)
-    spaces = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], np.tile(data.y, 2), fold)
+    spaces = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], np.tile(data.y, 2), folds=fold)
     flipped = np.concatenate([data.y, np.where(fold[:200] == 0, 1 - data.y, data.y)])
-    other = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], flipped, fold)
+    other = CrossFitted(LinearDiscriminantAnalysis(), 2).fit(twice[:, None, :], flipped, folds=fold)
     np.testing.assert_array_equal(spaces.embed(data.X[:, None, :])[:, 0], other.embed(data.X[:, None, :])[:, 0])
 
 
@@ -115,7 +115,7 @@ class _Nosy(TransformerMixin, BaseEstimator):
 def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Dataset) -> None:
     model = ModelPrediction(_Nosy(), classifier()).fit(data.X, data.y)
     assert model.n_spaces == 1
-    assert model.spaces.reducer.n_ == 200
+    assert model.spaces.reducer_.n_ == 200
 
 
 def test_the_tag_decides_between_one_space_and_cross_fitting() -> None:

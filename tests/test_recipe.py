@@ -55,8 +55,8 @@ def test_a_recipe_without_params_stays_without_them_whatever_its_base_has(name: 
 
 
 def test_numpy_numbers_are_written_as_plain_ones() -> None:
-    recipe = Recipe("pca", {"dim": np.int64(3)}, Policy(np.float64(0.1), np.float64(0.9)), radius=np.float32(0.5))
-    assert Recipe.from_toml(recipe.to_toml()) == Recipe("pca", {"dim": 3}, Policy(0.1, 0.9), radius=0.5)
+    recipe = Recipe("pca", {"n_components": np.int64(3)}, Policy(np.float64(0.1), np.float64(0.9)), radius=np.float32(0.5))
+    assert Recipe.from_toml(recipe.to_toml()) == Recipe("pca", {"n_components": 3}, Policy(0.1, 0.9), radius=0.5)
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -121,7 +121,7 @@ def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text: str,
 
 
 def test_an_unknown_recipe_lists_the_known_ones() -> None:
-    with pytest.raises(SettingError, match=r"conv, umap, pca, rocket, paper.*covn is neither"):
+    with pytest.raises(SettingError, match=r"conv, umap, pca, rocket, paper.*covn is none"):
         Recipe.load("covn")
 
 

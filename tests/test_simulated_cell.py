@@ -112,7 +112,7 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
 
 
 def test_quotas_keep_the_first_of_each_label_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dengine.cells.generate._BLOCK", 5)
+    monkeypatch.setattr("dengine.cells.simulation.generate._BLOCK", 5)
     traces = simulate_balanced(successes=2, failures=2, seed=5, n_jobs=1)
     assert sorted(traces.y) == [0, 0, 1, 1]
     assert list(traces.cycle) == sorted(traces.cycle)

@@ -8,6 +8,7 @@ import threading
 import uuid
 import zipfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dengine import sql_database
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import MemoryStore, SqlStore, Store, open_store
+from dengine.store import MemoryStore, SqlStore, Store, open_store, sql_queries, sql_queue
 
 C, T = 2, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -227,7 +227,8 @@ def test_points_since_a_swap_are_those_of_that_version(store: Store) -> None:
         put(store, str(i), content_hash=i)
         store.put_label(str(i), i % 2 == 0, Source.AUDIT, version, added)
     added = store.points_since(2, 2)
-    assert (added.seq.tolist(), added.labels.tolist(), added.hashes.tolist()) == ([5], [1], [4])
+    assert added.seq.tolist() == [5]
+    np.testing.assert_array_equal(added.points, (point + 3)[None])
     np.testing.assert_array_equal(store.points_since(0, 2).points, np.stack([point + 1, point + 3]))
     assert store.points_since(5, 2).points.shape == (0, 0)
 
@@ -262,6 +263,18 @@ def test_an_import_with_a_known_id_adds_nothing(store: Store) -> None:
 def test_an_import_whose_parts_differ_in_length_is_refused(store: Store) -> None:
     with pytest.raises(StoreError, match=r"\(1, 2, 2, 2\)"):
         store.put_labelled([decision("a")], trace(0, (2, C, T)), np.arange(2), np.ones(2, np.int8), Source.VERIFICATION)
+
+
+def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quarantined(store: Store) -> None:
+    for i, quarantined in enumerate([False, True, False, False]):
+        bounded = replace(decision(str(i)), lower=0.1 * i, upper=0.2 * i)
+        store.put_decision(bounded, trace(i), i, quarantined)
+        store.put_label(str(i), i % 2 == 0, Source.VERIFICATION, 1, None)
+    found = store.evidence_since(1)
+    assert (found.seq.tolist(), found.success.tolist()) == ([3, 4], [True, False])
+    np.testing.assert_array_equal(found.lower, [0.2, 0.1 * 3])
+    np.testing.assert_array_equal(found.upper, [0.4, 0.2 * 3])
+    assert len(store.evidence_since(4).seq) == 0
 
 
 # Versions and settings
@@ -455,8 +468,8 @@ def test_a_commit_whose_answer_was_lost_is_not_written_twice(
 
 
 def test_a_full_queue_is_written_by_put_decision_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql_database, "LINGER", 60.0)
-    monkeypatch.setattr(sql_database, "QUEUE_BYTES", 3 * C * T * 4)
+    monkeypatch.setattr(sql_queue, "LINGER", 60.0)
+    monkeypatch.setattr(sql_queue, "QUEUE_BYTES", 3 * C * T * 4)
     with SqlStore(str(tmp_path / "a.db")) as store:
         for i in range(20):
             put(store, str(i))
@@ -476,7 +489,12 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
 
 def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
-        for query in (store._newest(100), store._trace_query(5, 10), store._decision_query("a")):
+        for query in (
+            sql_queries.newest_query("cell", 100),
+            sql_queries.trace_query("cell", 5, 10),
+            sql_queries.decision_query("cell", "a"),
+            sql_queries.evidence_query("cell", 5),
+        ):
             text = query.compile(connection, compile_kwargs={"literal_binds": True})
             plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
             assert plan

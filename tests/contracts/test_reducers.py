@@ -1,204 +1,147 @@
-"""One contract over every entry of `REDUCERS`: whoever joins the table keeps it."""
+"""One contract over every entry of `REDUCERS`, and over reducers that come from outside: whoever joins keeps it."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from inspect import signature
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import REDUCERS, DataEngine, Dataset, ModelPrediction, Policy, Recipe, ReplayCell, make_reducer
+from dengine import REDUCERS, ModelPrediction, make_reducer
+from dengine.checks import REDUCER_CHECKS, check_reducer, toy_traces
 from dengine.errors import SettingError
-from dengine.folds import content_fold
-from dengine.recipe import RECIPES
-from dengine.reducers import reducer_class
-from dengine.reducers.base import StopRule
-from dengine.reducers.cross_fitting import as_reducer, uses_labels
+from dengine.reducers import Reducer
 
-STEPS = 8
-QUICK: dict[str, dict[str, Any]] = {"umap": {"n_epochs": 40, "n_neighbors": 8}}
+QUICK: dict[str, dict[str, Any]] = {
+    "umap": {"n_epochs": 40, "n_neighbors": 8},
+    "conv": {"folds": 2},
+    "rocket": {"folds": 2},
+}
+EXPORTABLE = [name for name in REDUCERS if name != "umap"]
 
 every_reducer = pytest.mark.parametrize("name", REDUCERS)
-SHAPES = [(152, 1), (800, 1), (90, 3)]
+every_check = pytest.mark.parametrize("check", REDUCER_CHECKS, ids=lambda check: check.__name__)
 
 
-def new(name: str, seed: int = 0) -> Any:
-    own = {"folds": 2} if "folds" in signature(reducer_class(name)).parameters else {}
-    return make_reducer(name, seed=seed, **own, **QUICK.get(name, {}))
+def new(name: str) -> Any:
+    return make_reducer(name, random_state=0, **QUICK.get(name, {}))
 
 
-def fit(name: str, data: Dataset, seed: int = 0) -> Any:
-    X = data.X if data.X.ndim == 3 else data.X[:, None, :]
-    spaces = as_reducer(new(name, seed), 2)
-    return spaces.fit(X, data.y, content_fold(X, spaces.n_spaces), StopRule(max_steps=STEPS))
+@every_check
+@every_reducer
+def test_a_shipped_reducer_keeps_the_contract(name: str, check: Any) -> None:
+    check(new(name))
 
 
-def channels_first(data: Dataset) -> np.ndarray:
-    return data.X if data.X.ndim == 3 else data.X[:, None, :]
+@every_check
+@pytest.mark.parametrize("reducer", [PCA(2, random_state=0), LinearDiscriminantAnalysis()], ids=["PCA", "LDA"])
+def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) -> None:
+    check(reducer)
 
 
-@pytest.fixture(scope="module")
-def fitted(make_data: Callable[..., Dataset]) -> Callable[[str], Any]:
-    known: dict[str, Any] = {}
-    data = make_data(100, samples=120)
-
-    def of(name: str) -> Any:
-        if name not in known:
-            known[name] = fit(name, data)
-        return known[name]
-
-    return of
-
-
-@pytest.fixture(scope="module")
-def queries(make_data: Callable[..., Dataset]) -> np.ndarray:
-    return make_data(20, samples=120, seed=5).X[:, None, :]
+@pytest.mark.parametrize("name", EXPORTABLE)
+def test_every_reducer_but_umap_can_be_exported_and_restored(name: str) -> None:
+    X, y = toy_traces()
+    fitted = new(name).fit(X, y)
+    assert fitted.module() is not None
+    assert fitted.get_state()
 
 
 @every_reducer
-def test_it_is_a_scikit_learn_transformer_that_clones(name: str) -> None:
-    reducer = new(name, seed=7)
-    assert isinstance(reducer, BaseEstimator)
-    assert isinstance(reducer, TransformerMixin)
-    assert clone(reducer).get_params() == reducer.get_params()
-    assert reducer.get_params()["seed"] == 7
-    assert isinstance(uses_labels(reducer), bool)
-
-
-@every_reducer
-def test_it_embeds_every_trace_in_every_space_as_finite_float32(name: str, fitted, queries) -> None:
-    spaces = fitted(name)
-    Z = spaces.embed(queries)
-    assert Z.shape[:2] == (20, spaces.n_spaces)
-    assert Z.dtype == np.float32
-    assert np.isfinite(Z).all()
-    assert spaces.transform(queries).shape == (20, Z.shape[2])
-    assert spaces.transform(queries).dtype == np.float32
-
-
-@every_reducer
-def test_a_label_using_reducer_has_two_spaces_or_more(name: str, fitted) -> None:
-    assert fitted(name).n_spaces >= (2 if uses_labels(new(name)) else 1)
-
-
-@every_reducer
-def test_references_live_in_the_space_of_their_own_fold(name: str, fitted, queries) -> None:
-    spaces = fitted(name)
-    fold = np.arange(20) % spaces.n_spaces
-    np.testing.assert_array_equal(spaces.embed_own(queries, fold), spaces.embed(queries)[np.arange(20), fold])
-
-
-@every_reducer
-def test_a_seed_repeats_exactly(name: str, make_data, queries, fitted) -> None:
-    again = fit(name, make_data(100, samples=120))
-    np.testing.assert_array_equal(again.embed(queries), fitted(name).embed(queries))
-
-
-@every_reducer
-def test_labels_of_fold_k_move_nothing_in_space_k(name: str, make_data, queries, fitted) -> None:
-    data = make_data(100, samples=120)
-    spaces = fitted(name)
-    fold = content_fold(channels_first(data), spaces.n_spaces)
-    for k in range(spaces.n_spaces):
-        y = data.y.copy()
-        y[fold == k] = np.random.default_rng(k).permutation(1 - y[fold == k])
-        other = fit(name, replace(data, y=y))
-        np.testing.assert_array_equal(other.embed(queries)[:, k], spaces.embed(queries)[:, k])
-
-
-@every_reducer
-def test_a_trace_alone_lies_where_it_lies_in_a_batch(name: str, fitted, queries) -> None:
-    spaces = fitted(name)
-    together = spaces.embed(queries)
-    alone = np.concatenate([spaces.embed(x[None]) for x in queries])
-    scale = np.sqrt(together.var(axis=0).sum(axis=-1))  # (K,) root mean square radius, as ModelPrediction scales
-    moved = np.linalg.norm(alone - together, axis=2) / scale
-    assert moved.max() <= reducer_class(name).single_tolerance
-
-
-@every_reducer
-def test_embedding_does_not_change_the_traces(name: str, fitted, queries) -> None:
-    before = queries.copy()
-    fitted(name).embed(queries)
-    np.testing.assert_array_equal(queries, before)
-
-
-@every_reducer
-def test_its_module_scripts_and_embeds_as_it_does(name: str, fitted, queries) -> None:
-    import torch
-
-    from dengine.decision.rule import script
-
-    module = fitted(name).module()
-    if module is None:
-        assert name == "umap", f"{name} has no module: it cannot be exported"
-        return
-    with torch.inference_mode():
-        Z = script(module.eval())(torch.from_numpy(queries)).numpy()
-    np.testing.assert_allclose(Z, fitted(name).embed(queries), rtol=1e-4, atol=1e-4)
-
-
-@every_reducer
-def test_its_state_is_plain_arrays_that_restore_it_bit_for_bit(name: str, fitted, queries) -> None:
-    state = fitted(name).get_state()
-    if state is None:
-        assert name == "umap", f"{name} has no state: it would have to be refitted at every start"
-        return
-    assert all(isinstance(v, np.ndarray) and not v.dtype.hasobject for v in state.values())
-    restored = as_reducer(new(name), 2).set_state(state)
-    np.testing.assert_array_equal(restored.embed(queries), fitted(name).embed(queries))
-
-
-@every_reducer
-def test_an_engine_resumes_from_its_store_with_identical_decisions(name: str, make_data, tmp_path: Path) -> None:
-    data, url = make_data(110, samples=100), str(tmp_path / "engine.db")
-    recipe = replace(
-        RECIPES.get(name, Recipe(name)),
-        params=QUICK.get(name, {}),
-        policy=Policy(0.2, 0.8),
-        retrain_every=70,
-        max_steps=STEPS,
-    )
-
-    def asked(engine: DataEngine) -> list[tuple]:
-        decided = [engine.decide(x) for x in data.X[90:]]
-        return [(d.action, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version) for d in decided]
-
-    with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
-        list(engine.run(ReplayCell(data), 90))
-        assert engine.version == 1
-        before = asked(engine)
-    with DataEngine.open(url) as engine:
-        assert asked(engine) == before
-
-
-@every_reducer
-@pytest.mark.parametrize(("samples", "channels"), SHAPES)
-def test_any_length_and_several_channels_work(name: str, samples: int, channels: int, make_data) -> None:
-    data = make_data(70, samples=samples, channels=channels)
-    model = ModelPrediction(new(name)).fit(data.X, data.y, stop=StopRule(max_steps=STEPS))
-    n_success, n_failure = model.count(data.X[:5])
-    assert (n_success + n_failure >= 0).all()
-    assert np.isfinite(model.predict_interval(data.X[:5])).all()
-    assert model.index.ring.size() == 70
-
-
-@every_reducer
-def test_too_little_to_learn_from_is_a_setting_error(name: str, make_data) -> None:
-    data = make_data(2, samples=100)
+def test_too_little_to_learn_from_is_a_setting_error(name: str) -> None:
+    X, _ = toy_traces(2)
     with pytest.raises(SettingError):
-        ModelPrediction(new(name)).fit(data.X, np.ones(2))
+        ModelPrediction(new(name)).fit(X, np.ones(2))
 
 
 @every_reducer
 def test_an_unknown_setting_is_an_error_that_lists_the_known(name: str) -> None:
-    with pytest.raises(SettingError, match=r"no parameter dimm; it has .*seed"):
+    with pytest.raises(SettingError, match=r"no parameter dimm; it has .*random_state"):
         make_reducer(name, dimm=2)
 
 
 def test_an_unknown_reducer_lists_the_known() -> None:
     with pytest.raises(SettingError, match="conv, umap, pca"):
         make_reducer("pac")
+
+
+# ------------------------------------------------------------------------------------------- caught when it is broken
+
+
+class Means(Reducer):
+    """A reducer of somebody else's, the least that is needed: means of the halves of a trace."""
+
+    def __init__(self, n_components: int = 2) -> None:
+        self.n_components = n_components
+
+    def fit(self, X: Any, y: Any = None) -> "Means":
+        self.check_traces(X, reset=True)
+        return self
+
+    def transform(self, X: Any) -> np.ndarray:
+        halves = np.array_split(self.check_traces(X), self.n_components, axis=2)
+        return np.stack([half.mean(axis=(1, 2)) for half in halves], axis=1)
+
+
+class Peeking(Means):
+    """Dishonest: it keeps the labels' mean of all folds, whatever space it is asked about."""
+
+    uses_labels, n_spaces = True, 2
+
+    def train(self, X: Any, y: Any, folds: Any, stop: Any = None) -> np.ndarray:
+        self.rate_ = float(np.mean(y * np.arange(len(y))))
+        return self.fit(X).embed_own(X, folds)
+
+    def embed(self, X: Any) -> np.ndarray:
+        Z = self.transform(X) * getattr(self, "rate_", 1.0)
+        return np.stack([Z, Z], axis=1).astype(np.float32)
+
+
+class Forgetful(Means):
+    """`fit` goes on from an earlier fit."""
+
+    def fit(self, X: Any, y: Any = None) -> "Forgetful":
+        self.gain_ = getattr(self, "gain_", 1.0) * 2.0
+        return super().fit(X)
+
+    def transform(self, X: Any) -> np.ndarray:
+        return super().transform(X) * self.gain_
+
+
+class Overwriting(Means):
+    """Writes to the caller's traces."""
+
+    def transform(self, X: Any) -> np.ndarray:
+        out = super().transform(X)
+        np.asarray(X)[:] = 0.0
+        return out
+
+
+class Unbounded(TransformerMixin, BaseEstimator):
+    """A transformer that gives infinities."""
+
+    def fit(self, X: Any, y: Any = None) -> "Unbounded":
+        return self
+
+    def transform(self, X: Any) -> np.ndarray:
+        return np.full((len(X), 2), np.inf)
+
+
+def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
+    check_reducer(Means())
+
+
+@pytest.mark.parametrize(
+    ("reducer", "clause"),
+    [
+        (Peeking(), "labels_of_a_fold_move_nothing_in_its_space"),
+        (Forgetful(), "fit_starts_afresh"),
+        (Overwriting(), "embedding_leaves_the_traces_as_they_are"),
+        (Unbounded(), "it_embeds_every_trace_in_every_space"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseEstimator) else "",
+)
+def test_a_broken_reducer_is_told_which_clause_it_breaks(reducer: Any, clause: str) -> None:
+    with pytest.raises(AssertionError, match=clause):
+        check_reducer(reducer)

@@ -7,11 +7,13 @@ import os
 
 import numpy as np
 import pytest
+from sklearn.base import clone
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, ReplayCell, WilsonRadiusClassifier, replay
 from dengine.experiments.replay import collect
 from dengine.recipe import RECIPES
+from dengine.reducers.base import as_points
 from dengine.reducers.cross_fitting import LabelFree
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
@@ -49,9 +51,12 @@ def test_labels_of_noise_yield_next_to_nothing_certain(name: str, make_data, pro
 class SeesEverything(LabelFree):
     """Dishonest on purpose: one space, fitted on the very labels that are then counted in it."""
 
-    def fit(self, X, y=None, folds=None, stop=None):
-        self.reducer.fit(X.reshape(len(X), -1), y)
-        return self
+    def train(self, X, y, folds, stop=None):
+        self.reducer_ = clone(self.reducer).fit(X.reshape(len(X), -1), y)
+        return self.embed_own(X, folds)
+
+    def embed(self, X):
+        return as_points(self.reducer_.transform(X.reshape(len(X), -1)))[:, None, :]
 
 
 def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:

@@ -1,0 +1,187 @@
+"""The decision rule: one formula in every form it takes, and an object that is asked, told and restored."""
+
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript, load_exported
+from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of, script
+from dengine.errors import ExportError, SettingError
+
+counts = st.integers(0, 5000)
+alphas = st.sampled_from([0.01, 0.05, 0.1, 0.2, 0.5])
+bounds = st.sampled_from([0.6, 0.8, 0.9, 0.95, 0.99])
+ACTIONS = tuple(Action)
+
+
+@pytest.mark.parametrize("interval", SCALAR_BOUNDS)
+@given(n_success=counts, n_failure=counts, alpha=alphas, lower_bound=bounds)
+def test_the_scalar_rule_is_the_interval_and_the_policy(interval, n_success, n_failure, alpha, lower_bound) -> None:
+    policy = Policy(alpha, lower_bound, interval)
+    action, lower, upper = policy.rule()(n_success, n_failure)
+    assert (lower, upper) == pytest.approx(INTERVALS[interval](n_success, n_failure, alpha), abs=1e-12)
+    assert ACTIONS[action] is policy.action(lower, upper)
+    assert 0.0 <= lower <= upper <= 1.0
+
+
+@pytest.mark.parametrize("interval", INTERVALS)
+def test_every_interval_gives_a_rule(interval: str) -> None:
+    action, lower, upper = Policy(0.1, 0.9, interval).rule()(300, 0)
+    assert (lower, upper) == pytest.approx(INTERVALS[interval](300, 0, 0.1), abs=1e-12)
+    assert ACTIONS[action] is Action.ACCEPT
+
+
+def test_the_compiled_rule_answers_to_the_bit_as_the_one_in_python() -> None:
+    for interval in SCALAR_BOUNDS:
+        rule = Policy(0.1, 0.9, interval).rule()
+        compiled = script(rule)
+        for n_success in (0, 1, 7, 24, 25, 26, 72, 73, 400):
+            for n_failure in (0, 1, 3, 30, 73):
+                assert compiled(n_success, n_failure) == rule(n_success, n_failure)
+
+
+def test_the_onnx_twin_bounds_as_the_rule_does() -> None:
+    from dengine.export.onnx import Twin
+
+    for interval in SCALAR_BOUNDS:
+        rule = Policy(0.05, 0.95, interval).rule()
+        twin = Twin.__new__(Twin)
+        torch.nn.Module.__init__(twin)
+        twin.rule = rule
+        for n_success in (0, 1, 24, 73, 1000):
+            for n_failure in (0, 1, 30):
+                found = [
+                    float(v)
+                    for v in twin.bound(torch.tensor(float(n_success)).double(), torch.tensor(float(n_failure)).double())
+                ]
+                assert found == pytest.approx(rule.bound(n_success, n_failure, rule.z), abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [(0.9, 1.0, 1), (math.nextafter(0.9, 0), 1.0, 0), (0.0, 0.1, 2), (0.0, 0.11, 0), (0, 1, 0)],
+)
+def test_a_bound_that_just_meets_the_tolerance_decides(lower: float, upper: float, expected: int) -> None:
+    assert action_of(lower, upper, 0.9, 0.1) == expected
+
+
+def test_the_fewest_all_good_neighbours_that_accept_are_those_of_the_field() -> None:
+    # 25 at (0.1, 90 %), 73 at (0.05, 95 %), 7 at (0.2, 80 %): lower = n / (n + z^2) >= LB.
+    for alpha, lower_bound, fewest in ((0.1, 0.9, 25), (0.05, 0.95, 73), (0.2, 0.8, 7)):
+        rule = Policy(alpha, lower_bound).rule()
+        assert [rule(n, 0)[0] for n in (fewest - 1, fewest)] == [0, 1]
+        assert [rule(0, n)[0] for n in (fewest - 1, fewest)] == [0, 2]
+
+
+# ------------------------------------------------------------------------------------- a rule from outside the package
+
+
+class FuseRule(DecisionRule):
+    """Accepts nothing for a while after a part that looked good enough to accept turned out bad."""
+
+    pause: torch.Tensor
+
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
+        super().__init__(alpha, lower_bound, interval)
+        self.register_buffer("pause", torch.zeros((), dtype=torch.int64))
+
+    def action(self, lower: float, upper: float) -> int:
+        """The paper's action, but for a pause."""
+        found = action_of(lower, upper, self.accept_at, self.reject_at)
+        return 0 if found == 1 and int(self.pause.item()) > 0 else found
+
+    @torch.jit.export
+    def tell(self, lower: float, upper: float, success: bool) -> None:
+        """A stop sets the fuse; each label after it burns a little of it."""
+        if not success and lower >= self.accept_at:
+            self.pause.fill_(5)
+        else:
+            self.pause.fill_(max(0, int(self.pause.item()) - 1))
+
+
+class SpokenRule(DecisionRule):
+    """A rule that stays in Python."""
+
+    compiles = False
+
+    def action(self, lower: float, upper: float) -> int:
+        return {True: 1, False: 0}[lower >= self.accept_at]
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The module `fuse` of an outside author, by which a recipe names his rule."""
+    source = Path(__file__).read_text(encoding="utf-8")
+    rule = source[source.index("class FuseRule") : source.index("@pytest.fixture")]
+    head = "import torch\nfrom dengine.decision.rule import DecisionRule, action_of\n\n\n"
+    (tmp_path / "fuse.py").write_text(head + rule, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "fuse", raising=False)
+    return "fuse:FuseRule"
+
+
+def recipe_with(guarantee: str) -> Recipe:
+    return Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9, guarantee=guarantee), retrain_every=40)
+
+
+def good(data: Dataset) -> np.ndarray:
+    return data.X[np.flatnonzero(data.y == 1)[-1]]
+
+
+def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(outside, data, tmp_path: Path) -> None:
+    recipe = Recipe.from_toml(recipe_with(outside).to_toml())
+    url = str(tmp_path / "engine.db")
+    with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
+        list(engine.run(ReplayCell(data, confirm=True), 150))
+        accepted = engine.decide(good(data))
+        assert accepted.action is Action.ACCEPT
+        engine.report(accepted.id, success=False)  # the system stopped
+        paused = engine.decide(good(data))
+        assert paused.lower >= 0.9  # only the rule holds it back
+        assert paused.action is Action.VERIFY
+    with DataEngine.open(url) as engine:
+        again = engine.decide(good(data))
+        assert (again.action, again.lower) == (Action.VERIFY, paused.lower)
+        engine.retrain()
+    with DataEngine.open(url) as engine:  # now from the version's own state
+        assert engine.decide(good(data)).action is Action.VERIFY
+        for x, y in zip(data.X[:60], data.y[:60], strict=True):
+            decision = engine.decide(np.roll(x, 1))
+            if decision.action is Action.VERIFY:
+                engine.report(decision.id, bool(y))
+        assert engine.decide(good(data)).action is Action.ACCEPT
+
+
+def test_a_rule_from_outside_is_exported_with_what_it_was_told(outside, data, tmp_path: Path) -> None:
+    with DataEngine(recipe=recipe_with(outside), replaying=True) as engine:
+        list(engine.run(ReplayCell(data, confirm=True), 150))
+        accepted = engine.decide(good(data))
+        before = load_exported(export_torchscript(engine, tmp_path / "before.ts"))
+        engine.report(accepted.id, success=False)
+        after = load_exported(export_torchscript(engine, tmp_path / "after.ts"))
+        assert before.decide(good(data)).action is Action.ACCEPT
+        assert after.decide(good(data)).action is engine.decide(good(data)).action is Action.VERIFY
+
+
+def test_a_rule_that_does_not_compile_decides_and_is_not_exported(outside, data, tmp_path: Path) -> None:
+    with DataEngine(recipe=recipe_with("fuse:SpokenRule"), replaying=True) as engine:
+        actions = [c.decision.action for c in engine.run(ReplayCell(data), len(data))]
+        assert actions.count(Action.ACCEPT) > 50
+        assert Action.REJECT not in actions
+        with pytest.raises(ExportError, match=r"SpokenRule .*does not compile"):
+            export_torchscript(engine, tmp_path / "model.ts")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("globl", "a guarantee among local"), ("nowhere:Rule", "can be imported here"), ("dengine.recipe:Recipe", "subclass")],
+)
+def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        DataEngine(recipe=recipe_with("local").with_policy(guarantee=name))

@@ -1,0 +1,278 @@
+"""What is given to an engine counts, or it is an error: recipes with settings beside them, own reducers, models, stores."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.decomposition import PCA
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from dengine import (
+    Action,
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    ReplayCell,
+    TraceSpec,
+    WilsonRadiusClassifier,
+    make_reducer,
+    replay,
+    run_grid,
+)
+from dengine.errors import SettingError, StoreError
+from dengine.recipe import RECIPES
+
+POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
+
+
+class Constant:
+    """A rival that verifies all."""
+
+    def fit(self, X, y):
+        return self
+
+    def add(self, x, y):
+        return self
+
+    def count(self, X):
+        return np.zeros(len(X), int), np.zeros(len(X), int)
+
+    def predict_interval(self, X):
+        return np.zeros(len(X)), np.ones(len(X))
+
+    def decide(self, X):
+        return np.full(len(X), Action.VERIFY, dtype=object)
+
+
+# --------------------------------------------------------------------------------------------- beside a recipe or model
+
+
+def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
+    engine = DataEngine(recipe="conv", policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3)
+    expected = replace(RECIPES["conv"], policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3)
+    assert engine.recipe == expected
+    assert engine.policy is engine.recipe.policy
+    assert engine.store.settings()["recipe"] == expected.to_toml()
+
+
+def test_a_radius_beside_an_adaptive_recipe_is_the_one_that_counts() -> None:
+    engine = DataEngine(recipe=replace(RECIPES["pca"], fraction=0.3, reject_fraction=0.1), radius=0.4)
+    assert (engine.recipe.radius, engine.recipe.fraction, engine.recipe.reject_fraction) == (0.4, None, None)
+
+
+def test_a_reducer_that_contradicts_its_recipe_is_an_error() -> None:
+    assert DataEngine("pca", recipe="pca").recipe.reducer == "pca"
+    with pytest.raises(SettingError, match="The recipe names its reducer, pca; got reducer 'conv' beside it"):
+        DataEngine("conv", recipe="pca")
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [({"policy": POLICY}, "policy"), ({"radius": 0.1}, "radius"), ({"folds": 3}, "folds"), ({"reducer": "pca"}, "reducer")],
+)
+def test_what_has_no_effect_on_a_handed_in_model_is_an_error(given: dict, named: str) -> None:
+    with pytest.raises(SettingError, match=f"decides by its own rule, so {named} would have no effect"):
+        DataEngine(model=Constant(), **given)
+
+
+def test_the_audit_rate_and_the_loops_settings_count_for_a_rival_too() -> None:
+    engine = DataEngine(model=Constant(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2)
+    assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (0.3, 7, 0.2)
+    assert engine.store.settings()["model"] == "Constant"
+
+
+def test_of_our_own_model_handed_in_the_engine_tells_the_numbers_that_it_decides_by() -> None:
+    model = ModelPrediction("pca", WilsonRadiusClassifier(0.5, 0.2, 0.8, "jeffreys"))
+    policy = DataEngine(model=model).policy
+    assert (policy.alpha, policy.lower_bound, policy.interval) == (0.2, 0.8, "jeffreys")
+
+
+@pytest.mark.parametrize("name", ["policy", "recipe", "version", "trace"])
+def test_what_a_running_engine_rests_on_cannot_be_assigned(name: str) -> None:
+    engine = DataEngine("pca")
+    with pytest.raises(AttributeError, match=name):
+        setattr(engine, name, getattr(engine, name))
+
+
+# ------------------------------------------------------------------------------------------------------- open_or_create
+
+
+def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None:
+    url = tmp_path / "engine.db"
+    for start in (0, 50, 100):
+        with DataEngine.open_or_create(url, reducer="pca", policy=POLICY, radius=0.5) as engine:
+            assert engine.resumed is (start > 0)
+            assert engine.store.status()["decisions"] == start
+            list(engine.run(ReplayCell(data, np.arange(start, start + 50)), 50))
+    assert DataEngine.open(url).version > 0
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        ({"policy": Policy(0.1, 0.9)}, "lower_bound"),
+        ({"radius": 0.3}, "radius"),
+        ({"reducer": "conv"}, "reducer"),
+        ({"recipe": "umap"}, "reducer"),
+        ({"seed": 4}, "seed"),
+        ({"trace": TraceSpec(99)}, "trace"),
+    ],
+)
+def test_other_settings_than_the_stores_are_an_error_that_names_both(other, named, data: Dataset, tmp_path: Path) -> None:
+    url = tmp_path / "engine.db"
+    with DataEngine("pca", POLICY, radius=0.5, store=url) as engine:
+        engine.decide(data.X[0])
+    with pytest.raises(SettingError, match=rf"the store's own settings \(.*{named} .*\), got .*{named} "):
+        DataEngine.open_or_create(url, **other)
+    with DataEngine.open_or_create(url) as engine:
+        assert engine.policy == POLICY
+
+
+def test_a_file_that_is_not_there_is_not_opened(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="found no file"):
+        DataEngine.open(tmp_path / "none.db")
+    assert not (tmp_path / "none.db").exists()
+
+
+# --------------------------------------------------------------------------------------------------------- own reducers
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A reducer in a module of somebody else's."""
+    (tmp_path / "halves.py").write_text(
+        "import numpy as np\n"
+        "from dengine import Reducer\n\n\n"
+        "class Halves(Reducer):\n"
+        "    def __init__(self, n_components=2, gain=1.0):\n"
+        "        self.n_components = n_components\n"
+        "        self.gain = gain\n\n"
+        "    def fit(self, X, y=None):\n"
+        "        self.check_traces(X, reset=True)\n"
+        "        return self\n\n"
+        "    def transform(self, X):\n"
+        "        parts = np.array_split(self.check_traces(X), self.n_components, axis=2)\n"
+        "        return self.gain * np.stack([part.mean(axis=(1, 2)) for part in parts], axis=1)\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield "halves:Halves"
+    sys.modules.pop("halves", None)
+
+
+def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, data: Dataset, tmp_path: Path) -> None:
+    recipe = Recipe.from_toml(f'reducer = "{outside}"\n[params]\ngain = 2.0\n').with_policy(alpha=0.2, lower_bound=0.8)
+    assert set(replay(data, recipe, cycles=120).action) == {"verify", "accept"}
+    frame = run_grid(data, [outside, "pca"], [0.2], [0.8], repeats=1, n_jobs=1, cycles=100)
+    assert list(frame["recipe"]) == [outside, "pca"]
+    with DataEngine(outside, POLICY, store=tmp_path / "engine.db") as engine:
+        list(engine.run(ReplayCell(data), 60))
+        before = engine.decide(data.X[70])
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert engine.decide(data.X[70]).embedding == before.embedding
+
+
+def test_an_own_reducer_enters_as_an_object_and_comes_back_where_it_has_a_name(outside, data, tmp_path: Path) -> None:
+    import halves
+
+    with DataEngine(halves.Halves(gain=3.0), POLICY, store=tmp_path / "engine.db") as engine:
+        assert 'reducer = "halves:Halves"' in engine.recipe.to_toml()
+        list(engine.run(ReplayCell(data), 60))
+        before = engine.decide(data.X[70])
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert engine.recipe.params["gain"] == 3.0
+        assert engine.decide(data.X[70]).embedding == before.embedding
+
+
+def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp_path: Path) -> None:
+    def pipeline():
+        return make_pipeline(StandardScaler(), PCA(2, random_state=0))
+
+    assert set(replay(data, Recipe(pipeline(), policy=POLICY), cycles=150).action) >= {"verify", "accept"}
+    with DataEngine(pipeline(), POLICY, store=tmp_path / "engine.db") as engine:
+        list(engine.run(ReplayCell(data), 60))
+        before = engine.decide(data.X[70])
+    with pytest.raises(SettingError, match=r"object Pipeline, has no name in TOML: hand it in again"):
+        DataEngine.open(tmp_path / "engine.db")
+    with DataEngine.open(tmp_path / "engine.db", reducer=pipeline()) as engine:
+        assert engine.decide(data.X[70]).embedding == before.embedding
+
+
+def test_the_words_of_the_first_version_are_still_read(data: Dataset) -> None:
+    text = 'reducer = "conv"\nmax_steps = 60\n[params]\ndim = 1\nobjective = "supervised"\n'
+    recipe = Recipe.from_toml(text)
+    assert recipe.params == {"n_components": 1}
+    engine = DataEngine(recipe=recipe)
+    list(engine.run(ReplayCell(data), 60))
+    assert np.shape(engine.decide(data.X[70]).embedding) == (5, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("nowhere:Reducer", "can be imported here"),
+        ("dengine.recipe:Recipe", "has no fit and transform"),
+        ("numpy:pi", "is a float and no class"),
+    ],
+)
+def test_a_reducer_that_cannot_be_had_is_named(name: str, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        DataEngine(name)
+
+
+# -------------------------------------------------------------------------------------------------- the loop's own work
+
+
+def test_a_report_does_not_embed_again_what_decide_has_embedded(data: Dataset) -> None:
+    engine = DataEngine("pca", POLICY, radius=0.5)
+    list(engine.run(ReplayCell(data), 60))
+    decided = [engine.decide(x) for x in data.X[60:64]]
+    embed, asked = engine.model.predictor.embed, []
+    expected = [embed_point(engine, x) for x in data.X[60:64]]
+    engine.model._compiled.predictor.embed = lambda x: asked.append(x) or embed(x)
+    known = [d for d in decided if d.action is not Action.REJECT]
+    for d in known:
+        engine.report(d.id, True)
+    assert asked == []
+    added = engine.model.index.points[-len(known) :]
+    np.testing.assert_array_equal(added, [p for p, d in zip(expected, decided, strict=True) if d in known])
+
+
+def embed_point(engine: DataEngine, x: np.ndarray) -> np.ndarray:
+    """Where a trace would lie, computed from the trace."""
+    import torch
+
+    with torch.inference_mode():
+        return engine.model.predictor.embed(torch.from_numpy(x[None]))[0].numpy()
+
+
+def test_a_retrain_is_timed_and_stopped_by_the_clock_that_was_handed_in(data: Dataset) -> None:
+    ticks = count()
+    engine = DataEngine("conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks)))  # a second a look
+    ids = [engine.decide(x).id for x in data.X[:80]]
+    for name, y in zip(ids, data.y[:80], strict=True):
+        engine.report(name, bool(y))
+    before = next(ticks)
+    report = engine.retrain()
+    assert report.n_steps == 0  # its budget is over before the first step
+    assert report.seconds == next(ticks) - before - 2
+
+
+def test_a_reducer_stops_on_max_steps(data: Dataset) -> None:
+    for steps in (1, 3):
+        engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
+        list(engine.run(ReplayCell(data), 60))
+        assert [r.n_steps for r in engine.store.retrains()] == [steps]
+
+
+def test_a_seed_makes_the_reducer(data: Dataset) -> None:
+    assert make_reducer("conv", random_state=3).random_state == 3
+    model = ModelPrediction.from_recipe(RECIPES["conv"], seed=3)
+    assert (model.reducer.random_state, model.reducer.folds) == (3, RECIPES["conv"].folds)
