@@ -1,11 +1,16 @@
 """The command line: real commands on small data."""
 
 import json
+import os
+import re
 import shlex
+import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -14,8 +19,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from dengine import DataEngine, __version__
+from dengine import DataEngine, __version__, load_dataset
 from dengine.cli import main
+from dengine.cli.interrupting import INTERRUPTED
+from dengine.cli.output import WIDE, duration, size
 from dengine.importing import import_labelled
 from dengine.store import MemoryStore
 
@@ -94,12 +101,35 @@ def example_of(verb: str) -> list[str]:
     return shlex.split(lines[-1])
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of its traces."""
+    folder = tmp_path_factory.mktemp("examples")
+    succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "conv", "--retrains", 1)
+    traces = load_dataset("insertion")
+    rows = np.column_stack([traces.y, traces.X])[:2]
+    np.savetxt(folder / "cell.csv", rows, delimiter=",", fmt="%g")
+    return folder
+
+
 @pytest.mark.parametrize("verb", VERBS)
-def test_every_help_ends_in_a_command_that_parses(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "cell.csv").touch()  # the journal that an example takes back in
+def test_every_help_ends_in_a_command_that_works(
+    verb: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if verb in ("run", "simulate"):
+        pytest.importorskip("mujoco")
+    makes_its_own = {"run", "train"}
+    for file in () if verb in makes_its_own else folder.iterdir():
+        shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
     program, named, *words = example_of(verb)
     assert (program, named) == ("dengine", verb)
+    succeed(named, *words)
+
+
+def test_the_programs_own_example_parses() -> None:
+    program, verb, *words = shlex.split(succeed("--help").rstrip().splitlines()[-1])
+    assert program == "dengine"
     with click.Context(main) as parent:
         main.commands[verb].make_context(verb, words, parent=parent)  # UsageError for an option that does not exist
 
@@ -108,8 +138,24 @@ def test_every_help_ends_in_a_command_that_parses(verb: str, tmp_path: Path, mon
 def test_every_verb_speaks_json_and_explains_each_option(verb: str) -> None:
     options = [p for p in main.commands[verb].params if isinstance(p, click.Option)]
     assert "--json" in {name for option in options for name in option.opts}
-    unexplained = {o.name for o in options if not o.help} - {"kind", "cycles"}  # these two say it all by name and default
-    assert not unexplained
+    assert not {option.name for option in options if not option.help}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_h_is_help(verb: str) -> None:
+    assert succeed(verb, "-h") == succeed(verb, "--help")
+
+
+def test_h_lists_every_verb_with_its_whole_sentence() -> None:
+    shown = succeed("-h")
+    assert shown == succeed("--help")
+    assert all(f"  {verb} " in shown for verb in VERBS)
+    assert not [line for line in shown.splitlines()[1:] if line.endswith("...")]
+
+
+def test_python_m_dengine_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "dengine", "-h"], check=True, capture_output=True, text=True)
+    assert done.stdout == succeed("-h").replace("Usage: main", "Usage: dengine")
 
 
 def test_replay_prints_a_table_and_writes_csv_and_pictures(data: Path, tmp_path: Path) -> None:
@@ -179,6 +225,7 @@ def test_the_same_file_twice_counts_no_label_twice(trained: Path, data: Path) ->
     again = document("train", "--data", data, "--store", trained)
     assert again["import"] == {"imported": 0, "quarantined": 0, "known": 160, "resumed": True}
     assert document("status", trained)["labels"] == 160
+    assert "Nothing new" in succeed("train", "--data", data, "--store", trained)
 
 
 def test_bad_traces_are_kept_and_never_trained_on(data: Path) -> None:
@@ -303,3 +350,246 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(
 )
 def test_a_wrong_call_is_exit_code_2(words: list[str]) -> None:
     assert dengine(*words).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--repeats", "2"],
+        ["compare", "--data", "DATA", "--reducers", "a_recipe_of_a_rather_long_name.toml,pca", "--repeats", "1"],
+        ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--cycles", "150"],
+        ["status", "STORE"],
+    ],
+)
+def test_what_a_verb_prints_fits_80_columns_uncut(
+    words: list[str], data: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a_recipe_of_a_rather_long_name.toml").write_text('reducer = "pca"\n')
+    shutil.copy(trained, tmp_path / "engine.db")
+    monkeypatch.chdir(tmp_path)
+    known = {"DATA": str(data), "STORE": "engine.db"}
+    out = succeed(*(known.get(word, word) for word in words))
+    assert max(map(len, out.splitlines())) <= WIDE == 80
+    assert "\u2026" not in out  # how rich marks what it has cut
+
+
+def test_the_caption_says_in_words_what_its_letters_mean(data: Path) -> None:
+    out = " ".join(succeed("replay", "--data", data, "--reducer", "pca", "--repeats", 1, "--cycles", 60).split())
+    for words in (
+        "FP (bad parts accepted)",
+        "FN (good parts rejected)",
+        "precision: the share of accepted parts that were good",
+        "NPV, below it: the share of rejected parts that were bad",
+        "pooled, that is, counted over the parts of all replays together",
+    ):
+        assert words in out
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(1.8e-4, "180 µs"), (0.0046, "4.6 ms"), (0.352, "352 ms"), (4.61, "4.6 s")])
+def test_times_are_as_a_person_writes_them(seconds: float, said: str) -> None:
+    assert duration(seconds) == said
+
+
+@pytest.mark.parametrize(("n_bytes", "said"), [(812, "812 B"), (296_123, "296 kB"), (1.4e6, "1.4 MB"), (4.4e9, "4.4 GB")])
+def test_sizes_are_as_a_person_writes_them(n_bytes: float, said: str) -> None:
+    assert size(n_bytes) == said
+
+
+@pytest.mark.parametrize(
+    "words", [["run", "--cycles", "3", "--store", "e.db"], ["simulate", "--n", "3", "--out", "traces.npz"]]
+)
+def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(name: str, package: str | None = None) -> object:
+        return None if name == "mujoco" else find_spec(name, package)
+
+    monkeypatch.setattr("dengine.cli.options.find_spec", without)
+    monkeypatch.chdir(tmp_path)
+    result = dengine(*words)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert 'pip install "dengine[sim]"' in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recording_runs_without_mujoco(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dengine.cli.options.find_spec", lambda name: None)
+    succeed("run", "--cell", "replay", "--data", data, "--reducer", "pca", "--cycles", 5)
+
+
+OWN_REDUCER = """
+from sklearn.base import BaseEstimator, TransformerMixin
+
+class FirstAndLast(TransformerMixin, BaseEstimator):
+    def fit(self, X, y=None):
+        self.n_features_in_ = X.shape[1]
+        return self
+    def transform(self, X):
+        return X[:, [0, -1]]
+"""
+
+
+def in_folder(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """A fresh process of the installed command, which has no folder of its own in the path as `python -m` has."""
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; sys.path = [p for p in sys.path if p]; from dengine.cli import main; main()",
+    ]
+    return subprocess.run([*command, *map(str, words)], cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_a_reducer_of_this_folder_is_found_and_named_safely(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN_REDUCER)
+    words = ["--data", data, *POLICY, "--repeats", 2, "--cycles", 100, "--out", "out", "--json"]
+    done = in_folder(tmp_path, "compare", "--reducers", "pca,mine:FirstAndLast", *words, "--n-jobs", 2)
+    assert done.returncode == 0, done.stderr
+    rows = {row["recipe"]: row for row in json.loads(done.stdout)["rows"]}
+    assert list(rows) == ["pca", "FirstAndLast"]
+    assert rows["FirstAndLast"]["certain"] > 0
+    assert (tmp_path / "out" / "map_FirstAndLast.png").is_file()
+
+
+def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN_REDUCER)
+    done = in_folder(tmp_path, "train", "--data", data, "--store", "e.db", "--reducer", "mine:FirstAndLast")
+    assert done.returncode == 0, done.stderr
+    assert "FirstAndLast answers" in done.stdout
+    assert "mine:FirstAndLast" in in_folder(tmp_path, "status", "e.db").stdout
+
+
+def test_a_module_of_this_folder_shadows_nothing(tmp_path: Path) -> None:
+    (tmp_path / "joblib.py").write_text("raise RuntimeError('shadowed')\n")
+    done = in_folder(tmp_path, "replay", "--reducer", "pca", "--repeats", 1, "--cycles", 20)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_reducer_that_is_not_there_makes_no_store(data: Path, tmp_path: Path) -> None:
+    words = ["run", "--cell", "replay", "--data", data, "--store", tmp_path / "e.db", "--cycles", 5]
+    result = dengine(*words, "--reducer", "nowhere:Nothing")
+    assert result.exit_code == 1
+    assert "nowhere:Nothing" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_compare_refuses_two_of_one_name() -> None:
+    result = dengine("compare", "--reducers", "pca,pca")
+    assert result.exit_code == 2
+    assert "pca, pca" in result.stderr
+
+
+class HalfHalf:
+    """A rival that is never certain."""
+
+    def fit(self, X: np.ndarray, y: np.ndarray) -> None: ...
+    def add(self, x: np.ndarray, y: int) -> None: ...
+    def count(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(X), int), np.zeros(len(X), int)
+
+    def predict_interval(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(X)), np.ones(len(X))
+
+    def decide(self, X: np.ndarray) -> list[str]:
+        return ["verify"] * len(X)
+
+
+def test_status_of_a_handed_in_model_names_it_and_shows_no_number_without_effect(tmp_path: Path) -> None:
+    with DataEngine(model=HalfHalf(), store=tmp_path / "e.db") as engine:
+        engine.decide(np.linspace(0, 1, 40))
+    out = succeed("status", tmp_path / "e.db")
+    assert "HalfHalf, decides by its own rule" in out
+    assert not {"reducer", "policy", "rule", "neighbours"} & {line.split()[1] for line in out.splitlines() if "│" in line}
+
+
+def test_status_says_what_the_engine_decides_by(trained: Path) -> None:
+    out = succeed("status", trained)
+    for said in ("alpha 0.2, LB 80 %", "local", "radius of 0.2", "every 50 new labels", "450 ms", "40 samples at 500 Hz"):
+        assert said in out
+
+
+def interrupted(folder: Path, ready: str, *words: object) -> tuple[int, str, str]:
+    """A real process that gets SIGINT once `ready` is in its folder: exit code, stdout, stderr."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dengine", *map(str, words)],
+        cwd=folder,
+        env=os.environ | {"COLUMNS": "80"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until = time.monotonic() + 60
+    while not (folder / ready).exists() and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    return process.returncode, out, err
+
+
+SIGNALLING_REDUCER = """
+from pathlib import Path
+from sklearn.decomposition import PCA
+
+class Slow(PCA):
+    def fit(self, X, y=None):
+        seen = len(list(Path().glob("fit_*")))
+        Path(f"fit_{seen}").touch()
+        return super().fit(X, y)
+"""
+
+
+def test_an_interrupted_replay_reports_what_was_finished(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(SIGNALLING_REDUCER)
+    words = ["--reducer", "mine:Slow", *POLICY, "--cycles", 120, "--repeats", 5000, "--out", "out"]
+    code, out, err = interrupted(tmp_path, "fit_9", "replay", "--data", data, *words)
+    assert code == INTERRUPTED
+    finished = int(re.search(r"Interrupted: (\d+) of 5000 replays were finished; the table shows those\.", err)[1])
+    assert finished >= 1
+    assert f"{finished} replay" in out
+    assert len((tmp_path / "out" / "replays.csv").read_text().splitlines()) == 1 + finished
+    assert (tmp_path / "out" / "curves.png").is_file()
+
+
+def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, tmp_path: Path) -> None:
+    long = tmp_path / "long.npz"
+    with np.load(data) as file:
+        noise = np.random.default_rng(0).normal(0, 0.1, (200 * len(file["y"]), file["X"].shape[1]))
+        np.savez(long, X=np.tile(file["X"], (200, 1)) + noise, y=np.tile(file["y"], 200))
+    (tmp_path / "mine.py").write_text(SIGNALLING_REDUCER)
+    words = ["--data", long, "--cycles", 30000, "--store", "e.db", "--reducer", "mine:Slow", "--lower-bound", "0.99"]
+    code, out, err = interrupted(tmp_path, "fit_1", "run", "--cell", "replay", *words)
+    assert code == INTERRUPTED
+    done = int(re.search(r"Interrupted: (\d+) of 30000 cycles were done", err)[1])
+    assert f"Everything up to cycle {done} is in e.db; the same command with --cycles {30000 - done}" in err
+    assert f"1 to {done}" in out
+    assert document("status", tmp_path / "e.db")["decisions"] == done > 0
+
+
+def test_an_interrupted_import_says_how_far_it_came(data: Path, tmp_path: Path) -> None:
+    X = np.random.default_rng(0).normal(size=(60_000, 40)).astype(np.float32)
+    np.savez(tmp_path / "many.npz", X=X, y=np.arange(len(X)) % 2)
+    code, _, err = interrupted(tmp_path, "e.db", "train", "--data", "many.npz", "--store", "e.db", "--reducer", "pca")
+    assert code == INTERRUPTED
+    done = int(re.search(r"Interrupted: (\d+) of 60000 traces are in e\.db; the same command goes on", err)[1])
+    assert document("status", tmp_path / "e.db")["labels"] == done
+
+
+def test_an_import_that_was_interrupted_in_training_keeps_its_retrains(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dengine.engine import DataEngine as Engine
+
+    retrain = Engine.retrain
+
+    def pressed(engine: Engine) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return retrain(engine)
+
+    monkeypatch.setattr(Engine, "retrain", pressed)
+    result = dengine("train", "--data", data, "--store", tmp_path / "e.db", "--reducer", "conv")
+    assert result.exit_code == INTERRUPTED
+    assert "Imported 160 labelled traces" in result.stdout
+    assert "Interrupted after 1 of at most 10 retrains" in result.stderr
+    assert document("status", tmp_path / "e.db")["last_version"] == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,16 +1,19 @@
 """Recorded streams through the same loop: exact under a seed, and counted right."""
 
+from contextlib import suppress
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from sklearn.decomposition import PCA
 
-from dengine import Action, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
+from dengine import Action, DataEngine, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
 from dengine.errors import DataError, SettingError
-from dengine.experiments.grid import run_replays
+from dengine.experiments.grid import name_of, run_replays
+from dengine.experiments.live import RunLog, RunRecorder, watch
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
-TIMES = ("decide_seconds", "retrain_seconds", "retrains")
+TIMES = ("decide_seconds", "retrains")
 
 
 def same(one: Replay, other: Replay) -> None:
@@ -103,7 +106,82 @@ def test_progress_is_told_cycle_by_cycle(data: Dataset) -> None:
     assert seen == list(range(1, 21))
 
 
+# ------------------------------------------------------------------------------------------------------- records
+
+
+class Silent:
+    """A cell as real ones are: it tells nothing but what it is asked for."""
+
+    def __init__(self, cell: ReplayCell) -> None:
+        self.insert, self.verify, self.proceed, self.reject = cell.insert, cell.verify, cell.proceed, cell.reject
+
+
+class Broken(ReplayCell):
+    """Someone presses Ctrl-C while part 31 is inserted."""
+
+    def insert(self):
+        if self.position == 29:
+            raise KeyboardInterrupt
+        return super().insert()
+
+
+def engine() -> DataEngine:
+    return DataEngine.from_recipe(RECIPE, seed=1, replaying=True)
+
+
+@pytest.fixture(scope="module")
+def order(data: Dataset) -> np.ndarray:
+    return np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
+
+
+def test_a_live_run_and_a_replay_of_the_same_parts_keep_the_same_record(data: Dataset, played: Replay, order) -> None:
+    log = watch(engine(), ReplayCell(data, order), 200)
+    for f in fields(RunLog):
+        if f.name not in TIMES:
+            np.testing.assert_array_equal(getattr(log, f.name), getattr(played, f.name), err_msg=f.name)
+    assert played.stretches(4) == log.stretches(4)
+
+
+def test_what_a_cell_does_not_tell_stays_unknown(data: Dataset, played: Replay, order) -> None:
+    log = watch(engine(), Silent(ReplayCell(data, order)), 200)
+    told = log.verified | log.stopped
+    assert 0 < told.sum() < 200
+    np.testing.assert_array_equal(log.truth[told], played.truth[told])
+    assert np.isnan(log.truth[~told]).all()
+    assert log.clock_s is None
+
+
+def test_a_run_that_is_broken_off_hands_over_what_was_finished(data: Dataset, played: Replay, order) -> None:
+    recorder = RunRecorder(Broken(data, order))
+    with suppress(KeyboardInterrupt):
+        recorder.follow(engine(), 200)
+    np.testing.assert_array_equal(recorder.log().action, played.action[:30])
+    assert recorder.log().summary()["last_cycle"] == 30
+
+
+def test_a_run_of_no_cycle_has_an_empty_record(data: Dataset) -> None:
+    log = watch(engine(), ReplayCell(data), 0)
+    assert (len(log), log.position.shape, log.stretches(6), log.retrain_seconds.shape) == (0, (0, 2), [], (0,))
+    row = log.summary()
+    assert (row["first_cycle"], row["last_cycle"], row["verified"], row["parts_per_hour"]) == (1, 0, 0, None)
+
+
+def test_a_run_is_told_cycle_by_cycle(data: Dataset) -> None:
+    seen: list[int] = []
+    watch(engine(), ReplayCell(data), 5, on_cycle=lambda cycle: seen.append(cycle.index))
+    assert seen == [0, 1, 2, 3, 4]
+
+
 # --------------------------------------------------------------------------------------------------------- grids
+
+
+def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(RECIPE.to_toml(), encoding="utf-8")
+    asked = ["paper", str(path), path, RECIPE, PCA(2), "sklearn.decomposition:PCA", Recipe(PCA(2))]
+    names = ["paper", "mine", "mine", "pca", "PCA", "sklearn.decomposition:PCA", "PCA"]
+    assert [name_of(recipe) for recipe in asked] == names
+    assert replay(data, PCA(2), cycles=30).summary()["recipe"] == "PCA"
 
 
 def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:

@@ -22,10 +22,11 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
+from dengine.cli.output import duration
 from dengine.traces import as_traces
 
-REFERENCES = 1503
 BUDGET = 0.45
+WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 
 
 def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
@@ -90,7 +91,7 @@ def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[np.ndarra
             trace, version = cell.insert(), engine.version
             begin = time.perf_counter()
             engine.decide(trace)
-            if i > 100:  # the pool starts its worker on the first
+            if i > WARM_UP * len(data):  # the pool starts its worker on the first
                 (seconds if engine.version == version else swapping).append(time.perf_counter() - begin)
             time.sleep(0.002)  # a cell does other things between two parts
         engine.close()
@@ -116,31 +117,41 @@ def umap_times(data: Dataset, repeats: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def row(name: str, seconds: np.ndarray, target: float | None = None) -> dict[str, Any]:
-    """One line of the table, in milliseconds."""
-    p50, p99, worst = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0])
+    """One line of the table, in milliseconds; NaN where it never happened, as a swap within few cycles."""
+    p50, p99, worst = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0]) if len(seconds) else np.full(3, np.nan)
     limit = None if target is None else 1e3 * target
     return {"what": name, "n": len(seconds), "median": p50, "p99": p99, "worst": worst, "target": limit, "unit": "ms"}
 
 
 def ratio(name: str, slow: np.ndarray, fast: np.ndarray, target: float) -> dict[str, Any]:
     """A ratio of medians, and at its worst: the fastest of the slow against the slowest of the fast."""
-    middle, worst = np.median(slow) / np.median(fast), slow.min() / fast.max()
+    middle = worst = np.nan
+    if len(slow) and len(fast):
+        middle, worst = np.median(slow) / np.median(fast), slow.min() / fast.max()
     return {"what": name, "n": len(slow), "median": middle, "p99": np.nan, "worst": worst, "target": target, "unit": "x"}
+
+
+def written(value: float | None, unit: str) -> str:
+    """A cell of the table as a person writes it."""
+    if value is None or np.isnan(value):
+        return ""
+    return duration(value / 1e3) if unit == "ms" else f"{value:.0f} {unit}"
 
 
 def show(rows: list[dict[str, Any]], deciding: dict[str, np.ndarray], out: Path) -> None:
     """Table on the screen, CSV and picture in `out`."""
     out.mkdir(parents=True, exist_ok=True)
     pd.DataFrame(rows).to_csv(out / "benchmark_cycle.csv", index=False)
-    table = Table("what", "n", "median", "p99", "worst", "target", "unit", title="A cycle's times")
+    table = Table("what", "n", "median", "p99", "worst", "target", title="A cycle's times")
     for r in rows:
-        numbers = (f"{r[key]:.3g}" if pd.notna(r[key]) else "" for key in ("median", "p99", "worst", "target"))
-        table.add_row(r["what"], str(r["n"]), *numbers, r["unit"])
+        numbers = (written(r[key], r["unit"]) for key in ("median", "p99", "worst", "target"))
+        table.add_row(r["what"], str(r["n"]), *numbers)
     Console(width=110).print(table)
     figure = Figure(figsize=(8, 4.5), layout="constrained")
     axes = figure.subplots()
     for name, seconds in deciding.items():
-        axes.ecdf(1e3 * seconds, label=name)
+        if len(seconds):
+            axes.ecdf(1e3 * seconds, label=name)
     axes.set(xscale="log", xlabel="wall time of one call (ms)", ylabel="share of calls", title="Deciding on one trace")
     axes.legend()
     figure.savefig(out / "benchmark_cycle.png", dpi=150)
@@ -149,13 +160,13 @@ def show(rows: list[dict[str, Any]], deciding: dict[str, np.ndarray], out: Path)
 def main() -> None:
     """Parse, measure, show."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion")
-    parser.add_argument("--samples", type=int)
-    parser.add_argument("--recipe", default="conv")
-    parser.add_argument("--replays", type=int, default=30)
+    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, or module:Class")
+    parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
-    parser.add_argument("--umap-repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
     args = parser.parse_args()
     data = load_dataset(args.data, args.samples)
     show(*measure(data, args), args.out)

@@ -4,7 +4,7 @@
 
 Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
 parity over every trace of the data set and random ones, bad ones and audits among them; damaged files, each of which
-must be refused. Ends with exit code 1 where a decision differs or a damaged file is taken.
+must be refused. Ends with exit code 1 where a decision differs or a damaged file is not refused.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from rich.progress import track
 from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
+from dengine.cli.output import duration, size
 from dengine.errors import ExportError
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx, load_onnx
@@ -154,26 +155,33 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
     first = microseconds(exported.decide, known, 1)[0]
     audits = sum(d.audit for d in expected)
     rows = [
-        Finding("file size", file.stat().st_size / 1e3, "kB", "< 1000"),
+        Finding("file size", file.stat().st_size / 1e3, "kB", "< 1 MB"),
         Finding("decisions compared", len(X), ""),
         Finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
         Finding("of them audits", audits, ""),
         Finding("Python differs in", differing(exported.decide_many(X), expected), "", "0"),
-        Finding("first call after loading", first, "µs", "<= 1000"),
-        *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150", "<= 500")),
+        Finding("first call after loading", first, "µs", "<= 1 ms"),
+        *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")),
     ]
     if args.cell is not None:
         wrong, _ = ask_cell(args.cell, file, X, expected)
         times = 1 + args.calls // len(known)
         _, taken = ask_cell(args.cell, file, np.concatenate([known] * times), expected[: len(known)] * times)
-        rows += [Finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120", "<= 400"))]
+        rows += [Finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
         model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
         rows.append(Finding("onnxruntime differs in", differing(runtime.decide_many(X), model.decide_many(X)), ""))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
-    refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
-    return [*rows, Finding(f"taken of {args.damaged} damaged files", refused, "", "0")]
+    not_refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
+    return [*rows, Finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
+
+
+def written(row: Finding) -> tuple[str, str]:
+    """Value and unit as a person writes them."""
+    text = {"µs": lambda v: duration(v / 1e6), "kB": lambda v: size(1e3 * v)}.get(row.unit, "{:,.0f}".format)(row.value)
+    value, _, unit = text.partition(" ")
+    return value, unit
 
 
 def main() -> None:
@@ -181,13 +189,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
     parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
-    parser.add_argument("--retrains", type=int, default=3)
+    parser.add_argument("--retrains", type=int, default=3, help="at most, each within the recipe's budget")
     parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
     parser.add_argument("--calls", type=int, default=5000, help="calls timed")
     parser.add_argument("--damaged", type=int, default=500, help="damaged files tried")
     parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")
-    parser.add_argument("--no-onnx", dest="onnx", action="store_false")
-    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--no-onnx", dest="onnx", action="store_false", help="leave onnxruntime out")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "damaged").mkdir()
@@ -196,7 +204,7 @@ def main() -> None:
     pd.DataFrame(rows).to_csv(args.out / "benchmark_export.csv", index=False)
     table = Table("what", "value", "unit", "target", title=f"Exported decision: {args.reducer} on {args.data}")
     for row in rows:
-        table.add_row(row.what, f"{row.value:,.0f}", row.unit, row.target)
+        table.add_row(row.what, *written(row), row.target)
     Console(width=None if sys.stdout.isatty() else 100).print(table)
     sys.exit(any(row.target == "0" and row.value > 0 for row in rows))
 

@@ -133,10 +133,10 @@ def report_shortcuts(data: Dataset) -> str:
 
 
 @click.command()
-@click.option("--data", default="insertion", help="A data set's name or an .npz file.")
-@click.option("--steps", default=0, help="Insertions to simulate at half the time step; 0 leaves that out.")
-@click.option("--seed", default=0, help="Seed of those insertions.")
-@click.option("--jobs", default=-1, help="Processes, as joblib counts them.")
+@click.option("--data", default="insertion", show_default=True, help="A bundled set, or an .npz file with X and y.")
+@click.option("--steps", default=0, show_default=True, help="Insertions to simulate at half the time step; 0: none.")
+@click.option("--seed", default=0, show_default=True, help="Seed of those insertions, an integer.")
+@click.option("--jobs", default=-1, show_default=True, help="Processes; -1: one a core.")
 def main(data: str, steps: int, seed: int, jobs: int) -> None:
     """Print hardness, shortcuts and the time-step check, as in the data set's card."""
     traces = load_dataset(data)

@@ -10,6 +10,7 @@ import argparse
 from pathlib import Path
 
 from dengine import DataEngine, Recipe, export_torchscript, load_dataset
+from dengine.cli.output import size
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx
 from dengine.importing import import_labelled, train_until_done
@@ -34,13 +35,14 @@ def main() -> None:
     parser.add_argument("--store", help="a trained engine's store, instead of --data")
     parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
     parser.add_argument("--retrains", type=int, default=10, help="at most, each within the recipe's budget")
-    parser.add_argument("--format", choices=FORMATS, default="torchscript")
-    parser.add_argument("--out", type=Path, default=Path("model.ts"))
+    parser.add_argument("--format", choices=FORMATS, default="torchscript", help="onnx only decides")
+    parser.add_argument("--out", type=Path, default=Path("model.ts"), help="the file; its .sha256 beside it")
     args = parser.parse_args()
     recipe = Recipe.load(args.reducer)
     with DataEngine.open(args.store) if args.store else trained(args.data, recipe, args.retrains) as engine:
         path = FORMATS[args.format](engine, args.out)
-        print(f"{path}: {path.stat().st_size:,} bytes, {len(engine.model.index)} references; sum in {sum_file(path).name}")
+        about = f"{size(path.stat().st_size)}, {len(engine.model.index)} labelled references"
+        print(f"Wrote {path} ({about}) and {sum_file(path).name}.")
 
 
 if __name__ == "__main__":

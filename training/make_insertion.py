@@ -252,10 +252,12 @@ def write_card(out: Path, steps: int, jobs: int) -> str:
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("dengine/data"), help="Folder to write to.")
-@click.option("--seed", default=SEED, show_default=True, help="Seed of the simulated cell.")
-@click.option("--steps", default=200, help="Insertions to repeat at half the time step.")
-@click.option("--jobs", default=-1, help="Processes, as joblib counts them.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("dengine/data"), show_default=True, help="Folder to write to."
+)
+@click.option("--seed", default=SEED, show_default=True, help="Seed of the simulated cell, an integer.")
+@click.option("--steps", default=200, show_default=True, help="Insertions to repeat at half the time step.")
+@click.option("--jobs", default=-1, show_default=True, help="Processes; -1: one a core.")
 @click.option("--card-only", is_flag=True, help="Keep the traces that are there; measure and draw them anew.")
 def main(out: Path, seed: int, steps: int, jobs: int, card_only: bool) -> None:
     """Write insertion.npz, insertion.md and the card's pictures."""

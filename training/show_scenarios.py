@@ -18,41 +18,14 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from dengine import DataEngine, Outcome, Recipe, SimulatedCell
-from dengine.cells.simulation.parameters import RATE_HZ
-from dengine.cells.simulation.scenarios import SCENARIOS
+from dengine import DataEngine, Recipe, SimulatedCell
+from dengine.cells.simulation.parameters import RATE_HZ, CellParameters
+from dengine.cells.simulation.scenarios import SCENARIOS, find_scenario
 from dengine.experiments.live import RunLog, watch
+from dengine.experiments.look import BAD, GOOD, LIMIT, SMALL, draw_errors, draw_verified, plain, save
 
-COLOURS = {1.0: "#0072B2", 0.0: "#D55E00"}  # good, bad
-
-
-class Recorded:
-    """A cell that keeps every trace it gave."""
-
-    def __init__(self, cell: SimulatedCell) -> None:
-        self.cell = cell
-        self.traces: list[np.ndarray] = []
-
-    @property
-    def truth(self) -> bool:
-        return self.cell.truth
-
-    @property
-    def clock(self) -> float:
-        return self.cell.clock
-
-    def insert(self) -> np.ndarray:
-        self.traces.append(np.asarray(self.cell.insert()))
-        return self.traces[-1]
-
-    def verify(self) -> bool:
-        return self.cell.verify()
-
-    def proceed(self) -> Outcome:
-        return self.cell.proceed()
-
-    def reject(self) -> None:
-        self.cell.reject()
+WINDOW = 100  # cycles
+CHANGES = {"wear": "wear begins to grow", "variant": "the new variant comes", "bias_jump": "the offset jumps"}
 
 
 @dataclass(frozen=True)
@@ -66,9 +39,16 @@ class Run:
 
 def run(scenario: str, cycles: int, recipe: Recipe, seed: int) -> Run:
     """One live run from the first part."""
-    cell = Recorded(SimulatedCell(scenario=scenario, seed=seed, cycles=cycles))
-    log = watch(DataEngine.from_recipe(recipe, seed=seed, replaying=True), cell, cycles)
-    return Run(scenario, np.stack(cell.traces), log)
+    cell, traces = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), []
+    engine = DataEngine.from_recipe(recipe, seed=seed, replaying=True)
+    log = watch(engine, cell, cycles, on_cycle=lambda cycle: traces.append(cell.last.trace))
+    return Run(scenario, np.stack(traces), log)
+
+
+def first_change(scenario: str, cycles: int) -> int | None:
+    """The number, from 1, of the first cycle that is not as at the beginning; None where nothing changes."""
+    as_usual, change = CellParameters(), find_scenario(scenario)
+    return next((i + 1 for i in range(cycles) if change(as_usual, i, cycles) != as_usual), None)
 
 
 def draw_force(axes: Axes, one: Run) -> None:
@@ -76,66 +56,70 @@ def draw_force(axes: Axes, one: Run) -> None:
     n = len(one.log)
     time_s = np.arange(one.traces.shape[1]) / RATE_HZ
     for when, part, style in (("first quarter", slice(n // 4), ":"), ("last quarter", slice(n - n // 4, n), "-")):
-        for label, name in ((1.0, "good"), (0.0, "bad")):
+        for label, name, colour in ((1.0, "good", GOOD), (0.0, "bad", BAD)):
             mine = one.traces[part][one.log.truth[part] == label]
-            axes.plot(time_s, np.median(mine, axis=0), style, color=COLOURS[label], label=f"{name}, {when}")
-    axes.set(title=one.scenario, xlabel="time (s)")
+            if len(mine):
+                axes.plot(time_s, np.median(mine, axis=0), style, color=colour, label=f"{name} parts, {when}")
+    axes.set(title=one.scenario, xlabel="time [s]")
 
 
-def draw_engine(top: Axes, bottom: Axes, one: Run, window: int = 100) -> None:
-    """Share of verified parts over the last `window` cycles; wrong decisions so far."""
-    kernel = np.ones(window) / window
-    cycle = np.arange(window, len(one.log) + 1)
-    top.plot(cycle, 100 * np.convolve(one.log.verified, kernel, "valid"), color="0.2")
-    top.set(ylim=(0, 105))
-    bottom.plot(np.cumsum(one.log.false_positive), color=COLOURS[0.0], label="bad part accepted")
-    bottom.plot(np.cumsum(one.log.false_negative), "--", color=COLOURS[1.0], label="good part rejected")
-    bottom.set(xlabel="cycle")
+def draw_change(top: Axes, bottom: Axes, one: Run) -> None:
+    """The moment from which on the cell is another one, in both panels."""
+    cycle = first_change(one.scenario, len(one.log))
+    if cycle is None:
+        return
+    for axes in (top, bottom):
+        axes.axvline(cycle, **LIMIT)
+    top.text(cycle, 1.01, CHANGES[one.scenario], transform=top.get_xaxis_transform(), fontsize=SMALL, va="bottom")
 
 
 def picture(runs: list[Run]) -> Figure:
     """A column a scenario: force, verified share, errors."""
-    figure = Figure(figsize=(4 * len(runs), 8), layout="constrained")
+    figure = Figure(figsize=(4 * len(runs), 9), layout="constrained")
     grid = figure.subplots(3, len(runs), sharey="row", squeeze=False)
-    for column, one in enumerate(runs):
-        draw_force(grid[0, column], one)
-        draw_engine(grid[1, column], grid[2, column], one)
-    for axes, name in zip(
-        grid[:, 0], ("simulated z-force (N)", "verified, last 100 (%)", "errors so far (parts)"), strict=True
-    ):
+    for (force, verified, errors), one in zip(grid.T, runs, strict=True):
+        draw_force(force, one)
+        draw_verified(verified, one.log.verified, WINDOW)
+        draw_errors(errors, one.log.false_positive, one.log.false_negative)
+        draw_change(verified, errors, one)
+        errors.set(xlabel="cycle")
+    for axes in grid.flat:
+        plain(axes)
+    names = ("simulated z-force [N]", f"verified, last {WINDOW} [%]", "errors so far [parts]")
+    for axes, name in zip(grid[:, 0], names, strict=True):
         axes.set_ylabel(name)
-    grid[0, 0].legend(fontsize=8)
-    grid[2, 0].legend(fontsize=8)
+    handles = [each for axes in (grid[0, 0], grid[2, 0]) for each in axes.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     figure.suptitle("Simulated cell: what changes in the force, and what the engine does")
     return figure
+
+
+def table_of(runs: list[Run]) -> Table:
+    """What happened, a row a quarter."""
+    table = Table("scenario", "cycles", "verified", "accepted", "bad ones", "rejected", "good ones", title="simulated")
+    for one in runs:
+        for row in one.log.stretches(4):
+            counts = (row[name] for name in ("accepted", "false_positive", "rejected", "false_negative"))
+            cycles = f"{row['first_cycle']} to {row['last_cycle']}"
+            table.add_row(one.scenario, cycles, f"{row['verified_share']:.0%}", *map(str, counts))
+    return table
 
 
 def main() -> None:
     """Parse, run, draw, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cycles", type=int, default=800)
-    parser.add_argument("--recipe", default="conv")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--n-jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/scenarios.png"))
+    parser.add_argument("--cycles", type=int, default=800, help="parts in each run (default: 800)")
+    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file (default: conv)")
+    parser.add_argument("--seed", type=int, default=0, help="of the cell and of the engine (default: 0)")
+    parser.add_argument("--n-jobs", type=int, default=2, help="scenarios at a time (default: 2)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs/scenarios.png"), help="the picture to write (default: docs/scenarios.png)"
+    )
     args = parser.parse_args()
     recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
     runs = Parallel(n_jobs=args.n_jobs)(delayed(run)(s, args.cycles, recipe, args.seed) for s in SCENARIOS)
-    table = Table("scenario", "cycles", "verified", "accepted", "bad ones", "rejected", "good ones", title="simulated")
-    for one in runs:
-        for row in one.log.stretches(4):
-            table.add_row(
-                one.scenario,
-                f"{row['first_cycle']} to {row['last_cycle']}",
-                f"{row['verified_share']:.0%}",
-                str(row["accepted"]),
-                str(row["false_positive"]),
-                str(row["rejected"]),
-                str(row["false_negative"]),
-            )
-    Console(width=120).print(table)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    picture(runs).savefig(args.out, dpi=80)
+    Console(width=120).print(table_of(runs))
+    save(picture(runs), args.out, dpi=80)
 
 
 if __name__ == "__main__":

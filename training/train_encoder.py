@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from dengine.model.factory import model_of
 from rich.console import Console
 from rich.table import Table
 from torchmetrics import MetricCollection
 from torchmetrics.classification import BinaryAccuracy, BinaryAUROC, BinaryCalibrationError
 
 from dengine import Dataset, ModelPrediction, Recipe, export_torchscript, load_dataset
+from dengine.cli.output import duration
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.traces import as_traces
@@ -36,7 +36,7 @@ def train(model: ModelPrediction, data: Dataset, steps: int) -> list[dict[str, f
     history = []
     for step in range(steps):
         begin = time.perf_counter()
-        model.fit(X, y, stop=StopRule(max_steps=1))
+        model.train(X, y, stop=StopRule(max_steps=1))
         seconds = time.perf_counter() - begin
         scores = torch.from_numpy(model.spaces.embed_own(X, folds)[:, 0].copy())  # (n,) P(success), out of fold
         metrics.reset()
@@ -71,19 +71,19 @@ It decides on traces like those of `{data.name}` and on nothing else; see that s
 def main() -> None:
     """Parse, train, show, save."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion")
-    parser.add_argument("--samples", type=int)
-    parser.add_argument("--recipe", default="conv")
-    parser.add_argument("--steps", type=int, default=15)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("models/conv"))
+    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, of conv or rocket")
+    parser.add_argument("--steps", type=int, default=15, help="optimiser steps of every head, at most")
+    parser.add_argument("--seed", type=int, default=0, help="of the encoder, an integer")
+    parser.add_argument("--out", type=Path, default=Path("models/conv"), help="folder for model.ts and card.md")
     args = parser.parse_args()
     data, recipe = load_dataset(args.data, args.samples), Recipe.load(args.recipe)
-    model = model_of(recipe, args.seed)
+    model = ModelPrediction.from_recipe(recipe, args.seed)
     history = train(model, data, args.steps)
     table = Table(*history[0], title=f"{args.recipe} on {data.name}: held-out figures, step by step")
     for row in history:
-        table.add_row(*(f"{value:.4g}" for value in row.values()))
+        table.add_row(*(duration(value) if name == "seconds" else f"{value:.4g}" for name, value in row.items()))
     Console().print(table)
     args.out.mkdir(parents=True, exist_ok=True)
     export_torchscript(model, args.out / "model.ts")

@@ -7,6 +7,8 @@ Only click is imported before a verb is known, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 
 import click
@@ -14,6 +16,8 @@ import click
 from .. import __version__
 from ..errors import DengineError
 from .export import export, import_labels
+from .interrupting import end_interrupted
+from .options import example
 from .replaying import compare, replay
 from .running import run
 from .simulating import simulate
@@ -26,18 +30,36 @@ class Verbs(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the verb."""
+        _find_own_modules()
         try:
             return super().invoke(ctx)
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
         except (DengineError, OSError) as error:
             raise click.ClickException(" ".join(str(error).split())) from error
+        except KeyboardInterrupt:
+            end_interrupted("Interrupted.")
 
 
-@click.group(cls=Verbs, epilog="\b\nExample:\n  dengine replay --data insertion --reducer conv --repeats 3")
+def _find_own_modules() -> None:
+    """Let `module:Class` name a module of the current folder; last in the path, so that it shadows nothing."""
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+
+
+@click.group(
+    cls=Verbs,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=example("dengine replay --data insertion --reducer conv --repeats 3"),
+)
 @click.version_option(__version__, prog_name="dengine", message="%(prog)s %(version)s")
 def main() -> None:
-    """Let a robot cell start on its slow check, and earn its way off it."""
+    """Let a robot cell start on its slow check, and earn its way off it.
+
+    Exit codes: 0 done; 1 it failed, and one line says why; 2 a wrong call; 130 interrupted by Ctrl-C, what was done
+    until then is kept and shown.
+    """
 
 
 for verb in (replay, compare, train, run, simulate, status, export, import_labels):

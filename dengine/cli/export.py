@@ -8,13 +8,16 @@ from pathlib import Path
 import click
 
 from .options import example, json_option
-from .output import show, write_json
+from .output import imported_line, show, size, write_json
 
 
 @click.command(epilog=example("dengine export engine.db --out model.ts"))
-@click.argument("store")
+@click.argument("store", metavar="STORE")
 @click.option(
-    "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="The file; its .sha256 beside it."
+    "--out",
+    required=True,
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="The file to write; its checksum comes beside it, as FILE.sha256.",
 )
 @click.option(
     "--format",
@@ -22,11 +25,14 @@ from .output import show, write_json
     type=click.Choice(["torchscript", "onnx"]),
     default="torchscript",
     show_default=True,
-    help="onnx carries no audits and learns nothing in the cell.",
+    help="torchscript decides, audits and learns in the cell; onnx only decides.",
 )
 @json_option
 def export(store: str, out: Path, form: str, as_json: bool) -> None:
-    """Write the whole decision of a store's engine to one file for the cell controller."""
+    """Write an engine's decision to a file for the controller.
+
+    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`.
+    """
     from ..engine import DataEngine
     from ..export import export_onnx, export_torchscript
 
@@ -34,27 +40,28 @@ def export(store: str, out: Path, form: str, as_json: bool) -> None:
     with DataEngine.open(store) as engine:
         path = write(engine, out)
         version, references = engine.version, len(engine.model.index)
-    size = path.stat().st_size
+    n_bytes = path.stat().st_size
     if as_json:
-        about = {"format": form, "version": version, "references": references, "bytes": size}
+        about = {"format": form, "version": version, "references": references, "bytes": n_bytes}
         write_json({"verb": "export", "store": store, "out": str(path)} | about)
         return
-    show(f"Wrote {path}, {size / 1e3:.0f} kB, and {path.name}.sha256: version {version} with {references} references.")
+    show(f"Wrote {path} ({size(n_bytes)}) and {path.name}.sha256: version {version} with {references} labelled references.")
 
 
 @click.command("import-labels", epilog=example("dengine import-labels cell.csv --store engine.db"))
-@click.argument("journal", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
 @json_option
 def import_labels(journal: Path, store: str, as_json: bool) -> None:
-    """Take the labels that a cell program learned back into the store. Each line counts once."""
+    """Take a cell program's labels back into the store.
+
+    JOURNAL is the CSV file that the program wrote: a line is a label (1
+    success, 0 failure) and the samples of its trace. Each line counts once, however often it is imported.
+    """
     from ..importing import import_journal
 
     report = import_journal(store, journal)
     if as_json:
         write_json({"verb": "import-labels", "store": store, "journal": str(journal)} | asdict(report))
         return
-    show(
-        f"Imported {report.imported} labels into {store}, {report.quarantined} more into quarantine; "
-        f"{report.known} were known from an earlier import."
-    )
+    show(imported_line(report, store))

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,18 +16,21 @@ import click
 if TYPE_CHECKING:
     from rich.console import Console
 
-WIDE = 110  # columns where no terminal says otherwise: a table in a file is not folded
+    from ..importing import ImportReport
+
+WIDE = 80  # columns where no terminal says otherwise; every table fits them
 
 
 def show(*parts: Any) -> None:
-    """Print tables and lines to stdout."""
+    """Print tables and lines to stdout; lines are broken between words, and a long path never."""
     out = console()
     for part in parts:
-        out.print(part, highlight=False, soft_wrap=isinstance(part, str))
+        lines = fill(part, out.width, break_long_words=False, break_on_hyphens=False) if isinstance(part, str) else part
+        out.print(lines, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
 def console() -> Console:
-    """The screen, or a file that is as wide as a table needs."""
+    """The screen, or a file of its usual width."""
     from rich.console import Console
 
     return Console() if sys.stdout.isatty() else Console(width=WIDE)
@@ -52,6 +56,32 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value)
+
+
+def duration(seconds: float) -> str:
+    """A time as a person writes it: 180 µs, 35 ms, 4.6 s, 240 s."""
+    if seconds < 0.9995e-3:
+        return f"{1e6 * seconds:.0f} µs"
+    if seconds < 0.9995:
+        return f"{1e3 * seconds:.1f} ms" if seconds < 9.95e-3 else f"{1e3 * seconds:.0f} ms"
+    return f"{seconds:.1f} s" if seconds < 99.95 else f"{seconds:.0f} s"
+
+
+def size(n_bytes: float) -> str:
+    """A size as a person writes it: 812 B, 296 kB, 1.4 MB, 4.4 GB."""
+    for factor, unit in ((1e9, "GB"), (1e6, "MB")):
+        if n_bytes >= 0.9995 * factor:
+            return f"{n_bytes / factor:.1f} {unit}"
+    return f"{n_bytes / 1e3:.0f} kB" if n_bytes >= 1e3 else f"{n_bytes:.0f} B"
+
+
+def imported_line(report: ImportReport, store: str) -> str:
+    """What became of imported labels; what did not happen is not mentioned."""
+    if not report.imported and not report.quarantined:
+        return f"Nothing new for {store}: all {report.known} traces were there from an earlier import."
+    bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
+    known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
+    return f"Imported {report.imported} labelled traces into {store}.{bad}{known}"
 
 
 @contextmanager

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from .interrupting import end_interrupted
 from .options import (
     RecipeChoice,
     data_options,
     example,
     json_option,
+    n_jobs_option,
     out_option,
     policy_options,
     read,
     recipe_options,
     seed_option,
+    short_name,
 )
 from .output import progress, show, write_json
 
@@ -31,14 +36,12 @@ def stream_options(command: Any) -> Any:
     for option in (
         json_option,
         out_option,
-        click.option(
-            "--n-jobs", type=int, default=1, show_default=True, help="Replays at a time; timings are honest with 1 only."
-        ),
+        n_jobs_option(1, "Replays at a time, each in a process; -1: one a core. Timings are honest with 1 only."),
         click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards."),
         click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
-        click.option("--cycles", type=click.IntRange(1), help="Only so many cycles of each stream.  [default: all]"),
+        click.option("--cycles", type=click.IntRange(1), help="Only so many parts of each stream.  [default: all]"),
         seed_option,
-        click.option("--repeats", type=click.IntRange(1), help="Shuffled replays a recipe.  [default: 30]"),
+        click.option("--repeats", type=click.IntRange(1), help="Shuffled replays of each recipe.  [default: 30]"),
     ):
         command = option(command)
     return command
@@ -51,26 +54,58 @@ def stream_options(command: Any) -> Any:
 @recipe_options
 @stream_options
 def replay(choice: RecipeChoice, **options: Any) -> None:
-    """Replay a recorded stream through fresh engines, shuffled anew each time."""
+    """Replay a recorded stream, shuffled, through fresh engines.
+
+    Ctrl-C shows the replays that were finished.
+    """
     _replay("replay", {choice.name: choice.load()}, **options)
 
 
-@click.command(epilog=example("dengine compare --data insertion --reducers conv,umap,pca --repeats 2 --out out/"))
+@click.command(epilog=example("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/"))
 @data_options()
-@click.option("--reducers", default="conv,umap,pca", show_default=True, help="Names or recipe files, with commas between.")
+@click.option(
+    "--reducers",
+    metavar="NAMES",
+    default="conv,umap,pca",
+    show_default=True,
+    help="With commas between: conv, umap, pca, rocket, TOML files, module:Class of your own.",
+)
 @policy_options
 @stream_options
 def compare(reducers: str, alpha: float | None, lower_bound: float | None, **options: Any) -> None:
-    """Replay the same streams through several reducers or recipes."""
-    names = [name.strip() for name in reducers.split(",") if name.strip()]
-    if not names:
+    """Replay the same streams through several reducers.
+
+    UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
+    """
+    asked = [name.strip() for name in reducers.split(",") if name.strip()]
+    if not asked:
         raise click.UsageError("--reducers names none; give at least one, as in conv,pca.")
     policy = RecipeChoice(None, None, alpha, lower_bound)
-    _replay("compare", {_short(name): policy.load(name) for name in names}, **options)
+    _replay("compare", {name: policy.load(one) for name, one in _names(asked).items()}, **options)
 
 
-def _short(name: str) -> str:
-    return Path(name).stem if name.endswith(".toml") else name
+def _names(asked: list[str]) -> dict[str, str]:
+    """What to call each in tables and file names -> what was asked for."""
+    names = {short_name(one): one for one in asked}
+    if len(names) < len(asked):
+        raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
+    return names
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The replays that were finished, by recipe, and how many were asked for."""
+
+    by_recipe: Mapping[str, list[Replay]]
+    asked: int
+
+    def __len__(self) -> int:
+        return sum(len(replays) for replays in self.by_recipe.values())
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether some are missing."""
+        return len(self) < self.asked
 
 
 def _replay(
@@ -89,12 +124,15 @@ def _replay(
 ) -> None:
     if in_order and repeats not in (None, 1):
         raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
-    repeats = 1 if in_order else repeats or 30
+    seeds = range(seed, seed + (1 if in_order else repeats or 30))
     dataset = read(data, samples)
-    total = repeats * len(recipes) * (cycles or len(dataset))
-    with progress(f"replaying {dataset.name}", total, as_json) as advance:
-        replays = _run(dataset, recipes, range(seed, seed + repeats), cycles, n_jobs, advance, not in_order, confirm)
-    _report(verb, dict(zip(recipes, _parts(replays, repeats), strict=True)), dataset.name, in_order, out, as_json)
+    with progress(f"replaying {dataset.name}", len(seeds) * len(recipes) * (cycles or len(dataset)), as_json) as advance:
+        finished = _run(dataset, recipes, seeds, cycles, n_jobs, advance, not in_order, confirm)
+    if len(finished):
+        _report(verb, finished, dataset.name, in_order, out, as_json)
+    if finished.interrupted:
+        kept = "the table shows those" if len(finished) else "there is nothing to show"
+        end_interrupted(f"Interrupted: {len(finished)} of {finished.asked} replays were finished; {kept}.")
 
 
 def _run(
@@ -106,52 +144,58 @@ def _run(
     advance: Any,
     shuffle: bool,
     confirm: bool,
-) -> list[Replay]:
-    from ..experiments.grid import run_replays
+) -> Finished:
+    from ..experiments.grid import iterate_replays
 
+    # Seed by seed: what an interrupted comparison has finished can be compared.
+    tasks = [(name, seed) for seed in seeds for name in recipes]
+    finished: dict[str, list[Replay]] = {name: [] for name in recipes}
     # A bar cannot travel to other processes: there it moves a replay at a time.
-    ticks: dict[str, Any] = (
-        {"on_cycle": lambda done: advance(1)} if n_jobs == 1 else {"on_done": lambda r: advance(len(r.action))}
-    )
-    return run_replays(
-        dataset, list(recipes.values()), seeds, cycles, n_jobs=n_jobs, shuffle=shuffle, confirm=confirm, **ticks
-    )
+    ticks: dict[str, Any] = {"on_cycle": lambda done: advance(1)} if n_jobs == 1 else {}
+    pairs = [(recipes[name], seed) for name, seed in tasks]
+    replays = iterate_replays(dataset, pairs, cycles, n_jobs=n_jobs, shuffle=shuffle, confirm=confirm, **ticks)
+    try:
+        for (name, _), one in zip(tasks, replays, strict=True):
+            finished[name].append(one)
+            if not ticks:
+                advance(len(one.action))
+    except KeyboardInterrupt:
+        pass  # what is missing says so
+    return Finished({name: some for name, some in finished.items() if some}, len(tasks))
 
 
-def _parts(replays: list[Replay], size: int) -> list[list[Replay]]:
-    return [replays[i : i + size] for i in range(0, len(replays), size)]
-
-
-def _report(
-    verb: str, by_recipe: dict[str, list[Replay]], data: str, in_order: bool, out: Path | None, as_json: bool
-) -> None:
+def _report(verb: str, finished: Finished, data: str, in_order: bool, out: Path | None, as_json: bool) -> None:
     from ..experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, retrain_line
 
+    by_recipe = finished.by_recipe
     named = [(name, each) for name, replays in by_recipe.items() for each in replays]
     frame = frame_of([each for _, each in named], [name for name, _ in named])
     rows = [row | {"promise_kept": promise_kept(row)} for row in pool(frame)]
-    files = _save(frame, by_recipe, _title(data, by_recipe, in_order), out) if out is not None else []
+    title = _title(data, by_recipe, in_order)
+    files = _save(frame, by_recipe, title, out) if out is not None else []
     retrains = {name: [r for each in replays for r in each.retrains] for name, replays in by_recipe.items()}
     if as_json:
         dropped = {name: sum(not r.accepted for r in reports) for name, reports in retrains.items()}
         rows = [row | {"retrains_dropped": dropped[row["recipe"]]} for row in rows]
-        write_json({"verb": verb, "data": data, "in_order": in_order, "rows": rows, "files": files})
+        about = {"verb": verb, "data": data, "in_order": in_order, "interrupted": finished.interrupted}
+        write_json(about | {"rows": rows, "files": files})
         return
-    show(pooled_table(rows, _title(data, by_recipe, in_order)))
+    show(pooled_table(rows, title))
     show(*(promise_line(row) for row in rows))
     show(*(f"{name}: {retrain_line(reports)}" for name, reports in retrains.items()))
     show(*(f"Wrote {path}" for path in files))
 
 
-def _title(data: str, by_recipe: dict[str, list[Replay]], in_order: bool) -> str:
-    first = next(iter(by_recipe.values()))
+def _title(data: str, by_recipe: Mapping[str, list[Replay]], in_order: bool) -> str:
+    each = sorted({len(replays) for replays in by_recipe.values()})
+    cycles = len(next(iter(by_recipe.values()))[0].action)
     order = "in recorded order" if in_order else "shuffled"
-    how = f"{order}, {len(first)} replay{'s' if len(first) > 1 else ''} of {len(first[0].action)} cycles"
+    how = f"{order}, {' or '.join(map(str, each))} replay{'s' if each[-1] > 1 else ''} of {cycles} cycles"
     source = "simulated insertions" if data == "insertion" else data
     return f"{', '.join(by_recipe)} on {source}, {how}"
 
 
-def _save(frame: Any, by_recipe: dict[str, list[Replay]], title: str, out: Path) -> list[Path]:
+def _save(frame: Any, by_recipe: Mapping[str, list[Replay]], title: str, out: Path) -> list[Path]:
     from ..experiments.figures import curves, embedding_map, save
     from ..experiments.tables import write_csv
 

@@ -2,31 +2,55 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import RecipeChoice, data_options, example, json_option, out_option, read, recipe_options
+from .interrupting import EndAskedError, end_interrupted, interruptible
+from .options import (
+    RecipeChoice,
+    data_options,
+    example,
+    json_option,
+    must_have_mujoco,
+    out_option,
+    read,
+    recipe_options,
+    scenario_option,
+    short_name,
+)
 from .output import progress, show, write_json
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
+    from ..engine import DataEngine
     from ..experiments.live import RunLog
+    from ..records import Cycle
     from ..store.base import Store
 
 STRETCHES = 6
 
 
-@click.command(epilog=example("dengine run --cell simulated --cycles 300 --store engine.db --alpha 0.1 --lower-bound 0.9"))
-@click.option("--cell", "kind", type=click.Choice(["simulated", "replay"]), default="simulated", show_default=True)
+@click.command(epilog=example("dengine run --cell simulated --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9"))
+@click.option(
+    "--cell",
+    "kind",
+    type=click.Choice(["simulated", "replay"]),
+    default="simulated",
+    show_default=True,
+    help="simulated: physics in MuJoCo. replay: the parts of --data, in their order.",
+)
 @data_options()
-@click.option("--scenario", default="nominal", show_default=True, help="Simulated cell: nominal, wear, variant, bias_jump.")
-@click.option("--cycles", type=click.IntRange(1), default=300, show_default=True)
+@scenario_option
+@click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
 @click.option("--store", metavar="FILE|URL", help="Remembers everything; without one the run is forgotten.")
 @recipe_options
-@click.option("--seed", type=click.IntRange(0), help="Of a new store's engine, and of the simulated cell.  [default: 0]")
+@click.option(
+    "--seed", type=click.IntRange(0), help="An integer, of a new store's engine and of the simulated cell.  [default: 0]"
+)
 @out_option
 @json_option
 def run(
@@ -44,17 +68,48 @@ def run(
     """Drive a cell: verify, learn, and verify less.
 
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
-    on after its last part with a label in the store: no part is learned from twice.
+    on after its last part with a label in the store: no part is learned from twice. Ctrl-C ends the run after the cycle
+    that is under way and shows what was done; pressed twice, it ends at once.
     """
+    if kind == "simulated":
+        must_have_mujoco()
     from ..engine import DataEngine
-    from ..experiments.live import watch
 
-    engine = DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None)
-    with engine:
+    with DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None) as engine:
         cell, name = CELLS[kind](engine.store, engine.seed, data, samples, scenario, cycles)
-        with progress(name, cycles, as_json) as advance:
-            log = watch(engine, cell, cycles, lambda cycle: advance(1))
-    _report(log, cell, kind, f"{name}, {engine.recipe.reducer}{', resumed' if engine.resumed else ''}", out, as_json)
+        log = _drive(engine, cell, cycles, name, as_json)
+    title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
+    if len(log):
+        _report(log, cell, kind, title, cycles, out, as_json)
+    if len(log) < cycles:
+        _say_interrupted(len(log), cycles, store)
+
+
+def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) -> RunLog:
+    from ..experiments.live import RunRecorder
+
+    recorder = RunRecorder(cell)
+    with interruptible() as asked, progress(name, cycles, quiet) as advance:
+
+        def count(cycle: Cycle) -> None:
+            advance(1)
+            if asked():  # between two cycles: no part is left half dealt with
+                raise EndAskedError
+
+        # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
+        with suppress(EndAskedError, KeyboardInterrupt):
+            recorder.follow(engine, cycles, count)
+    return recorder.log()
+
+
+def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
+    shown = "the table shows those" if done else "there is nothing to show"
+    kept = f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
+    forgotten = "Nothing was stored: --store FILE keeps a run, and goes on with it."
+    end_interrupted(
+        f"Interrupted: {done} of {cycles} cycles were done; {shown}.",
+        forgotten if store is None else kept,
+    )
 
 
 def _simulated(store: Store, seed: int, data: str, samples: int | None, scenario: str, cycles: int) -> tuple[Cell, str]:
@@ -86,7 +141,7 @@ def _recorded(store: Store, seed: int, data: str, samples: int | None, scenario:
 CELLS = {"simulated": _simulated, "replay": _recorded}
 
 
-def _report(log: RunLog, cell: Cell, kind: str, title: str, out: Path | None, as_json: bool) -> None:
+def _report(log: RunLog, cell: Cell, kind: str, title: str, cycles: int, out: Path | None, as_json: bool) -> None:
     from ..experiments.tables import retrain_line
 
     total, stretches = log.summary(), log.stretches(STRETCHES)
@@ -94,37 +149,59 @@ def _report(log: RunLog, cell: Cell, kind: str, title: str, out: Path | None, as
     worst = max((r.seconds for r in log.retrains), default=None)
     files = _save(log, title, out) if out is not None else []
     if as_json:
-        result = {"verb": "run", "title": title, "simulated": kind == "simulated", "total": total, "stretches": stretches}
-        write_json(result | {"cell": clock, "retrains": log.retrains, "retrain_max_s": worst, "files": files})
+        about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
+        counts = {"total": total, "stretches": stretches, "cell": clock}
+        write_json(about | counts | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
         return
-    show(_table([*stretches, total], title))
+    show(_table([*stretches, total], title, clock is not None))
     if clock is not None:
-        show(
-            f"Simulated: {clock['parts_per_hour']:.1f} good parts an hour; {clock['seconds_saved']:.0f} s saved against "
-            f"verifying every part, {clock['stops']} stops and {clock['sent_back']} good parts sent back taken off; "
-            f"{clock['escapes']} bad parts escaped in silence."
-        )
+        show(_clock_line(clock))
     show(retrain_line(log.retrains))
     show(*(f"Wrote {path}" for path in files))
 
 
-def _table(rows: list[dict[str, Any]], title: str) -> Any:
+def _clock_line(clock: dict[str, Any]) -> str:
+    """What the simulated clock says. Its seconds saved have the cost of stops and wrong rejects taken off already."""
+    saved = clock["seconds_saved"]
+    result = "nothing was saved" if abs(saved) < 0.5 else f"{abs(saved):.0f} s were {'saved' if saved > 0 else 'lost'}"
+    silent = f" Bad parts that went on unnoticed: {clock['escapes']}." if clock["escapes"] else ""
+    return (
+        f"Simulated: {clock['parts_per_hour']:.1f} good parts an hour. Against verifying every part {result}; this counts "
+        f"what stops ({clock['stops']}) and good parts sent back to the bin ({clock['sent_back']}) cost.{silent}"
+    )
+
+
+CAPTION = (
+    "\nFP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
+    "cell tells the truth about parts that were not verified."
+)
+
+
+def _table(rows: list[dict[str, Any]], title: str, timed: bool) -> Any:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
-    for name in ("cycles", "verified", "accepted", "FP", "of them stops", "rejected", "FN", "good parts/h"):
-        table.add_column(name, justify="right")
-    for i, row in enumerate(rows):
-        if i == len(rows) - 1:
-            table.add_section()
-        rate = row["parts_per_hour"]
-        table.add_row(
-            f"{row['first_cycle']} to {row['last_cycle']}",
-            f"{100 * row['verified_share']:.0f} %",
-            *(str(row[name]) for name in ("accepted", "false_positive", "stops", "rejected", "false_negative")),
-            "-" if rate is None else f"{rate:.1f}",
-        )
+    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
+    caption = CAPTION + (" good/h: good parts passed on an hour.\n" if timed else "\n")
+    table = Table(title=f"\n{title}\n", caption=caption, pad_edge=False, show_edge=False, **look)
+    for name in ("cycles", "verified", "accepted", "FP", "stops", "rejected", "FN", *(["good/h"] if timed else [])):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows[:-1]:
+        table.add_row(*_cells(row, timed))
+    table.add_section()
+    table.add_row(*_cells(rows[-1], timed))
     return table
+
+
+def _cells(row: dict[str, Any], timed: bool) -> list[str]:
+    counts = [str(row[name]) for name in ("accepted", "false_positive", "stops", "rejected", "false_negative")]
+    rate = row["parts_per_hour"]
+    return [
+        f"{row['first_cycle']} to {row['last_cycle']}",
+        f"{100 * row['verified_share']:.0f} %",
+        *counts,
+        *(["-" if rate is None else f"{rate:.1f}"] if timed else []),
+    ]
 
 
 def _save(log: RunLog, title: str, out: Path) -> list[Path]:

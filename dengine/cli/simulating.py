@@ -6,19 +6,25 @@ from pathlib import Path
 
 import click
 
-from .options import example, json_option, seed_option
+from .options import example, json_option, must_have_mujoco, n_jobs_option, scenario_option, seed_option
 from .output import progress, show, write_json
 
 
-@click.command(epilog=example("dengine simulate --n 100 --out traces.npz --seed 0"))
-@click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate.")
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True, help="An .npz file.")
-@click.option("--scenario", default="nominal", show_default=True, help="nominal, wear, variant or bias_jump.")
+@click.command(epilog=example("dengine simulate --n 50 --out traces.npz --seed 0"))
+@click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate, of 2 s each.")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help="The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels.",
+)
+@scenario_option
 @seed_option
-@click.option("--n-jobs", type=int, default=-1, show_default=True, help="Processes; -1: one a core.")
+@n_jobs_option(-1, "Processes; -1: one a core.")
 @json_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, as_json: bool) -> None:
-    """Simulate insertions in MuJoCo and write their force traces and labels."""
+    """Simulate insertions and write their forces and labels."""
+    must_have_mujoco()
     from ..cells.simulation.generate import save_traces
     from ..cells.simulation.generate import simulate as simulate_traces
 

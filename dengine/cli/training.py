@@ -2,55 +2,125 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
 import click
 
-from .options import RecipeChoice, data_options, example, json_option, read, recipe_options
-from .output import progress, show, write_json
+from .interrupting import Asked, EndAskedError, end_interrupted, interruptible
+from .options import RecipeChoice, data_options, example, json_option, read, recipe_options, short_name
+from .output import imported_line, progress, show, write_json
+
+if TYPE_CHECKING:
+    from ..datasets import Dataset
+    from ..importing import ImportReport
+    from ..recipe import Recipe
+    from ..records import RetrainReport
 
 RETRAINS = 10
 
 
 @click.command(epilog=example("dengine train --data insertion --store engine.db --reducer conv"))
 @data_options(None)
-@click.option("--store", required=True, metavar="FILE|URL", help="Made where it does not exist.")
+@click.option("--store", required=True, metavar="FILE|URL", help="Where the engine remembers; made if need be.")
 @recipe_options
-@click.option("--seed", type=click.IntRange(0), help="Of a new store's engine.  [default: 0]")
+@click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
 @click.option(
     "--retrains",
     type=click.IntRange(1),
     default=RETRAINS,
     show_default=True,
-    help="At most, each within the budget and going on from the last; one is enough for umap and pca.",
+    help="At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one.",
 )
 @json_option
 def train(
     choice: RecipeChoice, data: str, samples: int | None, store: str, seed: int | None, retrains: int, as_json: bool
 ) -> None:
-    """Import labelled traces into a store and train an engine on it.
+    """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant) is kept, but never
-    trained on. A store that has been used keeps its own recipe and seed.
+    trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
+    command goes on from there.
     """
-    from ..engine import DataEngine
-    from ..experiments.tables import retrain_line
-    from ..importing import import_labelled, train_until_done
-
-    dataset = read(data, samples)
-    recipe = choice.load() if choice.asked else None
-    with progress(f"importing {dataset.name}", len(dataset), as_json) as advance:
-        imported = import_labelled(store, dataset, recipe, seed, advance)
-    with DataEngine.open(store) as engine, progress("training", retrains, as_json) as advance:
-        reports = train_until_done(engine, retrains, lambda report: advance(1))
-        status, answering = engine.store.status(), engine.recipe
+    dataset, recipe = read(data, samples), choice.load() if choice.asked else None
+    with interruptible() as asked:
+        imported = _import(dataset, store, recipe, seed, as_json, asked)
+        trained = _train(store, retrains, as_json, asked)
     if as_json:
-        write_json({"verb": "train", "store": store, "import": imported, "retrains": reports})
+        about = {"verb": "train", "store": store, "interrupted": trained.interrupted}
+        write_json(about | {"import": imported, "retrains": trained.reports})
     else:
-        resumed = "a used store" if imported.resumed else "a new store"
-        show(
-            f"Imported {imported.imported} traces into {resumed}, {imported.quarantined} more into quarantine; "
-            f"{imported.known} were known from an earlier import.",
-            f"Version {reports[-1].version} of {answering.reducer} answers. {retrain_line(reports)}",
-            f"{store} holds {status['labels']} labels.",
+        _show(imported, trained, store)
+    if trained.interrupted:
+        end_interrupted(f"Interrupted after {len(trained.reports)} of at most {retrains} retrains; they are in {store}.")
+    if not trained.reports[-1].accepted:
+        raise click.ClickException(f"The last retrain was {trained.reports[-1].reason}.")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of the retrains, and the labels that the store holds now."""
+
+    reports: list[RetrainReport]
+    reducer: str
+    labels: int
+    interrupted: bool
+
+
+def _import(
+    dataset: Dataset, store: str, recipe: Recipe | None, seed: int | None, quiet: bool, asked: Asked
+) -> ImportReport:
+    from ..importing import import_labelled
+
+    done = 0
+
+    def count(n: int) -> None:
+        nonlocal done
+        done += n
+        advance(n)
+        if asked() and done < len(dataset):
+            raise EndAskedError
+
+    try:
+        with progress(f"importing {dataset.name}", len(dataset), quiet) as advance:
+            return import_labelled(store, dataset, recipe, seed, count)
+    except EndAskedError:
+        end_interrupted(
+            f"Interrupted: {done} of {len(dataset)} traces are in {store}; the same command goes on from there."
         )
-    if not reports[-1].accepted:
-        raise click.ClickException(f"The last retrain was {reports[-1].reason}.")
+
+
+def _train(store: str, retrains: int, quiet: bool, asked: Asked) -> Trained:
+    from ..engine import DataEngine
+    from ..importing import train_until_done
+
+    reports: list[RetrainReport] = []
+
+    def count(report: RetrainReport) -> None:
+        reports.append(report)
+        advance(1)
+        if asked() and len(reports) < retrains:
+            raise EndAskedError
+
+    interrupted = False
+    with DataEngine.open(store) as engine:
+        try:
+            with progress("training", retrains, quiet) as advance:
+                train_until_done(engine, retrains, count)
+        except EndAskedError:
+            interrupted = True
+        return Trained(reports, short_name(engine.recipe.name), engine.store.status()["labels"], interrupted)
+
+
+def _show(imported: ImportReport, trained: Trained, store: str) -> None:
+    from ..experiments.tables import retrain_line
+
+    kind = "a used store" if imported.resumed else "a new store"
+    version = trained.reports[-1].version
+    show(
+        imported_line(imported, f"{store}, {kind}"),
+        f"Version {version} of {trained.reducer} answers. {retrain_line(trained.reports)}"
+        if version
+        else "No version answers yet: every part is verified.",
+        f"{store} holds {trained.labels} labels.",
+    )

@@ -2,160 +2,130 @@
 
     save(curves({"conv": replays}), "out/curves.png")
 
-No pyplot: its global state would leak figures into a user's notebook. Colours: Okabe and Ito (2008), distinct to all eyes.
+How they look is said in look.py, the maps of the embedding are drawn in maps.py; both are handed on from here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..records import Action
 from .live import RunLog
+from .look import (
+    GREEN,
+    LIMIT,
+    RECIPES,
+    VERIFIED,
+    Floats,
+    draw_errors,
+    draw_verified,
+    legend_above,
+    panels,
+    save,
+    sliding_sum,
+)
+from .maps import embedding_map
 from .replay import Replay
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
+__all__ = ["curves", "embedding_map", "run_picture", "save", "sliding_sum", "window_curves"]
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-BLUE, RED, GREEN, PINK, SKY, ORANGE = COLOURS
-GREY = "#6E6E6E"
 WINDOW = 300  # cycles, the paper's
-ACTION_MARKS = {  # drawn in this order, so that the few certain ones lie on top
-    Action.VERIFY: ("verify", GREY, ".", 14),
-    Action.ACCEPT: ("accept", BLUE, "o", 26),
-    Action.REJECT: ("reject", RED, "X", 30),
-}
-TRUTH_MARKS = {True: ("good part", BLUE, "o", 22), False: ("bad part", RED, "X", 26)}
+FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
+COUNTS = ("accepted", "false_positive", "rejected", "false_negative")
 
 
-def sliding_sum(values: NDArray[Any], window: int) -> Floats:
-    """(..., n) -> (..., n): sum over the last `window` values, over all so far where there are fewer."""
-    total = np.cumsum(np.asarray(values, dtype=np.float64), axis=-1)
-    out = total.copy()
-    out[..., window:] -= total[..., :-window]
-    return out
-
-
-def window_curves(replays: Sequence[Replay], window: int = WINDOW) -> dict[str, Floats]:
+def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> dict[str, Floats]:
     """What the paper plots, in percent, (n,) each, over a sliding window and all replays, which must be equally long.
 
-    certain, false_positive, false_negative : of all cycles in the window.
-    precision : of the accepted parts in the windows of all replays together; NaN where none was accepted.
-    certain_low, certain_high : 10th and 90th percentile over the replays.
+    certain : of all cycles in the window.  certain_low, certain_high : 10th and 90th percentile over the replays.
+    precision, false_positive : of the accepted parts in the windows of all replays together.
+    false_negative : of the rejected parts, likewise.  All three NaN where these are fewer than `fewest`.
     """
-    action, truth = np.stack([r.action for r in replays]), np.stack([r.truth for r in replays])
-    accept, reject = action == Action.ACCEPT, action == Action.REJECT
-    seen = sliding_sum(np.ones(action.shape[1]), window)
-    accepted, certain = sliding_sum(accept, window), sliding_sum(accept | reject, window) / seen
-    false_positive, false_negative = sliding_sum(accept & ~truth, window), sliding_sum(reject & truth, window)
-    with np.errstate(invalid="ignore"):
-        precision = 1.0 - false_positive.sum(axis=0) / accepted.sum(axis=0)
+    accept, reject = np.stack([r.accepted for r in replays]), np.stack([r.rejected for r in replays])
+    seen = sliding_sum(np.ones(accept.shape[1]), window)
+    certain = sliding_sum(accept | reject, window) / seen
+    false_positive = _pooled_share(np.stack([r.false_positive for r in replays]), accept, window, fewest)
+    false_negative = _pooled_share(np.stack([r.false_negative for r in replays]), reject, window, fewest)
     curves = {
         "certain": certain.mean(axis=0),
         "certain_low": np.quantile(certain, 0.1, axis=0),
         "certain_high": np.quantile(certain, 0.9, axis=0),
-        "precision": precision,
-        "false_positive": (false_positive / seen).mean(axis=0),
-        "false_negative": (false_negative / seen).mean(axis=0),
+        "precision": 1.0 - false_positive,
+        "false_positive": false_positive,
+        "false_negative": false_negative,
     }
     return {name: 100.0 * values for name, values in curves.items()}
 
 
+def _pooled_share(wrong: Any, decided: Any, window: int, fewest: int) -> Floats:
+    """(replays, n) bool each -> (n,): share of the decided parts that were wrong, in all replays' windows together."""
+    of = sliding_sum(decided.sum(axis=0), window)
+    return np.where(of >= fewest, sliding_sum(wrong.sum(axis=0), window) / np.maximum(of, 1.0), np.nan)
+
+
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: int = WINDOW) -> Figure:
-    """The paper's two-part curve, a colour a recipe: certain and precision above, errors below."""
-    figure, (top, bottom) = _axes(2, (9.0, 7.0), heights=(3, 2))
-    length = max(len(r.action) for replays in by_recipe.values() for r in replays)
+    """The paper's two-part curve, a colour a recipe: certain and precision above; below the errors of what was decided.
+
+    The tolerance 100 - LB is a share of the accepted parts, so the errors are drawn as shares of what was decided alike.
+    """
+    wide = max(2, min(len(by_recipe), 4))  # recipes side by side in the legends: a column each, and one for the bound
+    figure, (top, bottom) = panels(2, (3.6 + 2.7 * wide, 7.4), heights=(4, 3))
+    length = max(len(r) for replays in by_recipe.values() for r in replays)
     window = min(window, max(1, length // 3))
-    for colour, (name, replays) in zip(cycle(COLOURS), by_recipe.items(), strict=False):
-        _draw_curves(top, bottom, window_curves(replays, window), colour, name if len(by_recipe) > 1 else "")
-    _draw_tolerance(top, bottom, {r.recipe.policy.lower_bound for replays in by_recipe.values() for r in replays})
+    bounds = {r.recipe.policy.lower_bound for replays in by_recipe.values() for r in replays}
+    for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
+        _draw_curves(top, bottom, replays, window, colour, f"{name}: " if len(by_recipe) > 1 else "")
+    _draw_tolerance(top, bottom, bounds)
     top.set(ylim=(0, 102), ylabel="share [%]")
-    bottom.set(ylim=(0, None), xlabel=f"cycle (end of a window of {window})", ylabel="errors [% of cycles]")
+    # Above the tolerance at least half as much again: whether the errors keep to it is what the panel is there for.
+    bottom.set(ylim=(0, max(bottom.get_ylim()[1], 150 * (1 - min(bounds)))), ylabel="wrong [% of accepted, rejected]")
+    bottom.set(xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)")
     figure.suptitle(title)
-    _legend(top)
-    _legend(bottom)
+    legend_above(top, columns=wide + 1)
+    legend_above(bottom, columns=wide + 1)
     return figure
 
 
-def _draw_curves(top: Axes, bottom: Axes, lines: dict[str, Floats], colour: str, name: str) -> None:
-    x, lead = np.arange(1, len(lines["certain"]) + 1), f"{name}: " if name else ""
+def _draw_curves(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str) -> None:
+    lines = window_curves(replays, window, FEWEST)
+    x = np.arange(1, len(lines["certain"]) + 1)
     top.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
     top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
-    top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted parts")
-    bottom.plot(x, lines["false_positive"], color=colour, label=f"{lead}FP, bad part accepted")
-    bottom.plot(x, lines["false_negative"], color=colour, linestyle="--", label=f"{lead}FN, good part rejected")
+    top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
+    # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
+    n = {name: sum(each.summary()[name] for each in replays) for name in COUNTS}
+    bad, good = "{false_positive} bad of {accepted} accepted", "{false_negative} good of {rejected} rejected"
+    bottom.plot(x, lines["false_positive"], color=colour, label=lead + bad.format_map(n))
+    bottom.plot(x, lines["false_negative"], color=colour, linestyle="--", label=lead + good.format_map(n))
 
 
 def _draw_tolerance(top: Axes, bottom: Axes, lower_bounds: set[float]) -> None:
     for bound in sorted(lower_bounds):
-        top.axhline(100 * bound, color="black", linestyle=":", label=f"LB = {100 * bound:g} %")
+        top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
         tolerated = 100 * (1 - bound)
-        bottom.axhline(tolerated, color="black", linestyle=":", label=f"tolerance 100 - LB = {tolerated:g} %")
-
-
-def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
-    """Where the newest parts of a replay lie: once by what they were, once by what was decided.
-
-    Only the newest, since each retrain moves the map. The first two dimensions are drawn.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    z = _plane(replay.position[-last:])
-    _scatter(left, z, replay.truth[-last:], TRUTH_MARKS)
-    _scatter(right, z, replay.action[-last:], ACTION_MARKS)
-    left.set(title="what the parts were", xlabel="embedding 1 [scaled]", ylabel="embedding 2 [scaled]")
-    right.set(title="what was decided", xlabel="embedding 1 [scaled]")
-    figure.suptitle(title)
-    return figure
-
-
-def _plane(positions: Floats) -> Floats:
-    """(n, d) -> (n, 2): zeros where a reducer has but one dimension."""
-    return np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]
-
-
-def _scatter(axes: Axes, z: Floats, kinds: NDArray[Any], marks: Mapping[Any, tuple[str, str, str, int]]) -> None:
-    known = np.isfinite(z).all(axis=1)
-    for kind, (name, colour, marker, size) in marks.items():
-        points = z[known & (kinds == kind)]
-        look: dict[str, Any] = {"color": colour, "marker": marker, "s": size, "alpha": 0.7, "linewidths": 0}
-        axes.scatter(points[:, 0], points[:, 1], label=f"{name} ({len(points)})", **look)
-    if not known.any():
-        axes.text(0.5, 0.5, "no trace was embedded yet", transform=axes.transAxes, ha="center", va="center")
-    _plain(axes)
-    axes.legend(loc="best", frameon=True, framealpha=0.9)
+        bottom.axhline(tolerated, label=f"tolerance 100 - LB = {tolerated:g} %", **LIMIT)
 
 
 def run_picture(log: RunLog, title: str = "", window: int = 100) -> Figure:
     """A live run: verified share, errors so far and, with a clock, parts an hour."""
-    from matplotlib.ticker import MaxNLocator
-
     window = min(window, max(1, len(log) // 3))
-    figure, axes = _axes(2 if log.clock_s is None else 3, (9.0, 6.0 if log.clock_s is None else 8.5))
-    x = np.arange(1, len(log) + 1)
-    seen = sliding_sum(np.ones(len(log)), window)
-    axes[0].plot(x, 100 * sliding_sum(log.verified, window) / seen, color=BLUE, label="verified")
-    axes[0].set(ylim=(0, 104), ylabel=f"verified, last {window} [%]")
-    axes[1].step(x, np.cumsum(log.false_positive), color=RED, where="post", label="bad part accepted (FP)")
-    axes[1].step(
-        x, np.cumsum(log.false_negative), color=GREEN, where="post", linestyle="--", label="good part rejected (FN)"
-    )
+    figure, axes = panels(2 if log.clock_s is None else 3, (9.0, 6.0 if log.clock_s is None else 8.5))
+    draw_verified(axes[0], log.verified, window)
+    axes[0].set(ylabel=f"verified, last {window} [%]")
+    draw_errors(axes[1], log.false_positive, log.false_negative)
     axes[1].set(ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * max(log.false_positive.sum(), log.false_negative.sum())))
-    axes[1].yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    _legend(axes[1])
+    legend_above(axes[1])
     if log.clock_s is not None:
         _draw_rate(axes[2], log, log.clock_s, window)
+    if not len(log):
+        axes[0].text(0.5, 0.5, "no cycle was finished", transform=axes[0].transAxes, ha="center", va="center")
     axes[-1].set(xlabel="cycle")
     figure.suptitle(title)
     return figure
@@ -165,39 +135,11 @@ def _draw_rate(axes: Axes, log: RunLog, clock_s: Floats, window: int) -> None:
     x, took = np.arange(1, len(log) + 1), np.diff(clock_s, prepend=0.0)
     rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
     settled = x >= window  # a rate over few cycles is mostly luck
-    axes.plot(x[settled], rate[settled], color=BLUE, label="this run")
+    axes.plot(x[settled], rate[settled], color=GREEN, label="this run")
     if log.verified.any():
         # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
         seconds = float(np.median(took[log.verified])) * sliding_sum(np.ones(len(x)), window)
         always = 3600 * sliding_sum(log.truth == 1.0, window) / seconds
-        axes.plot(x[settled], always[settled], color=GREY, linestyle=":", label="had every part been verified")
+        axes.plot(x[settled], always[settled], color=VERIFIED, linestyle=":", label="had every part been verified")
     axes.set(ylabel=f"good parts/h, last {window}")
-    _legend(axes)
-
-
-def save(figure: Figure, path: str | Path, dpi: int = 120) -> Path:
-    """Write a figure as its suffix says; makes the folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
-    return path
-
-
-def _axes(rows: int, size: tuple[float, float], heights: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    axes = list(figure.subplots(rows, 1, sharex=True, height_ratios=heights))
-    for each in axes:
-        _plain(each)
-    return figure, axes
-
-
-def _plain(axes: Axes) -> None:
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _legend(axes: Axes, columns: int = 3) -> None:
-    # Above the axes: inside, it would lie on one curve or another.
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize=9, borderaxespad=0.2)
+    legend_above(axes)

@@ -6,16 +6,33 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..datasets import load_dataset
-from ..recipe import Recipe
+from ..recipe import RECIPES, Recipe
 from .replay import Replay, replay
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+def iterate_replays(
+    dataset: Any, tasks: Iterable[tuple[Any, int]], cycles: int | None = None, *, n_jobs: int = 1, **options: Any
+) -> Iterator[Replay]:
+    """The replay of each (recipe, seed), in that order, each as soon as it is done: what was finished can be kept.
+
+    options : as in `replay`. joblib runs them, with the backend that the caller picked (`joblib.parallel_config`).
+    """
+    from joblib import Parallel, delayed
+
+    data = load_dataset(dataset)
+    replays: Iterator[Replay] = Parallel(n_jobs=n_jobs, return_as="generator")(
+        delayed(replay)(data, Recipe.load(recipe), seed, cycles, **options) for recipe, seed in tasks
+    )
+    yield from replays
 
 
 def run_replays(
@@ -28,19 +45,10 @@ def run_replays(
     on_done: Callable[[Replay], None] | None = None,
     **options: Any,
 ) -> list[Replay]:
-    """Every recipe under every seed, in parallel; a list in that order. options : as in `replay`.
-
-    joblib runs them, with the backend that the caller picked (`joblib.parallel_config`).
-    """
-    from joblib import Parallel, delayed
-
-    data = load_dataset(dataset)
+    """Every recipe under every seed, in parallel; a list in that order. n_jobs, options : as in `iterate_replays`."""
     tasks = list(itertools.product([Recipe.load(r) for r in recipes], seeds))
-    jobs = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(replay)(data, recipe, seed, cycles, **options) for recipe, seed in tasks
-    )
     results = []
-    for result in jobs:
+    for result in iterate_replays(dataset, tasks, cycles, n_jobs=n_jobs, **options):
         results.append(result)
         if on_done is not None:
             on_done(result)
@@ -80,5 +88,7 @@ def run_grid(
 
 
 def name_of(recipe: Any) -> str:
-    """What to call a recipe in a table: its name, its file's name, or its reducer."""
-    return recipe.reducer if isinstance(recipe, Recipe) else Path(recipe).stem
+    """What to call a recipe in a table: the name or the file that was asked for, else its reducer."""
+    if isinstance(recipe, str | os.PathLike) and (str(recipe) in RECIPES or Path(recipe).is_file()):
+        return Path(recipe).stem
+    return Recipe.load(recipe).name

@@ -1,4 +1,4 @@
-"""What happened while an engine drove a live cell, cycle by cycle.
+"""What happened while an engine drove a cell, cycle by cycle: one record of live runs and of replays.
 
 log = watch(DataEngine(), SimulatedCell(cycles=600), cycles=600)
 log.stretches(6)
@@ -16,23 +16,33 @@ from numpy.typing import NDArray
 
 from ..cells.base import Cell
 from ..engine import DataEngine
-from ..records import Action, Cycle, RetrainReport
+from ..records import Action, Cycle, Decision, Outcome, RetrainReport
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunLog:
-    """One run of a cell.
+    """One run of a cell; n cycles were finished, which may be none.
 
     action : (n,) str, the engine's.  stopped : (n,) bool, the system stopped on an accepted part.
-    truth : (n,) float, 1 good, 0 bad, NaN where the cell does not tell: real ones tell only what was verified.
+    truth : (n,) 1 good, 0 bad, NaN where the cell does not tell: real ones tell only what was verified.
+    lower, upper, n_success, n_failure : (n,) the evidence.
+    position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
+    decide_seconds : (n,) wall time of each decision.
     clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
+    retrains : the reports of those that ended in this run.
     """
 
     action: NDArray[np.str_]
-    truth: NDArray[np.float64]
+    truth: NDArray[np.float64] | NDArray[np.bool_]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    n_success: NDArray[np.int64]
+    n_failure: NDArray[np.int64]
+    position: NDArray[np.float64]
+    decide_seconds: NDArray[np.float64]
     stopped: NDArray[np.bool_]
-    clock_s: NDArray[np.float64] | None
-    retrains: tuple[RetrainReport, ...]
+    clock_s: NDArray[np.float64] | None = None
+    retrains: tuple[RetrainReport, ...] = ()
 
     def __len__(self) -> int:
         return len(self.action)
@@ -43,71 +53,138 @@ class RunLog:
         return np.asarray(self.action == Action.VERIFY)
 
     @property
+    def accepted(self) -> NDArray[np.bool_]:
+        """(n,) the part went on without a check."""
+        return np.asarray(self.action == Action.ACCEPT)
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """(n,) the part went back to the bin without a check."""
+        return np.asarray(self.action == Action.REJECT)
+
+    @property
     def false_positive(self) -> NDArray[np.bool_]:
         """(n,) accepted and bad, as far as the truth is known."""
-        return np.asarray((self.action == Action.ACCEPT) & (self.truth == 0.0))
+        return np.asarray(self.accepted & (self.truth == 0.0))
 
     @property
     def false_negative(self) -> NDArray[np.bool_]:
         """(n,) rejected and good, as far as the truth is known."""
-        return np.asarray((self.action == Action.REJECT) & (self.truth == 1.0))
+        return np.asarray(self.rejected & (self.truth == 1.0))
 
     @property
     def finished(self) -> NDArray[np.bool_]:
-        """(n,) a good part was passed on."""
-        return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
+        """(n,) a good part was passed on, as far as the truth is known."""
+        return np.asarray(~self.rejected & (self.truth == 1.0))
 
-    def summary(self, part: slice = slice(None)) -> dict[str, Any]:
-        """Counts over all cycles, or a stretch of them; parts an hour where there is a clock."""
-        action = self.action[part]
-        first = part.start or 0
+    @property
+    def retrain_seconds(self) -> NDArray[np.float64]:
+        """Wall time of each retrain."""
+        return np.array([each.seconds for each in self.retrains], dtype=np.float64)
+
+    def summary(self) -> dict[str, Any]:
+        """Counts over all cycles; parts an hour where there is a clock."""
+        return self.stretch(slice(None))
+
+    def stretches(self, n: int) -> list[dict[str, Any]]:
+        """The run cut into at most n stretches of about equal length, each as in `stretch`."""
+        edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
+        return [self.stretch(slice(a, b)) for a, b in pairwise(edges)]
+
+    def stretch(self, part: slice) -> dict[str, Any]:
+        """Counts over some of the cycles; parts an hour where there is a clock."""
+        begin, end, _ = part.indices(len(self))
         return {
-            "first_cycle": first + 1,
-            "last_cycle": first + len(action),
-            "verified_share": float(self.verified[part].mean()) if len(action) else float("nan"),
+            "first_cycle": begin + 1,
+            "last_cycle": end,
+            "verified_share": float(self.verified[part].mean()) if end > begin else float("nan"),
             "verified": int(self.verified[part].sum()),
-            "accepted": int((action == Action.ACCEPT).sum()),
-            "rejected": int((action == Action.REJECT).sum()),
+            "accepted": int(self.accepted[part].sum()),
+            "rejected": int(self.rejected[part].sum()),
             "false_positive": int(self.false_positive[part].sum()),
             "false_negative": int(self.false_negative[part].sum()),
             "stops": int(self.stopped[part].sum()),
-            "parts_per_hour": self._parts_per_hour(part),
+            "parts_per_hour": self._parts_per_hour(begin, end),
         }
 
-    def stretches(self, n: int) -> list[dict[str, Any]]:
-        """The run cut into at most n stretches of about equal length, each as in `summary`."""
-        edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
-        return [self.summary(slice(a, b)) for a, b in pairwise(edges)]
-
-    def _parts_per_hour(self, part: slice) -> float | None:
-        if self.clock_s is None or not len(self):
+    def _parts_per_hour(self, begin: int, end: int) -> float | None:
+        if self.clock_s is None or end <= begin:
             return None
-        begin, end = part.indices(len(self))[:2]
         seconds = self.clock_s[end - 1] - (self.clock_s[begin - 1] if begin else 0.0)
-        return float(3600.0 * self.finished[part].sum() / seconds) if seconds > 0 else None
+        return float(3600.0 * self.finished[begin:end].sum() / seconds) if seconds > 0 else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """One cycle, and what the cell told about it on the side."""
+
+    cycle: Cycle
+    truth: float
+    clock: float | None
+
+
+class RunRecorder:
+    """Gathers a run while it happens, so that one that is broken off can still be shown.
+
+        recorder = RunRecorder(cell)
+        with suppress(KeyboardInterrupt):
+            recorder.follow(engine, cycles=600)
+        recorder.log()
+
+    `truth` and `clock` are read off a cell that has them.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self._seen: list[_Seen] = []
+
+    def follow(self, engine: DataEngine, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> None:
+        """Let the engine drive the cell, and gather every cycle. on_cycle : called after each."""
+        for cycle in engine.run(self.cell, cycles):
+            self.add(cycle)
+            if on_cycle is not None:
+                on_cycle(cycle)
+
+    def add(self, cycle: Cycle) -> None:
+        """Take in the cycle that was just finished, before the cell's next part."""
+        known = getattr(self.cell, "truth", cycle.success)
+        truth = float("nan") if known is None else float(known)
+        self._seen.append(_Seen(cycle, truth, getattr(self.cell, "clock", None)))
+
+    def log(self) -> RunLog:
+        """What was gathered so far."""
+        cycles = [each.cycle for each in self._seen]
+        decisions = [cycle.decision for cycle in cycles]
+        return RunLog(
+            action=np.array([str(d.action) for d in decisions], dtype=np.str_),
+            truth=np.array([each.truth for each in self._seen], dtype=np.float64),
+            lower=np.array([d.lower for d in decisions], dtype=np.float64),
+            upper=np.array([d.upper for d in decisions], dtype=np.float64),
+            n_success=np.array([d.n_success for d in decisions], dtype=np.int64),
+            n_failure=np.array([d.n_failure for d in decisions], dtype=np.int64),
+            position=_positions(decisions),
+            decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
+            stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
+            clock_s=self._clock(),
+            retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
+        )
+
+    def _clock(self) -> NDArray[np.float64] | None:
+        if getattr(self.cell, "clock", None) is None:
+            return None
+        return np.array([each.clock for each in self._seen], dtype=np.float64)
 
 
 def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> RunLog:
-    """Drive a cell and keep what figures and tables need. `truth` and `clock` are read off a cell that has them."""
-    action, truth, stopped, clock, retrains = [], [], [], [], []
-    for cycle in engine.run(cell, cycles):
-        action.append(str(cycle.decision.action))
-        truth.append(_truth(cell, cycle))
-        stopped.append(cycle.outcome == "stopped")
-        clock.append(getattr(cell, "clock", None))
-        if cycle.retrain is not None:
-            retrains.append(cycle.retrain)
-        if on_cycle is not None:
-            on_cycle(cycle)
-    return RunLog(
-        action=np.array(action),
-        truth=np.array(truth, dtype=np.float64),
-        stopped=np.array(stopped, dtype=bool),
-        clock_s=None if None in clock else np.array(clock, dtype=np.float64),
-        retrains=tuple(retrains),
-    )
+    """Drive a cell and keep what figures and tables need; `RunRecorder` is for a run that may be broken off."""
+    recorder = RunRecorder(cell)
+    recorder.follow(engine, cycles, on_cycle)
+    return recorder.log()
 
 
-def _truth(cell: Cell, cycle: Cycle) -> float:
-    known = getattr(cell, "truth", cycle.success)
-    return float("nan") if known is None else float(known)
+def _positions(decisions: list[Decision]) -> NDArray[np.float64]:
+    """(n, d): each embedding's mean over the K spaces, NaN where there is none."""
+    known = [None if d.embedding is None else np.mean(d.embedding, axis=0) for d in decisions]
+    width = next((len(z) for z in known if z is not None), 2)
+    blank = np.full(width, np.nan)
+    return np.array([blank if z is None else z for z in known], dtype=np.float64).reshape(len(known), width)

@@ -25,9 +25,13 @@ CONDITION = ["recipe", "interval", "alpha", "lower_bound"]
 COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative"]
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
 PROMISE = (
-    "The promise shown is the pooled one: of all parts accepted in all replays at most 1 - LB are bad (precision >= LB). "
-    "Rejected parts get no feedback but audits, so NPV promises nothing without them. Counts and saved seconds are means a "
-    "replay; saved are the checks left out, at 5 s each, and what stops and wrong rejects cost is not taken off."
+    "certain: cycles decided without a check, and their share of all cycles. accept, reject: such decisions; below them "
+    "the wrong ones, FP (bad parts accepted) and FN (good parts rejected). precision: the share of accepted parts that "
+    "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
+    "99th percentile. saved: checks left out, at 5 s each; what stops and wrong rejects cost is not taken off. Counts "
+    "and saved are means a replay; shares are pooled, that is, counted over the parts of all replays together. The "
+    "promise shown is the pooled one: at most 1 - LB of all accepted parts are bad (precision >= LB). Rejected parts get "
+    "no feedback but audits, so NPV promises nothing without them."
 )
 
 
@@ -83,6 +87,8 @@ def promise_kept(row: Mapping[str, Any]) -> bool | None:
 
 def promise_line(row: Mapping[str, Any]) -> str:
     """The promise of one row in words."""
+    if not row["total_accepted"]:
+        return f"{row['recipe']}: no part was accepted."
     verdict = {True: "kept", False: "broken", None: f"fewer than {ENOUGH} accepted parts, too few to say"}[
         promise_kept(row)
     ]
@@ -95,11 +101,12 @@ def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> T
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    look: dict[str, Any] = {"box": SIMPLE_HEAD, "pad_edge": False, "title_justify": "left", "caption_justify": "left"}
-    table = Table(title=title, caption=PROMISE, **look)
-    table.add_column("recipe")
+    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
+    look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
+    table = Table(title=f"\n{title}\n", caption=f"\n{PROMISE}\n", **look)
+    table.add_column("recipe\n ", overflow="fold")  # the one that gives way: 80 columns are enough for every number
     for name in _CELLS_OF:
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         table.add_row(str(row["recipe"]), *(show(row) for show in _CELLS_OF.values()))
     return table
@@ -119,9 +126,9 @@ _CELLS_OF: dict[str, Any] = {
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",
-    "retrain s\np50, max": lambda r: f"{_number(r['retrain_p50_s'], 3)}\n{_number(r['retrain_max_s'], 3)}",
-    "decide µs\np50, p99": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
-    "saved s\n ": lambda r: f"{r['saved_s']:.0f}\n",
+    "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
+    "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
+    "saved\ns": lambda r: f"{r['saved_s']:.0f}\n",
 }
 
 

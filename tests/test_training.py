@@ -1,0 +1,168 @@
+"""The scripts in training/: what they say of themselves is so, and small data does not break them."""
+
+import argparse
+import ast
+import importlib
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import click
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "training"
+SCRIPTS = sorted(FOLDER.glob("*.py"))
+Run = Callable[..., str]
+
+
+@pytest.fixture(autouse=True)
+def _beside_the_scripts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER))  # as `python training/NAME.py` has it
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs a script's main in this process; what it printed."""
+
+    def run_script(name: str, *words: object) -> str:
+        monkeypatch.setattr(sys, "argv", [f"training/{name}.py", *map(str, words)])
+        load(name).main()
+        return capsys.readouterr().out
+
+    return run_script
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """60 traces of 40 samples in two easy shapes."""
+    rng = np.random.default_rng(0)
+    y = rng.random(60) < 0.6
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (60, 40))
+    path = tmp_path_factory.mktemp("data") / "tiny.npz"
+    np.savez(path, X=X.astype(np.float32), y=y.astype(np.int8))
+    return path
+
+
+def load(name: str) -> ModuleType:
+    if name in ("make_insertion", "show_scenarios"):
+        pytest.importorskip("mujoco")
+    return importlib.import_module(name)
+
+
+class ParsedError(Exception):
+    """A parser, as complete as it is when the script asks it to parse."""
+
+
+def options_of(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Option or argument -> help."""
+    main = load(name).main
+    if isinstance(main, click.Command):
+        return {word: p.help or "" for p in main.params if isinstance(p, click.Option) for word in p.opts}
+
+    def parse(parser: argparse.ArgumentParser, *_: Any) -> None:
+        raise ParsedError(parser)
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    with pytest.raises(ParsedError) as parsed:
+        main()
+    actions = parsed.value.args[0]._actions
+    return {word: action.help or "" for action in actions for word in action.option_strings or [action.dest]}
+
+
+def commands_in(script: Path) -> list[list[str]]:
+    """The commands that a script's docstring names."""
+    text = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
+    return [shlex.split(line) for line in text.splitlines() if line.strip().startswith("python training/")]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_scripts_docstring_names_a_command_that_it_understands(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = commands_in(script)
+    assert commands
+    known = set(options_of(script.stem, monkeypatch))
+    for _, file, *words in commands:
+        assert file == f"training/{script.name}"
+        assert {word for word in words if word.startswith("--")} <= known
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_every_option_of_a_script_is_described(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not [option for option, text in options_of(script.stem, monkeypatch).items() if not text]
+
+
+def test_a_comparison_of_60_cycles_has_a_table_and_a_csv(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["report", "--data", tiny, "--reducers", "pca", "--seeds", "0:2", "--n-jobs", 1, "--out", tmp_path]
+    out = run("compare_reducers", *words)
+    assert "pca" in out
+    assert len((tmp_path / "report_tiny.csv").read_text().splitlines()) == 1 + 2 * 2
+
+
+def test_a_replay_that_was_compared_twice_counts_once(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["report", "--data", tiny, "--reducers", "pca", "--seeds", "0:2", "--policies", "0.1:0.9", "--n-jobs", 1]
+    first, second = (run("compare_reducers", *words, "--out", tmp_path).splitlines() for _ in range(2))
+    assert first[-2].split()[-2] == second[-2].split()[-2] == "2"  # the column of replays
+
+
+def test_choosing_among_tries_that_are_never_certain_says_so(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["choose", "--data", tiny, "--cycles", 10, "--reducers", "pca", "--seeds", "0:1", "--n-jobs", 1]
+    assert "Chosen: none" in run("compare_reducers", *words, "--out", tmp_path)
+
+
+def test_the_noise_check_takes_sets_of_fewer_than_1503_traces(run: Run, tiny: Path) -> None:
+    assert "of 60 cycles" in run("check_noise", "--data", tiny, "--reducer", "pca", "--seeds", "0:1")
+
+
+def test_an_exported_model_is_said_in_kilobytes(run: Run, tiny: Path, tmp_path: Path) -> None:
+    out = run("export_model", "--data", tiny, "--reducer", "pca", "--out", tmp_path / "m.ts")
+    assert " kB, 60 labelled references" in out
+    assert (tmp_path / "m.ts.sha256").is_file()
+
+
+def test_the_encoder_goes_on_from_its_last_step(tiny: Path) -> None:
+    from dengine import ModelPrediction, Recipe, load_dataset
+
+    model = ModelPrediction.from_recipe(Recipe.load("conv"))
+    history = load("train_encoder").train(model, load_dataset(tiny), 4)
+    assert history[-1]["held-out loss"] < history[0]["held-out loss"]
+
+
+def test_a_cycles_benchmark_has_empty_cells_for_what_never_happened() -> None:
+    benchmark = load("benchmark_cycle")
+    nothing, some = np.array([]), np.array([0.0352])
+    row = benchmark.row("decide and swap", nothing)
+    assert [benchmark.written(row[key], "ms") for key in ("median", "worst", "target")] == ["", "", ""]
+    assert benchmark.written(benchmark.row("retrain", some)["median"], "ms") == "35 ms"
+    assert np.isnan(benchmark.ratio("UMAP / retrain", some, nothing, 6.0)["worst"])
+
+
+def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import time
+
+    from dengine import Recipe, SqlStore, load_dataset
+
+    put_version = SqlStore.put_version
+
+    def slow(*words: Any) -> None:
+        time.sleep(0.4)
+        put_version(*words)
+
+    monkeypatch.setattr(SqlStore, "put_version", slow)
+    row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
+    assert row["retrain_p50_s"] >= 0.4
+
+
+def test_the_scale_benchmark_runs_on_stores_of_a_few_traces(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["--data", tiny, "--sizes", "60", "--windows", "20,30", "--repeats", 1, "--umap-most", 0, "--out", tmp_path]
+    out = run("benchmark_scale", *words, "--recipe", "pca")
+    assert "kB" in out
+    assert (tmp_path / "benchmark_scale.png").is_file()
+
+
+def test_the_recipes_are_written_where_they_are_asked_for(run: Run, tmp_path: Path) -> None:
+    run("write_recipes", "--out", tmp_path)
+    shipped = FOLDER.parent / "models" / "recipes"
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {p.name: p.read_text() for p in shipped.glob("*.toml")}
