@@ -1,10 +1,8 @@
-"""The data engine: decide, report, retrain, run.
+"""The data engine: decide, report, retrain, run. Source: the paper's section "Data engine".
 
-    engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95), store="engine.db")
-    for cycle in engine.run(cell, cycles=1503):
-        ...
-
-One loop for replay, simulation and a live cell. Source: the paper's section "Data engine".
+engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95), store="engine.db")
+for cycle in engine.run(cell, cycles=1503):
+    ...
 """
 
 from __future__ import annotations
@@ -23,15 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 from .cells.base import Cell
 from .deciding import DecisionMaker, source_of
 from .decision.policy import Policy
-from .errors import DengineError, ReportError, StoreError
-from .model.base import Exportable, Model
+from .errors import ReportError, StoreError
+from .model.base import EngineModel, Exportable, Model
 from .model.prediction import ModelPrediction
 from .model.rival import as_engine_model
 from .recipe import Recipe
 from .records import Action, Cycle, Decision, Outcome, RetrainReport, TraceSpec
 from .retraining import Clock, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, refuse_idle
-from .store.base import Store, open_store
+from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .traces import as_trace, spec_of
 from .versions import ModelVersions
@@ -79,20 +77,24 @@ class DataEngine:
         beside = {"radius": radius, "folds": folds, "retrain_every": retrain_every, "budget": budget, "policy": policy}
         if model is not None:
             refuse_idle(reducer, beside)
-        opened = open_store(store)
-        if opened.settings():
-            raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
-        self._start(EngineSettings(chosen_recipe(reducer, recipe, beside), seed), model, opened, executor, replaying, clock)
-        if trace is not None:
-            self.agree_on(trace)
-        self.store.save_settings(self._settings.to_store())
+        settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
+        settings, template = _with_template(settings, model)  # before a store is made: a wrong setting leaves none behind
+        with opening(store) as opened:
+            if opened.settings():
+                raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
+            self._start(settings, template, opened, executor, replaying, clock)
+            self.store.save_settings(self._settings.to_store())
 
     def _start(
-        self, settings: EngineSettings, model: Any, store: Store, executor: Executor | None, replaying: bool, clock: Clock
+        self,
+        settings: EngineSettings,
+        template: EngineModel,
+        store: Store,
+        executor: Executor | None,
+        replaying: bool,
+        clock: Clock,
     ) -> None:
         torch.set_num_threads(1)
-        template = ModelPrediction.from_recipe(settings.recipe, settings.seed) if model is None else as_engine_model(model)
-        settings = settings if model is None else settings.with_model(template)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._versions = ModelVersions(template, retrainer, store, clock)
@@ -122,15 +124,11 @@ class DataEngine:
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
         Raises StoreError where there is nothing to go on with, SettingError where an object is missing.
         """
-        store = open_store(url, must_exist=True)
-        try:
+        engine = cls.__new__(cls)
+        with opening(url, must_exist=True) as store:
             settings = EngineSettings.from_store(store.settings(), str(url), reducer, model)
-            engine = cls.__new__(cls)
-            engine._start(settings, model, store, executor, replaying, clock)
+            engine._start(*_with_template(settings, model), store, executor, replaying, clock)
             engine._versions.resume()
-        except DengineError:
-            store.close()
-            raise
         engine.resumed = True
         return engine
 
@@ -141,22 +139,16 @@ class DataEngine:
         settings : as `DataEngine` takes them. Of a used store they must be what it was made with, where they are given.
         Raises SettingError where they are others: a running cell's settings do not change in silence.
         """
-        opened = open_store(store)
-        if not opened.settings():
-            return cls(store=opened, seed=seed or 0, **settings)
-        options = {name: settings.pop(name) for name in ("model", "executor", "replaying", "clock") if name in settings}
-        own = settings.get("reducer")
-        engine = cls.open(opened, reducer=None if isinstance(own, str) else own, **options)
-        try:
+        with opening(store) as opened:
+            if not opened.settings():
+                return cls(store=opened, seed=seed or 0, **settings)
+            options = {name: settings.pop(name) for name in ("model", "executor", "replaying", "clock") if name in settings}
+            engine = cls.open(opened, reducer=settings.get("reducer"), **options)
             engine._settings.must_agree_with(seed=seed, **settings)
-        except DengineError:
-            engine.close()
-            raise
-        return engine
+            return engine
 
     def decide(self, trace: ArrayLike, *, wait: bool = False) -> Decision:
         """Decide on one trace, (T,) or (channels, T). TraceError for a wrong shape; whatever else fails becomes VERIFY.
-
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
         self._versions.collect()
@@ -298,3 +290,11 @@ class DataEngine:
             self._maker.agree_on(trace)
             self.store.save_settings(self._settings.to_store())
         return self._settings.trace or trace
+
+
+def _with_template(settings: EngineSettings, model: Model | None) -> tuple[EngineSettings, EngineModel]:
+    """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
+    if model is None:
+        return settings, ModelPrediction.from_recipe(settings.recipe, settings.seed)
+    template = as_engine_model(model)
+    return settings.with_model(template), template

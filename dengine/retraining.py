@@ -145,17 +145,17 @@ class Retrainer:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
         return self._pending is not None
 
-    def train(self, answering: EngineModel) -> Trained:
-        """Train in line."""
+    def train(self, current: EngineModel) -> Trained:
+        """Train a successor of the current model, in line."""
         begin, data = self.clock(), self.window.snapshot()
-        candidate = train_candidate(answering.successor(), data, self.limits, self.clock)
+        candidate = train_candidate(current.successor(), data, self.limits, self.clock)
         return self._note(Trained(candidate, data.seq, begin))
 
-    def start(self, answering: EngineModel) -> None:
-        """Train beside the cell."""
+    def start(self, current: EngineModel) -> None:
+        """Train a successor of the current model beside the cell."""
         assert self.executor is not None  # the caller asked; for the type checker
         data = self.window.snapshot()
-        future = self.executor.submit(_train_beside, answering.successor(), data, self.limits, self.clock)
+        future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock)
         self._pending = (future, data.seq)
 
     def collect(self, wait: bool = False) -> Trained | None:

@@ -50,7 +50,7 @@ class EngineSettings:
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
         recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
-        if reducer is not None:
+        if reducer is not None and not isinstance(reducer, str):
             recipe = replace(recipe, reducer=reducer, params={})
         elif str(recipe.reducer).startswith(OBJECT):
             raise SettingError(

@@ -27,7 +27,7 @@ from dengine import (
     wilson_interval,
 )
 from dengine.errors import SettingError
-from dengine.folds import content_fold
+from dengine.folds import content_fold, content_hash
 from dengine.model import Model
 from dengine.reducers.cross_fitting import LabelFree, as_reducer, uses_labels
 
@@ -163,13 +163,19 @@ def test_bounds_follow_from_counts_and_decisions_from_bounds(data: Dataset) -> N
 
 @pytest.mark.parametrize("reducer", ["pca", LinearDiscriminantAnalysis()], ids=["pca", "lda"])
 def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
-    newtons = ModelPrediction(reducer, classifier()).fit(data.X[:150], data.y[:150])
-    hashes_of_newtons = newtons.index.ring.spaces[:150].numpy()
-    radii = np.linalg.norm(newtons.index.ring.points[:, :150].numpy(), axis=0)
-    for k in range(newtons.n_spaces):
-        own = newtons.index.ring.points[:, :150].numpy().T[hashes_of_newtons == k]
+    X, y, queries, hashes = data.X[:150], data.y[:150], data.X[150:], content_hash(data.X[:150])
+    newtons = ModelPrediction(reducer, classifier()).fit(X, y, hashes=hashes)
+    smaller = ModelPrediction(reducer, classifier()).fit(1024 * X, y, hashes=hashes)  # a power of two: exact in floats
+    assert newtons.predict_interval(queries)[0].max() > 0.8
+    np.testing.assert_array_equal(smaller.count(1024 * queries), newtons.count(queries))
+
+
+@pytest.mark.parametrize("reducer", ["pca", LinearDiscriminantAnalysis()], ids=["pca", "lda"])
+def test_references_are_scaled_to_a_radius_of_one_in_each_space(reducer, data: Dataset) -> None:
+    index = (model := ModelPrediction(reducer, classifier()).fit(data.X, data.y)).index
+    for k in range(model.n_spaces):
+        own = index.points[index.spaces == k]
         assert np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean()) == pytest.approx(1.0, rel=1e-4)
-    assert radii.max() < 100
 
 
 def test_an_unfitted_model_says_what_to_do(data: Dataset) -> None:

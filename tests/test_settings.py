@@ -135,6 +135,13 @@ def test_other_settings_than_the_stores_are_an_error_that_names_both(other, name
         assert engine.policy == POLICY
 
 
+def test_a_wrong_setting_leaves_no_store_behind(tmp_path: Path) -> None:
+    for begin in (DataEngine, DataEngine.open_or_create):
+        with pytest.raises(SettingError):
+            begin(store=tmp_path / "engine.db", recipe=Recipe("pca", {"dims": 3}))
+    assert DataEngine("pca", store=tmp_path / "engine.db").store.settings()
+
+
 def test_a_file_that_is_not_there_is_not_opened(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="found no file"):
         DataEngine.open(tmp_path / "none.db")

@@ -54,21 +54,16 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
         """Forget everything, then hold embeddings Z (n, d) with labels y (n,) of at most two classes."""
         Z, y = validate_data(self, Z, y)
-        check_classification_targets(y)
-        self.classes_ = np.unique(np.asarray(y))
-        if len(self.classes_) > 2:
-            raise ValueError(
-                f"Only binary classification is supported. The type of the target is multiclass: {len(self.classes_)}."
-            )
+        self.classes_ = _classes(y)
         self._start(np.asarray(Z).shape[1])
         return self._add(Z, y)
 
     def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
         """Add embeddings Z (n, d) with labels y (n,) to what is held. `classes` names both, on the first call."""
-        first = not hasattr(self, "index_")
+        first = "index_" not in vars(self)
         Z, y = validate_data(self, Z, y, reset=first)
         if first:
-            self.classes_ = np.unique(np.asarray(y if classes is None else classes))
+            self.classes_ = _classes(y if classes is None else classes)
             self._start(np.asarray(Z).shape[1])
         unknown = np.setdiff1d(np.asarray(y), self.classes_)
         if len(unknown):
@@ -132,3 +127,15 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         tags = super().__sklearn_tags__()
         tags.classifier_tags.multi_class = False
         return tags
+
+
+def _classes(y: ArrayLike) -> NDArray[Any]:
+    """The classes among labels, two at most; ValueError in scikit-learn's words for more, and for continuous labels."""
+    check_classification_targets(y)
+    classes = np.unique(np.asarray(y))
+    if len(classes) > 2:
+        raise ValueError(
+            "Only binary classification is supported. The type of the target is multiclass: expected two classes, "
+            f"1 = success and 0 = failure, got {len(classes)}."
+        )
+    return classes

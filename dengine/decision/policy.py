@@ -83,7 +83,7 @@ class Neighbourhood:
 
     radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
     fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
-    reject_fraction : a second, smaller share that a rejection is judged by; None: the same ball for both. Successes and
+    reject_fraction : a second, smaller share that a rejection is decided by; None: the same ball for both. Successes and
         failures rarely come in equal numbers, and a ball wide enough to certify the many blurs the few.
     """
 

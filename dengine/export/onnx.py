@@ -176,10 +176,12 @@ class Twin(nn.Module):
     def inside(self, distances: Tensor, fraction: float) -> Tensor:
         """(n,) bool, as `ReferenceRing.count_near`."""
         if fraction == 0.0:
-            return distances <= self.radius * self.radius
+            ball: Tensor = distances <= self.radius * self.radius
+            return ball
         k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
         limit = distances.topk(k, largest=False)[0].max()
-        return (distances <= limit) & (limit < float("inf"))
+        within: Tensor = (distances <= limit) & (limit < float("inf"))
+        return within
 
     def bound(self, n_success: Tensor, n_failure: Tensor) -> tuple[Tensor, Tensor]:
         """`DecisionRule.bound` of two () float64; no neighbours: (0, 1)."""

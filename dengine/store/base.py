@@ -8,7 +8,8 @@ The database behind `SqlStore` lives in `sql.py`, so that importing this module 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -106,3 +107,15 @@ def open_store(store: str | os.PathLike[str] | Store | None, *, must_exist: bool
     if not isinstance(store, Store):
         raise StoreError(f"Expected None, a file, a URL or a Store, got {type(store).__name__}; see `Store`.")
     return store
+
+
+@contextmanager
+def opening(store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False) -> Iterator[Store]:
+    """`open_store`; where what follows fails, a store that was opened here is closed again."""
+    opened = open_store(store, must_exist=must_exist)
+    try:
+        yield opened
+    except BaseException:
+        if opened is not store:
+            opened.close()
+        raise
