@@ -1,4 +1,4 @@
-"""The estimator: scikit-learn's own checks, the empty ball, and one bound whoever computes it."""
+"""The estimator: the empty ball, and one bound whoever computes it; scikit-learn's checks are in test_estimators."""
 
 import numpy as np
 import pytest
@@ -6,24 +6,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.neighbors import RadiusNeighborsClassifier
-from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from dengine import INTERVALS, Action, Policy, WilsonRadiusClassifier
-from dengine.decision.neighbors import ReferenceRing
-from dengine.decision.policy import Neighbourhood
-from dengine.decision.rule import SCRIPTED_INTERVALS, make_judge, script
+from dengine.decision.rule import SCALAR_BOUNDS, script
 from dengine.errors import SettingError
-
-
-@parametrize_with_checks(
-    [
-        WilsonRadiusClassifier(),
-        WilsonRadiusClassifier(fraction=0.1, reject_fraction=0.05),
-        WilsonRadiusClassifier(interval="jeffreys"),
-    ]
-)
-def test_scikit_learns_estimator_checks_pass(estimator, check) -> None:
-    check(estimator)
 
 
 def blobs(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -88,12 +74,12 @@ def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
 # -------------------------------------------------------------------------------------------------- one bound
 
 
-@pytest.mark.parametrize("interval", SCRIPTED_INTERVALS)
+@pytest.mark.parametrize("interval", SCALAR_BOUNDS)
 @pytest.mark.parametrize("alpha", [0.01, 0.05, 0.1, 0.5])
 def test_the_scripted_bound_is_the_interval_to_twelve_digits(interval: str, alpha: float) -> None:
-    judge = script(make_judge(ReferenceRing(2, 4), Neighbourhood(), Policy(alpha, 0.9, interval)))
+    rule = script(Policy(alpha, 0.9, interval).rule())
     counts = [(s, f) for s in (0, 1, 2, 25, 95, 1000, 9999) for f in (0, 1, 5, 100, 9999)]
-    scripted = np.array([judge.bound(s, f) for s, f in counts])
+    scripted = np.array([rule(s, f)[1:] for s, f in counts])
     n_s, n_f = np.array(counts).T
     np.testing.assert_allclose(scripted.T, INTERVALS[interval](n_s, n_f, alpha), rtol=0, atol=1e-12)
 
@@ -110,12 +96,12 @@ def test_counts_of_references_become_the_wilson_interval(n_s: int, n_f: int, alp
 
 
 @pytest.mark.parametrize("shares", [{}, {"fraction": 0.2}, {"fraction": 0.3, "reject_fraction": 0.05}])
-def test_the_scripted_judge_equals_the_eager_one(shares) -> None:
+def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does(shares) -> None:
     Z, y = blobs()
     model = WilsonRadiusClassifier(radius=0.4, alpha=0.1, lower_bound=0.9, **shares).fit(Z, y)
-    scripted = script(model.new_judge(model.index_))
+    scripted = script(model.around(model.index_))
     queries = torch.rand(60, 1, 2, generator=torch.Generator().manual_seed(0)) * 4 - 2
-    assert [scripted(q) for q in queries] == [model.judge_(q) for q in queries]
+    assert [scripted(q) for q in queries] == [model.neighbours_(q) for q in queries]
 
 
 # ---------------------------------------------------------------------------------------------------- learning
@@ -148,9 +134,17 @@ def test_labels_of_one_class_count_as_what_they_are(label: int, counts: tuple[in
     assert tuple(int(c[0]) for c in model.count([[0.0, 0.0]])) == counts
 
 
-def test_a_label_outside_the_two_classes_is_refused() -> None:
-    with pytest.raises(ValueError, match="binary"):
-        WilsonRadiusClassifier().fit(np.zeros((3, 2)), [0, 1, 2])
+@pytest.mark.parametrize("learn", ["fit", "partial_fit"])
+def test_labels_of_three_classes_or_none_are_refused_in_scikit_learns_words(learn: str) -> None:
+    for labels, message in (
+        ([0, 1, 2], "Only binary classification is supported"),
+        ([0.1, 0.2, 0.3], "Unknown label type"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            getattr(WilsonRadiusClassifier(), learn)(np.zeros((3, 2)), labels)
+
+
+def test_a_label_that_the_first_call_did_not_name_is_refused() -> None:
     model = WilsonRadiusClassifier().fit(np.zeros((2, 2)), [0, 1])
     with pytest.raises(ValueError, match="Expected labels among"):
         model.partial_fit(np.zeros((1, 2)), [2])

@@ -9,11 +9,11 @@ from sklearn.base import clone
 from sklearn.utils import get_tags
 
 from dengine.errors import SettingError, TraceError
-from dengine.reducers.base import StopRule, content_fold
+from dengine.folds import content_fold
+from dengine.reducers.base import StopRule
 from dengine.reducers.conv import ConvReducer
 from dengine.reducers.logistic import CrossFittedScores
 
-BOTH = pytest.mark.parametrize("objective", ["supervised", "label_free"])
 STEPS = StopRule(max_steps=20)
 
 
@@ -28,9 +28,15 @@ def traces(n=160, channels=1, samples=152, seed=0):
     return X, y
 
 
-def fitted(objective="supervised", **params):
+def fitted(**params):
     X, y = traces()
-    return ConvReducer(objective=objective, **params).fit(X, y, stop=STEPS), X, y
+    return ConvReducer(**params).fit(X, y, stop=STEPS), X, y
+
+
+def train(reducer, X, y, stop=None):
+    """The engine's warm start; returns the reducer."""
+    reducer.train(X, y, content_fold(X, reducer.folds), stop)
+    return reducer
 
 
 @pytest.mark.parametrize("k", [0, 1, 2])
@@ -41,8 +47,8 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
     other[folds == k] = 1 - y[folds == k]
     one, two = ConvReducer(folds=3), ConvReducer(folds=3)
     for n in (60, 110, 160):
-        one.fit(X[:n], y[:n], folds=folds[:n])
-        two.fit(X[:n], other[:n], folds=folds[:n])
+        one.train(X[:n], y[:n], folds[:n])
+        two.train(X[:n], other[:n], folds[:n])
         other[folds == k] = rng.permutation(other[folds == k])  # other labels again at the next warm start
         a, b = one.embed(X), two.embed(X)
         assert np.array_equal(a[:, k], b[:, k])
@@ -59,56 +65,47 @@ def test_space_k_stays_the_same_where_a_step_limit_ends_the_fit():
     assert np.array_equal(a[:, 0], b[:, 0])
 
 
-def test_the_label_free_objective_reads_no_label():
+def test_the_features_read_no_label_and_the_heads_say_that_they_do():
     X, y = traces()
-    a = ConvReducer(objective="label_free").fit(X, y, stop=STEPS)
-    b = ConvReducer(objective="label_free").fit(X, stop=STEPS)
-    assert np.array_equal(a.embed(X), b.embed(X))
-    assert not get_tags(a).target_tags.required
+    a, b = (ConvReducer().fit(X, labels).net_.features.state_dict() for labels in (y, 1 - y))
+    assert all(torch.equal(a[name], b[name]) for name in a)
     assert get_tags(ConvReducer()).target_tags.required
 
 
-@BOTH
-@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize("n_components", [1, 2])
 @pytest.mark.parametrize(("samples", "channels"), [(152, 1), (400, 6), (800, 2), (1000, 1), (997, 3)])
-def test_every_length_and_number_of_channels_embeds_into_k_spaces_of_d(objective, dim, samples, channels):
+def test_every_length_and_number_of_channels_embeds_into_k_spaces_of_d(n_components, samples, channels):
     X, y = traces(60, channels, samples)
-    reducer = ConvReducer(objective=objective, dim=dim, folds=3).fit(X, y, stop=StopRule(max_steps=2))
+    reducer = ConvReducer(n_components=n_components, folds=3).fit(X, y, stop=StopRule(max_steps=2))
     Z = reducer.embed(X)
-    assert Z.shape == (60, reducer.n_spaces, dim)
+    assert Z.shape == (60, 3, n_components)
     assert Z.dtype == np.float32
     assert np.isfinite(Z).all()
-    assert reducer.transform(X).shape == (60, dim)
+    assert reducer.transform(X).shape == (60, n_components)
 
 
-@BOTH
-def test_embedding_in_the_own_space_picks_row_i_of_space_folds_i(objective):
-    reducer, X, _ = fitted(objective)
+def test_embedding_in_the_own_space_picks_row_i_of_space_folds_i():
+    reducer, X, _ = fitted()
     folds = content_fold(X, 5)
-    own = folds if objective == "supervised" else np.zeros_like(folds)
-    assert np.array_equal(reducer.embed_own(X, folds), reducer.embed(X)[np.arange(len(X)), own])
+    assert np.array_equal(reducer.embed_own(X, folds), reducer.embed(X)[np.arange(len(X)), folds])
 
 
-@BOTH
-def test_fitted_traces_are_placed_without_a_second_pass_where_a_pass_would_place_them(objective):
-    reducer, X, _ = fitted(objective)
-    folds = content_fold(X, 5)
-    fast, slow = reducer.embed_fitted(X, folds), reducer.embed_own(X, folds)
-    assert np.abs(fast - slow).max() <= 1e-6
-    again = clone(reducer).set_state(reducer.get_state())  # resumed, it holds no features of the last fit
-    assert np.array_equal(again.embed_fitted(X, folds), slow)
+def test_training_places_its_traces_without_a_second_pass_where_a_pass_would_place_them():
+    X, y = traces()
+    reducer, folds = ConvReducer(), content_fold(X, 5)
+    placed = reducer.train(X, y, folds, STEPS)
+    assert placed.shape == (len(X), 2)
+    assert np.abs(placed - reducer.embed_own(X, folds)).max() <= 1e-6
 
 
-@BOTH
-def test_one_trace_alone_lands_where_it_does_in_a_batch(objective):
-    reducer, X, _ = fitted(objective)
+def test_one_trace_alone_lands_where_it_does_in_a_batch():
+    reducer, X, _ = fitted()
     single = np.concatenate([reducer.embed(x[None]) for x in X])
     assert np.abs(single - reducer.embed(X)).max() <= reducer.single_tolerance
 
 
-@BOTH
-def test_scripted_and_frozen_the_module_answers_as_the_reducer_does(objective, tmp_path):
-    reducer, X, _ = fitted(objective)
+def test_scripted_and_frozen_the_module_answers_as_the_reducer_does(tmp_path):
+    reducer, X, _ = fitted()
     frozen = torch.jit.freeze(torch.jit.script(reducer.module()))
     torch.jit.save(frozen, tmp_path / "conv.ts")
     loaded = torch.jit.load(tmp_path / "conv.ts")
@@ -119,36 +116,37 @@ def test_scripted_and_frozen_the_module_answers_as_the_reducer_does(objective, t
         assert np.abs(Z - reducer.embed(X[:7])).max() <= 1e-6
 
 
-@BOTH
-def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit(objective):
-    reducer, X, y = fitted(objective)
+def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit():
+    reducer, X, y = fitted()
     state = reducer.get_state()
     again = clone(reducer).set_state(state)
     assert np.array_equal(again.embed(X), reducer.embed(X))
     assert again.holdout_loss_ == reducer.holdout_loss_
     X2, y2 = np.concatenate([X, traces(seed=5)[0]]), np.concatenate([y, traces(seed=5)[1]])
-    assert np.array_equal(again.fit(X2, y2, stop=STEPS).embed(X), reducer.fit(X2, y2, stop=STEPS).embed(X))
+    cold = clone(reducer).fit(X2, y2, stop=STEPS).embed(X)
+    trained_on = train(again, X2, y2, STEPS).embed(X)
+    assert np.array_equal(trained_on, train(reducer, X2, y2, STEPS).embed(X))
+    assert not np.array_equal(trained_on, cold)  # it went on from where it was
     assert all(isinstance(value, np.ndarray) for value in state.values())
 
 
-@BOTH
-def test_a_seed_repeats_exactly_and_a_clone_starts_cold(objective):
-    reducer, X, y = fitted(objective)
+def test_a_seed_repeats_exactly_and_a_clone_starts_cold():
+    reducer, X, y = fitted()
     assert np.array_equal(clone(reducer).fit(X, y, stop=STEPS).embed(X), reducer.embed(X))
 
 
-def test_a_refit_on_the_same_labels_does_not_move_the_map():
+def test_a_retrain_on_the_same_labels_does_not_move_the_map():
     reducer, X, y = fitted()
     before = reducer.embed(X)
-    reducer.fit(X, y)
-    assert reducer.n_steps_ <= 3
+    train(reducer, X, y)
+    assert reducer.n_iter_ <= 3
     assert np.abs(reducer.embed(X) - before).max() < 1e-3
 
 
 def test_a_warm_start_ends_where_a_cold_start_does():
     X, y = traces(300)
     cold = ConvReducer().fit(X, y)
-    warm = clone(cold).set_state(cold.get_state()).fit(X[:100], y[:100]).fit(X, y)
+    warm = train(train(clone(cold).set_state(cold.get_state()), X[:100], y[:100]), X, y)
     assert np.abs(warm.embed(X)[:, :, 0] - cold.embed(X)[:, :, 0]).max() < 1e-3
 
 
@@ -177,31 +175,21 @@ def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_th
     assert reducer.holdout_loss_ < base
 
 
-def test_the_plane_gets_better_at_keeping_neighbours():
-    X, _ = traces(300)
-    short, long = (
-        ConvReducer(objective="label_free").fit(X, stop=StopRule(max_steps=steps)).holdout_loss_ for steps in (5, 200)
-    )
-    assert long < short
-
-
-@BOTH
-def test_no_step_begins_after_the_deadline(objective):
+def test_no_step_begins_after_the_deadline():
     X, y = traces()
     ticks = iter(range(1000))
-    reducer = ConvReducer(objective=objective).fit(X, y, stop=StopRule(deadline=3.0, clock=lambda: float(next(ticks))))
-    assert reducer.n_steps_ == 3
-    late = ConvReducer(objective=objective).fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
-    assert late.n_steps_ == 0
+    reducer = ConvReducer().fit(X, y, stop=StopRule(deadline=3.0, clock=lambda: float(next(ticks))))
+    assert reducer.n_iter_ == 3
+    late = ConvReducer().fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
+    assert late.n_iter_ == 0
     assert np.isfinite(late.embed(X)).all()
 
 
-@BOTH
-def test_dead_channels_and_huge_scales_embed_finitely(objective):
+def test_dead_channels_and_huge_scales_embed_finitely():
     X, y = traces(80, channels=2)
     X[:, 1] = 7.0
     X[:, 0] = X[:, 0] * 1e6 + 1e7
-    reducer = ConvReducer(objective=objective).fit(X, y, stop=STEPS)
+    reducer = ConvReducer().fit(X, y, stop=STEPS)
     Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
     assert np.isfinite(Z).all()
 
@@ -217,7 +205,7 @@ def test_more_traces_move_the_map_less_and_less():
     for seed in range(6):  # a doubling moves the map by luck too, so on the average of some streams
         X, y = traces(640, seed=seed)
         reducer = ConvReducer()
-        maps = [reducer.fit(X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
+        maps = [train(reducer, X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
         moves += [np.abs(b - a).mean() / 6 for a, b in pairwise(maps)]
     assert moves[0] > moves[1] > moves[2]
     assert moves[2] < 0.05
@@ -226,7 +214,7 @@ def test_more_traces_move_the_map_less_and_less():
 def test_too_little_to_learn_from_is_said_clearly():
     X, y = traces()
     with pytest.raises(SettingError, match="at least 20 traces, got 12"):
-        ConvReducer().fit(X[:12], y[:12])
+        train(ConvReducer(), X[:12], y[:12])
     with pytest.raises(SettingError, match="both classes outside fold 0"):
         ConvReducer(folds=2).fit(X, np.ones(len(X), dtype=int))
     folds = np.zeros(len(X), dtype=np.int64)
@@ -239,12 +227,12 @@ def test_too_little_to_learn_from_is_said_clearly():
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        ({"dim": 3}, "dim 1 or 2"),
+        ({"n_components": 3}, "n_components 1 or 2"),
         ({"folds": 1}, "folds >= 2"),
-        ({"objective": "both"}, "objective among"),
+        ({"max_iter": 0}, "max_iter >= 1"),
         ({"l2": 0.0}, "l2 > 0"),
         ({"filters": 0}, "filters >= 1"),
-        ({"segments": 100}, "at least 200 samples"),
+        ({"segments": 0}, "segments >= 1"),
     ],
 )
 def test_a_setting_out_of_range_is_named(params, message):
@@ -253,9 +241,23 @@ def test_a_setting_out_of_range_is_named(params, message):
         ConvReducer(**params).fit(X, y)
 
 
+@pytest.mark.parametrize("samples", [2, 3, 7, 15])
+def test_a_trace_too_short_for_its_segments_has_fewer_of_them(samples):
+    X, y = traces(samples=152)
+    short = np.ascontiguousarray(X[:, :, :: 152 // samples][:, :, :samples])
+    reducer = ConvReducer(segments=100).fit(short, y)
+    assert reducer.net_.features.segments == samples // 2
+    assert np.isfinite(reducer.embed(short)).all()
+
+
+def test_a_single_sample_is_no_trace():
+    with pytest.raises(SettingError, match="at least 2 samples, got 1"):
+        ConvReducer().fit(np.arange(30.0)[:, None], np.arange(30) % 2)
+
+
 def test_a_trace_of_another_shape_is_an_error_that_names_both():
     reducer, X, _ = fitted()
-    with pytest.raises(TraceError, match="1 channels x 152 samples, got 1 x 150"):
+    with pytest.raises(TraceError, match=r"1 channels x 152 samples, as in fit, got 1 x 150"):
         reducer.embed(X[:, :, :150])
 
 
@@ -270,13 +272,13 @@ def test_a_head_that_would_do_worse_than_the_base_rate_keeps_its_earlier_weights
     y = torch.from_numpy((rng.random(2000) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64))
     folds = torch.from_numpy(rng.integers(0, 2, 2000))
     heads = CrossFittedScores(50, folds=2, dim=1)
-    heads.train_on(g, y, folds, 0.01, None)
+    heads.train_on(g, y, folds, 0.01, 12, None)
     learned = heads.weight.clone()
     assert not heads.kept.any()
     few = torch.cat(
         [(folds == 0).nonzero()[:40, 0], (folds == 1).nonzero()[:900, 0]]
     )  # head 1 sees forty rows, head 0 enough
-    heads.train_on(g[few], y[few], folds[few], 0.01, None)
+    heads.train_on(g[few], y[few], folds[few], 0.01, 12, None)
     assert heads.kept.tolist() == [False, True]
     assert torch.equal(heads.weight[1], learned[1])
     assert not torch.equal(heads.weight[0], learned[0])
@@ -288,6 +290,6 @@ def test_features_standardised_anew_leave_the_scores_of_a_warm_start_where_they_
     before = reducer.embed(X)
     with torch.no_grad():
         features, head = reducer.net_.features, reducer.net_.head
-        _, ratio, shift = features.standardise(reducer.raw_features(X[:, None, :] if X.ndim == 2 else X))
+        _, ratio, shift = features.standardise(reducer.raw_features(X))
         head.carry_over(ratio, shift)
     assert np.abs(reducer.embed(X)[..., 0] - before[..., 0]).max() < 0.02  # but for what is clipped

@@ -18,7 +18,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin
-from sklearn.utils.validation import check_array, check_is_fitted, validate_data
+from sklearn.utils import ClassifierTags
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import assert_all_finite, check_array, check_is_fitted, column_or_1d, validate_data
 
 from ..errors import SettingError, TraceError
 
@@ -132,32 +134,46 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         if not reset:
             check_is_fitted(self)
-        shape = np.shape(X)
-        if len(shape) == 3:
-            x = check_array(X, dtype=np.float32, order="C", allow_nd=True, ensure_min_samples=int(reset), estimator=self)
-            if 0 in x.shape[1:]:
-                raise TraceError(f"Expected traces with samples, got shape {shape}.")
-            if reset:
-                self.n_features_in_ = x.shape[1] * x.shape[2]
-        else:
-            x = validate_data(self, X, reset=reset, dtype=np.float32, order="C", ensure_min_samples=int(reset))[:, None, :]
+        x = np.asarray(
+            check_array(
+                X,
+                dtype=np.float32,
+                order="C",
+                allow_nd=True,
+                force_writeable=True,  # torch warns of an array that it could not write to
+                ensure_min_samples=int(reset),
+                estimator=self,
+                input_name="X",
+            )
+        )
+        if x.ndim > 3 or 0 in x.shape[1:]:
+            raise TraceError(f"Expected traces (n, samples) or (n, channels, samples) with samples, got shape {x.shape}.")
+        traces = x[:, None, :] if x.ndim == 2 else x
+        if reset or x.ndim == 2:  # only a table's columns have names and a number to compare
+            validate_data(self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True)
+        self._match_shape(traces, reset)
+        return traces
+
+    def _match_shape(self, traces: Floats, reset: bool) -> None:
         if reset:
-            self.trace_shape_ = x.shape[1:]
-        elif x.shape[1:] != self.trace_shape_:
+            self.trace_shape_ = traces.shape[1:]
+        elif traces.shape[1:] != self.trace_shape_:
             channels, samples = self.trace_shape_
             raise TraceError(
-                f"Expected traces of {channels} channels x {samples} samples, as in fit, got {x.shape[1]} x {x.shape[2]}; "
-                "resample, or fit a fresh clone."
+                f"Expected traces of {channels} channels x {samples} samples, as in fit, got {traces.shape[1]} x "
+                f"{traces.shape[2]}; resample, or fit anew."
             )
-        return np.asarray(x)
 
     @property
     def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
+        check_is_fitted(self)
         return int(self.get_params(deep=False)["n_components"])
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.target_tags.required = self.uses_labels
+        if self.uses_labels:
+            tags.classifier_tags = ClassifierTags(multi_class=False)  # no classifier, but its labels are of two classes
         tags.transformer_tags.preserves_dtype = ["float32"]
         return tags
 
@@ -167,6 +183,12 @@ def as_points(Z: Any) -> Floats:
     return np.ascontiguousarray(Z, dtype=np.float32)
 
 
+def as_rows(traces: Floats) -> Floats:
+    """(n, C, T) -> (n, C * T), of no traces as well."""
+    n, channels, samples = traces.shape
+    return traces.reshape(n, channels * samples)
+
+
 def own_places(Z: Floats, folds: Ints) -> Floats:
     """(n, K, d) -> (n, d), row i of space folds[i]; of one space, all of it."""
     own = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
@@ -174,19 +196,40 @@ def own_places(Z: Floats, folds: Ints) -> Floats:
 
 
 def binary_labels(y: Any, n: int, name: str) -> Ints:
-    """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are."""
+    """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are. SettingError for others."""
     if y is None:
         raise SettingError(f"{name} uses labels: requires y to be passed, but the target y is None.")
-    labels = np.asarray(y)
+    labels = _class_labels(y)
+    if len(labels) != n:
+        raise SettingError(f"Expected a label for each of {n} traces, got inconsistent numbers of samples: {len(labels)}.")
     classes = np.unique(labels)
-    if labels.shape != (n,) or len(classes) > 2:
+    if len(classes) > 2:
         raise SettingError(
-            f"Expected {n} labels of two classes, 1 = success and 0 = failure, got shape {labels.shape} "
-            f"and {len(classes)} classes."
+            "Only binary classification is supported. The type of the target is multiclass: expected two classes, "
+            f"1 = success and 0 = failure, got {len(classes)}."
         )
     if np.isin(classes, (0, 1)).all():
         return labels.astype(np.int64)
     return np.asarray(labels == classes[-1], dtype=np.int64)
+
+
+def _class_labels(y: Any) -> NDArray[Any]:
+    """Y as (n,) labels of classes; scikit-learn's words where it is continuous, not finite or not one column."""
+    try:
+        labels = column_or_1d(y, warn=True)
+        assert_all_finite(labels, input_name="y")
+        check_classification_targets(labels)
+    except ValueError as error:
+        raise SettingError(str(error)) from error
+    return np.asarray(labels)
+
+
+def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
+    """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
+    return SettingError(
+        f"Expected both classes outside fold {fold}, got {n} traces of {classes} class; "
+        "collect more labels before the first fit."
+    )
 
 
 def seed_of(random_state: Any) -> int | None:

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.utils import get_tags
+from sklearn.utils.validation import check_is_fitted
 
 from ..errors import SettingError
 from ..folds import content_fold
-from .base import Floats, Ints, Reducer, StopRule, as_points, binary_labels
+from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows, binary_labels, one_class_outside
 
 
 def uses_labels(transformer: Any) -> bool:
@@ -47,10 +48,11 @@ class _Wrapping(Reducer):
 
     def handed(self, X: Floats) -> Any:
         """Traces (n, C, T) as the transformer takes them: ours as they are, scikit-learn's as rows."""
-        return X if isinstance(self.reducer, Reducer) else X.reshape(len(X), -1)
+        return X if isinstance(self.reducer, Reducer) else as_rows(X)
 
     @property
     def _n_features_out(self) -> int:
+        check_is_fitted(self)
         return self.dim_
 
 
@@ -72,7 +74,8 @@ class LabelFree(_Wrapping):
 
     def transform(self, X: ArrayLike) -> Floats:
         """(n, T) or (n, C, T) -> (n, d)."""
-        return as_points(self.reducer_.transform(self.handed(self.check_traces(X))))
+        handed = self.handed(self.check_traces(X))
+        return as_points(self.reducer_.transform(handed))
 
 
 class CrossFitted(_Wrapping):
@@ -106,8 +109,9 @@ class CrossFitted(_Wrapping):
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
         for k, outside in self._outside(folds):
             # Fold k never trains clone k, or its labels would count themselves.
-            if len(np.unique(labels[outside])) < 2:
-                raise SettingError(f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of 1 class.")
+            classes = len(np.unique(labels[outside]))
+            if classes < 2:
+                raise one_class_outside(k, int(outside.sum()), classes)
             self.clones_[k].fit(self.handed(traces[outside]), labels[outside])
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
@@ -121,9 +125,16 @@ class CrossFitted(_Wrapping):
 
     def embed(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, K, d)."""
-        handed = self.handed(self.check_traces(X))
-        return np.stack([as_points(each.transform(handed)) for each in self.clones_], axis=1)
+        return self._in_every_space(self.handed(self.check_traces(X)))
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in."""
-        return np.asarray(self.embed(self.check_traces(X)).mean(axis=1))
+        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in.
+
+        Each trace alone, as a cell decides: in a batch its last bits would depend on what is beside it.
+        """
+        handed = self.handed(self.check_traces(X))
+        alone = (handed[i : i + 1] for i in range(max(1, len(handed))))
+        return np.concatenate([self._in_every_space(x).mean(axis=1) for x in alone])
+
+    def _in_every_space(self, handed: Any) -> Floats:
+        return np.stack([as_points(each.transform(handed)) for each in self.clones_], axis=1)

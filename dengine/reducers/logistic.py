@@ -6,8 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..errors import SettingError
-from .base import StopRule
+from .base import StopRule, one_class_outside
 
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 CONVERGED = 1e-5  # largest change of a weight
@@ -68,11 +67,9 @@ class CrossFittedScores(nn.Module):
 
     def _head(self, k: int, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> "_NewtonHead":
         # Fold k never trains head k, or its labels would count themselves.
-        if len(torch.unique(y[outside])) < 2:
-            raise SettingError(
-                f"Expected both classes outside fold {k}, got {int(outside.sum())} traces of one; "
-                "collect more labels before the first fit."
-            )
+        classes = len(torch.unique(y[outside]))
+        if classes < 2:
+            raise one_class_outside(k, int(outside.sum()), classes)
         row = k * self.dim
         start = torch.cat([self.weight[row], self.bias[row : row + 1]]).double()
         return _NewtonHead(g[outside], y[outside].double(), start, l2)

@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
 from ..errors import SettingError
-from .base import Floats, Reducer
+from .base import Floats, Reducer, as_rows
 
 
 class PcaReducer(Reducer):
@@ -26,7 +26,7 @@ class PcaReducer(Reducer):
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for no more traces than dimensions."""
-        rows = _rows(self.check_traces(X, reset=True))
+        rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:
             raise SettingError(
                 f"PCA to {self.n_components} dimensions needs more than {self.n_components} traces, "
@@ -42,8 +42,16 @@ class PcaReducer(Reducer):
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, n_components) float32."""
-        return np.asarray((_rows(self.check_traces(X)) - self.mean_) @ self.components_.T)
+        """(n, T) or (n, C, T) -> (n, n_components) float32; each trace alone, so that none moves by what is beside it."""
+        rows = as_rows(self.check_traces(X))
+        return np.array([self._project(row) for row in rows], dtype=np.float32).reshape(len(rows), len(self.components_))
+
+    def embed(self, X: Floats) -> Floats:
+        """(n, C, T) -> (n, 1, n_components) float32, in one product."""
+        return self._project(as_rows(self.check_traces(X)))[:, None, :]
+
+    def _project(self, rows: Floats) -> Floats:
+        return np.asarray((rows - self.mean_) @ self.components_.T)
 
     def module(self) -> nn.Module:
         """(B, C, T) -> (B, 1, n_components)."""
@@ -61,11 +69,6 @@ class PcaReducer(Reducer):
         self.n_features_in_ = len(self.mean_)
         self.trace_shape_ = tuple(int(n) for n in state.get("shape", (1, self.n_features_in_)))  # 0.1 kept no shape
         return self
-
-
-def _rows(traces: Floats) -> Floats:
-    """(n, C, T) -> (n, C * T)."""
-    return traces.reshape(len(traces), -1)
 
 
 class _Projection(nn.Module):

@@ -8,6 +8,7 @@ So a trace's features are computed once and kept, and a retrain is the heads' cl
 Source: Dempster, Schmidt and Webb (2021), MiniRocket, KDD; arXiv:2012.08791. Here with one bias a kernel and dilation.
 """
 
+from hashlib import blake2b
 from itertools import combinations
 from typing import Any
 
@@ -17,7 +18,6 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
-from ..folds import content_hash
 from .base import Floats
 from .features import Features
 from .scored import FeatureReducer
@@ -92,19 +92,24 @@ class RocketReducer(FeatureReducer):
 
     def make_features(self, channels: int, samples: int) -> Features:
         """Shares of positive values."""
-        self._kept: dict[int, Any] = {}
         return RocketFeatures(channels, samples, self.dilations)
+
+    def _build(self, channels: int, samples: int) -> None:
+        super()._build(channels, samples)
+        # Features of other biases must not be read again. A tensor for all: one each would pickle them all with each.
+        self._kept: dict[bytes, int] = {}
+        self._kept_features = torch.empty(0, len(self.net_.features.gain))
 
     def raw_features(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P): computed once a trace and kept, since no kernel or bias ever changes."""
-        hashes = content_hash(traces).tolist()
-        new = [i for i, h in enumerate(hashes) if h not in self._kept]
-        if new:
-            for i, row in zip(new, super().raw_features(traces[new]), strict=True):
-                self._kept[hashes[i]] = row
-        features = torch.stack([self._kept[h] for h in hashes])
-        self._kept = dict(zip(hashes, features, strict=True))  # what has left the window leaves here too
-        return features
+        keys = [blake2b(trace, digest_size=16).digest() for trace in traces]  # exact: a fold's hash is of rounded samples
+        new = [i for i, key in enumerate(keys) if key not in self._kept]
+        known = self._kept | {keys[i]: len(self._kept_features) + j for j, i in enumerate(new)}
+        rows = torch.cat([self._kept_features, super().raw_features(traces[new])]) if new else self._kept_features
+        # What has left the window leaves here too.
+        self._kept_features = rows[[known[key] for key in keys]]
+        self._kept = {key: i for i, key in enumerate(keys)}
+        return self._kept_features
 
 
 def _kernels() -> Tensor:

@@ -43,7 +43,7 @@ class FeatureReducer(Reducer):
     """Trace -> point, by features and cross-fitted logistic heads: axis 1 is a probability, its own unit.
 
     A kind has parameters `n_components` (d, 1 or 2), `folds` (K), `l2`, `max_iter` and `random_state` at least.
-    `n_steps_` counts the steps of the last fit. `holdout_loss_` is its held-out log loss: head k's is the leave-one-out
+    `n_iter_` counts the steps of the last fit. `holdout_loss_` is its held-out log loss: head k's is the leave-one-out
     loss on rows outside fold k (`holdout_losses_` (K,)). `note_` says what the fit has to tell, a head that kept its
     earlier weights for one.
     """
@@ -110,7 +110,7 @@ class FeatureReducer(Reducer):
             head.carry_over(ratio, shift)  # a warm start begins where the last fit ended
             rows = torch.from_numpy(self._sample(len(g)))
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
-            self.n_steps_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
+            self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
         self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
         self.n_fits_ += 1
         return g
@@ -135,7 +135,7 @@ class FeatureReducer(Reducer):
     def report(self) -> FitReport:
         """Newton steps, held-out loss, and which heads kept their weights."""
         check_is_fitted(self, "net_")
-        return FitReport(self.n_steps_, self.holdout_loss_, self.note_)
+        return FitReport(self.n_iter_, self.holdout_loss_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
         """(n, T) or (n, C, T) -> (n, K, d) float32: every trace in every space."""
@@ -145,8 +145,14 @@ class FeatureReducer(Reducer):
         return out
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in."""
-        return np.asarray(self.embed(X).mean(axis=1))
+        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in.
+
+        Each trace alone, as a cell decides: in a batch its last bits would depend on what is beside it.
+        """
+        traces = torch.from_numpy(self.check_traces(X))
+        alone = (traces[i : i + 1] for i in range(max(1, len(traces))))
+        with torch.inference_mode():
+            return np.asarray(torch.cat([self.net_(x).mean(1) for x in alone]).numpy())
 
     def module(self) -> nn.Module:
         """The embedding, (B, C, T) -> (B, K, d), ready to be scripted and frozen."""
@@ -156,7 +162,7 @@ class FeatureReducer(Reducer):
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Plain arrays: all that answers and goes on training, bit for bit."""
         check_is_fitted(self, "net_")
-        own = {"shape": np.array(self.trace_shape_), "n_fits": np.array(self.n_fits_), "n_steps": np.array(self.n_steps_)}
+        own = {"shape": np.array(self.trace_shape_), "n_fits": np.array(self.n_fits_), "n_steps": np.array(self.n_iter_)}
         own["holdout_losses"] = np.array(self.holdout_losses_)
         return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
 
@@ -168,7 +174,7 @@ class FeatureReducer(Reducer):
         self._build(channels, samples)
         net = {name[4:]: torch.from_numpy(np.array(value)) for name, value in state.items() if name.startswith("net.")}
         self.net_.load_state_dict(net)
-        self.n_fits_, self.n_steps_ = int(state["n_fits"]), int(state["n_steps"])
+        self.n_fits_, self.n_iter_ = int(state["n_fits"]), int(state["n_steps"])
         self._tell(state["holdout_losses"], [])
         return self
 

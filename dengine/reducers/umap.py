@@ -6,11 +6,12 @@ import warnings
 from typing import Any, Self
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from ..errors import SettingError
-from .base import Floats, Ints, Reducer, StopRule, as_points
+from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
 
 
 class UmapReducer(Reducer):
@@ -47,7 +48,7 @@ class UmapReducer(Reducer):
             )
         from umap import UMAP
 
-        with _Quiet():
+        with _Contained():
             self.umap_ = UMAP(
                 n_components=self.n_components,
                 n_neighbors=self.n_neighbors,
@@ -55,7 +56,7 @@ class UmapReducer(Reducer):
                 n_epochs=self.n_epochs,
                 random_state=self.random_state,
                 n_jobs=1,
-            ).fit(traces.reshape(len(traces), -1))
+            ).fit(as_rows(traces))
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
@@ -66,14 +67,24 @@ class UmapReducer(Reducer):
         """(n, T) or (n, C, T) -> (n, n_components) float32."""
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
-        with _Quiet():
-            return np.asarray(self.umap_.transform(traces.reshape(len(traces), -1)), dtype=np.float32)
+        with _Contained():
+            return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
 
 
-class _Quiet(warnings.catch_warnings):
-    """umap-learn warns that a seed means one thread, which is what is asked for; spectral fallbacks are its own."""
+class _Contained(warnings.catch_warnings):
+    """What umap-learn does beyond its task stays here: its warnings, and the number of threads.
+
+    It warns that a seed means one thread, which is what is asked for; spectral fallbacks are its own. Its first kernel
+    makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others on a busy machine.
+    """
 
     def __enter__(self) -> None:
         super().__enter__()
+        self.threads = torch.get_num_threads()
         warnings.filterwarnings("ignore", module=r"umap\..*")
         warnings.filterwarnings("ignore", module=r"sklearn\.manifold\..*")
+
+    def __exit__(self, *raised: Any) -> None:
+        super().__exit__(*raised)
+        if torch.get_num_threads() != self.threads:
+            torch.set_num_threads(self.threads)
