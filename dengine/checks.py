@@ -124,9 +124,7 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
     alone = np.concatenate([trained.embed(x[None]) for x in Q])
     radius = np.sqrt(together.var(axis=0).sum(axis=-1))  # (K,)
     moved = float((np.linalg.norm(alone - together, axis=2) / np.maximum(radius, 1e-12)).max())
-    assert moved <= trained.single_tolerance, (
-        f"a trace alone moves by {moved:.2g}, more than {trained.single_tolerance:g}"
-    )
+    assert moved <= trained.single_tolerance, f"a trace alone moves by {moved:.2g}, more than {trained.single_tolerance:g}"
 
 
 def embedding_leaves_the_traces_as_they_are(reducer: Any) -> None:

@@ -28,10 +28,9 @@ PROMISE = (
     "certain: cycles decided without a check, and their share of all cycles. accept, reject: such decisions; below them "
     "the wrong ones, FP (bad parts accepted) and FN (good parts rejected). precision: the share of accepted parts that "
     "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
-    "99th percentile. saved: checks left out, at 5 s each; what stops and wrong rejects cost is not taken off. Counts "
-    "and saved are means a replay; shares are pooled, that is, counted over the parts of all replays together. The "
-    "promise shown is the pooled one: at most 1 - LB of all accepted parts are bad (precision >= LB). Rejected parts get "
-    "no feedback but audits, so NPV promises nothing without them."
+    "99th percentile. saved: checks left out, at 5 s each, before what stops and wrong rejects cost. Counts and saved "
+    "are means a replay; shares are pooled, that is, counted over the parts of all replays together. The pooled "
+    "precision is compared with LB; it is measured here, no rule enforces it. Rejected parts get no feedback but audits."
 )
 
 
