@@ -45,7 +45,7 @@ demo: $(VENV)/.demo
 	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cell replay --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
 
 test: $(VENV)/.dev
-	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .

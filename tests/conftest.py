@@ -16,6 +16,15 @@ REPO = Path(__file__).resolve().parents[1]
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
+# Files that take longest come first: a long one that begins last keeps one core waiting for the other.
+LONG = ("test_readme", "test_notebooks", "test_golden", "test_training", "test_cli", "test_estimators", "test_reducers")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; a file's own order stays as it is."""
+    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
 def insertion_like(
     n: int = 200, samples: int = 100, channels: int = 1, *, seed: int = 0, failures: float = 0.2, noise: float = 0.5
 ) -> Dataset:

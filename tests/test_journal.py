@@ -69,7 +69,7 @@ def test_a_line_that_does_not_fit_is_named(tmp_path: Path, line: str, message: s
 def test_the_verbs_export_and_import(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     out = tmp_path / "model.ts"
     done = CliRunner().invoke(export, [store, "--out", str(out)], catch_exceptions=False)
-    assert "version 1 with 200 references" in " ".join(done.output.split())
+    assert "version 1 with 200 labelled references" in " ".join(done.output.split())
     assert load_exported(out).metadata["references"] == 200
     new = make_data(30, seed=4)
     journal = write(tmp_path / "cell.csv", new.X, new.y)
