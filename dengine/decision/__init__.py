@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from .bounds import INTERVALS, binomial_interval, clopper_pearson_interval, jeffreys_interval, wilson_interval
     from .classifier import WilsonRadiusClassifier
     from .neighbors import RadiusIndex
-    from .policy import Neighbourhood, Policy
+    from .policy import RULES, Neighbourhood, Policy
+    from .rule import DecisionRule
 
 _WHERE = {
     "bounds": (
@@ -23,13 +24,17 @@ _WHERE = {
     "classifier": ("WilsonRadiusClassifier",),
     "neighbors": ("RadiusIndex",),
     "policy": (
+        "RULES",
         "Neighbourhood",
         "Policy",
     ),
+    "rule": ("DecisionRule",),
 }
 
 __all__ = [
     "INTERVALS",
+    "RULES",
+    "DecisionRule",
     "Neighbourhood",
     "Policy",
     "RadiusIndex",

@@ -103,8 +103,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def around(self, index: RadiusIndex, rule: DecisionRule | None = None) -> RadiusNeighbours:
         """What decides over the points of `index`, by these settings; `rule` in place of the policy's own."""
-        neighbourhood = Neighbourhood(self.radius, self.fraction, self.reject_fraction)
-        return RadiusNeighbours(index.ring, neighbourhood, rule or self.policy().rule())
+        near = Neighbourhood(self.radius, self.fraction, self.reject_fraction)
+        rule = rule or self.policy().rule()
+        return RadiusNeighbours(index.ring, rule, near.radius, near.fraction or 0.0, near.reject_fraction or 0.0)
 
     def _start(self, dim: int) -> None:
         self.index_ = RadiusIndex(dim, self.capacity)

@@ -11,7 +11,7 @@ by `state_dict`); the paper's rule learns nothing from being told.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,9 +19,6 @@ from torch import Tensor, nn
 from ..records import Action
 from .bounds import INTERVALS, normal_quantile
 from .neighbors import ReferenceRing
-
-if TYPE_CHECKING:
-    from .policy import Neighbourhood
 
 VERIFY, ACCEPT, REJECT = (list(Action).index(a) for a in (Action.VERIFY, Action.ACCEPT, Action.REJECT))
 
@@ -112,15 +109,17 @@ class RadiusNeighbours(nn.Module):
 
     Two looks, one for each tail of the interval: the wide ball may accept; where it does not, the narrow one may reject.
     The counts and the bound that come back are those of the ball that decided, so the action follows from them alone.
+
+    radius, fraction, reject_fraction : as in `Neighbourhood`, 0 for None.
     """
 
-    def __init__(self, ring: ReferenceRing, neighbourhood: "Neighbourhood", rule: DecisionRule) -> None:
+    def __init__(
+        self, ring: ReferenceRing, rule: DecisionRule, radius: float, fraction: float = 0.0, reject_fraction: float = 0.0
+    ) -> None:
         super().__init__()
         self.ring = ring
         self.rule = rule
-        self.radius = float(neighbourhood.radius)
-        self.fraction = float(neighbourhood.fraction or 0.0)
-        self.reject_fraction = float(neighbourhood.reject_fraction or 0.0)
+        self.radius, self.fraction, self.reject_fraction = float(radius), float(fraction), float(reject_fraction)
 
     def forward(self, z: Tensor) -> tuple[int, float, float, int, int]:
         """(K, d) float32 scaled embedding -> action (0 verify, 1 accept, 2 reject), lower, upper, n_success, n_failure."""
