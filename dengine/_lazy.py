@@ -22,7 +22,7 @@ def lazy_names(package: str, where: Mapping[str, Sequence[str]]) -> tuple[Callab
         return value
 
     def __dir__() -> list[str]:  # noqa: N807
-        return sorted({*vars(sys.modules[package]), *module_of})
+        return sorted({name for name in vars(sys.modules[package]) if name.startswith("__")} | {*module_of})
 
     return __getattr__, __dir__
 

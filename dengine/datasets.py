@@ -82,7 +82,8 @@ def _read(path: Path, name: str) -> Dataset:
     except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"Cannot read {path} as an .npz file of plain arrays: {error}.") from error
+        said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
+        raise DataError(f"Cannot read {path} as an .npz file of plain arrays: {said}.") from error
     rate, unit = float(extra.get("rate_hz", 500.0)), str(extra.get("unit", "N"))
     return make_dataset(X, y, name=name, rate_hz=rate, unit=unit, cause=extra.get("cause"))
 

@@ -23,12 +23,10 @@ from .deciding import DecisionMaker, source_of
 from .decision.policy import Policy
 from .errors import ReportError, StoreError
 from .model.base import EngineModel, Exportable, Model
-from .model.prediction import ModelPrediction
-from .model.rival import as_engine_model
 from .recipe import Recipe
 from .records import Action, Cycle, Decision, Outcome, RetrainReport, TraceSpec
 from .retraining import Clock, Limits, Retrainer, Window
-from .settings import EngineSettings, chosen_recipe, refuse_idle
+from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .traces import as_trace, spec_of
@@ -78,7 +76,7 @@ class DataEngine:
         if model is not None:
             refuse_idle(reducer, beside)
         settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
-        settings, template = _with_template(settings, model)  # before a store is made: a wrong setting leaves none behind
+        settings, template = settings.with_template(model)  # before a store is made: a wrong setting leaves none behind
         with opening(store) as opened:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
@@ -126,8 +124,9 @@ class DataEngine:
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True) as store:
-            settings = EngineSettings.from_store(store.settings(), str(url), reducer, model)
-            engine._start(*_with_template(settings, model), store, executor, replaying, clock)
+            name = "the store" if isinstance(url, Store) else str(url)
+            settings = EngineSettings.from_store(store.settings(), name, reducer, model)
+            engine._start(*settings.with_template(model), store, executor, replaying, clock)
             engine._versions.resume()
         engine.resumed = True
         return engine
@@ -143,8 +142,8 @@ class DataEngine:
             if not opened.settings():
                 return cls(store=opened, seed=seed or 0, **settings)
             options = {name: settings.pop(name) for name in ("model", "executor", "replaying", "clock") if name in settings}
-            engine = cls.open(opened, reducer=settings.get("reducer"), **options)
-            engine._settings.must_agree_with(seed=seed, **settings)
+            engine = cls.open(opened, reducer=object_of(**settings), **options)
+            engine._settings.must_agree_with(settings | {"seed": seed})
             return engine
 
     def decide(self, trace: ArrayLike, *, wait: bool = False) -> Decision:
@@ -290,11 +289,3 @@ class DataEngine:
             self._maker.agree_on(trace)
             self.store.save_settings(self._settings.to_store())
         return self._settings.trace or trace
-
-
-def _with_template(settings: EngineSettings, model: Model | None) -> tuple[EngineSettings, EngineModel]:
-    """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
-    if model is None:
-        return settings, ModelPrediction.from_recipe(settings.recipe, settings.seed)
-    template = as_engine_model(model)
-    return settings.with_model(template), template

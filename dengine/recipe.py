@@ -14,6 +14,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from .errors import SettingError
 
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
+BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
+PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
 RENAMED = {"dim": "n_components"}  # parameters of reducers as dengine 0.1 wrote them
 GONE = (("objective", "supervised"),)  # what went without saying then
@@ -62,12 +65,19 @@ class Recipe:
             value = getattr(self, name)
             if name == "max_steps" and value is None:
                 continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
                 raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
-        if not self.budget > 0.0:
+        if not (isinstance(self.budget, Real) and self.budget > 0.0):
             raise SettingError(f"Expected budget > 0 seconds, got {self.budget!r}.")
         if not isinstance(self.params, Mapping):
             raise SettingError(f"Expected params to be a table of the reducer's settings, got {self.params!r}.")
+        for name, value in self.params.items():
+            if not (value is None or isinstance(value, PLAIN)) or not BARE.fullmatch(str(name)):
+                raise SettingError(
+                    f"Expected params of plain names and values, got {name!r}: {value!r}; hand an object in."
+                )
+        if not isinstance(self.policy, Policy):
+            raise SettingError(f"Expected a Policy, got {self.policy!r}.")
         Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
 
     @property
@@ -84,7 +94,11 @@ class Recipe:
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
-            return cls(recipe)
+            if not callable(getattr(recipe, "fit", None)) or isinstance(recipe, type):
+                raise SettingError(f"Expected a recipe, its name, or a scikit-learn transformer, got {recipe!r}.")
+            # A reducer of ours keeps the neighbourhood of its own recipe: a radius means something else in each.
+            base = RECIPES.get(type(recipe).__module__.removeprefix("dengine.reducers."), cls())
+            return replace(base, reducer=recipe, params={})
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]
         path = Path(recipe)
@@ -111,7 +125,7 @@ class Recipe:
         policy = table.pop("policy", {})
         if isinstance(table.get("params"), Mapping):
             kept = {name: value for name, value in table["params"].items() if (name, value) not in GONE}
-            table["params"] = {RENAMED.get(name, name): value for name, value in kept.items()}
+            table["params"] = _without_none({RENAMED.get(name, name): value for name, value in kept.items()})
         try:
             return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
         except TypeError as error:
@@ -149,10 +163,20 @@ def _named(reducer: Any, params: Params) -> tuple[str, Params]:
     kind = type(reducer)
     own: dict[str, Any] = reducer.get_params(deep=False)
     defaults = {name: each.default for name, each in signature(kind).parameters.items()}
-    plain = all(isinstance(v, bool | int | float | str) or (v is None and defaults.get(k) is None) for k, v in own.items())
+    plain = all(isinstance(v, PLAIN) or (v is None and defaults.get(k) is None) for k, v in own.items())
     if not plain or "<locals>" in kind.__qualname__ or kind.__module__ == "__main__":
         return f"{OBJECT}{kind.__name__}", {}
     return f"{kind.__module__}:{kind.__qualname__}", {name: value for name, value in own.items() if value is not None}
+
+
+def described(thing: Any) -> str:
+    """An estimator's class and settings, nested ones included, as text that is the same at every start."""
+    settings = thing.get_params(deep=True)
+    values = (
+        f"{name}={value!r}" if isinstance(value, PLAIN) or value is None else f"{name}: {type(value).__qualname__}"
+        for name, value in sorted(settings.items())
+    )
+    return f"{type(thing).__qualname__}({', '.join(values)})"
 
 
 def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:

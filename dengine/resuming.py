@@ -38,7 +38,7 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     # A stored state holds what came in during its retrain; a rival was refitted without that.
     known_to = version.last_seq if model.keeps_references else trained_to
     _add_since(model, store, version, labelled, known_to)
-    _tell(model, store, version.last_seq)
+    _tell(model, store, 0 if "untold" in version.state else version.last_seq)
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
@@ -65,4 +65,4 @@ def _add_since(model: EngineModel, store: Store, version: ModelVersion, labelled
 def _tell(model: EngineModel, store: Store, last_seq: int) -> None:
     evidence = store.evidence_since(last_seq)
     for lower, upper, success in zip(evidence.lower, evidence.upper, evidence.success, strict=True):
-        model.tell(float(lower), float(upper), bool(success))
+        model.tell_safely(float(lower), float(upper), bool(success))

@@ -7,82 +7,111 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
+import numpy as np
+
 from . import __version__
 from .decision.policy import Policy
 from .errors import SettingError, StoreError
-from .model.base import EngineModel
-from .recipe import OBJECT, Recipe
+from .model.base import EngineModel, Model
+from .model.prediction import ModelPrediction
+from .model.rival import as_engine_model
+from .recipe import OBJECT, Recipe, described
 from .records import TraceSpec
+
+LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate")  # what counts for any model
 
 
 @dataclass(frozen=True, slots=True)
 class EngineSettings:
     """An engine's settings.
 
-    recipe : as it is in force.  seed : of the reducer and of the audits' coin.
+    recipe : as it is in force.  seed : of the reducer and of the audits' coin, 0 or more.
     model : what a model that was handed in is called; None: the recipe describes the model.
+    described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
     trace : the traces' contract; None until the first trace.
     """
 
     recipe: Recipe
     seed: int = 0
     model: str | None = None
+    described: str | None = None
     trace: TraceSpec | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.seed, int | np.integer) or isinstance(self.seed, bool) or self.seed < 0:
+            raise SettingError(f"Expected a seed of 0 or more, an integer, got {self.seed!r}.")
+        if not (self.trace is None or isinstance(self.trace, TraceSpec)):
+            raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
 
     def to_store(self) -> dict[str, str]:
         """As `Store.save_settings` takes them."""
         known = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
-        if self.model is not None:
-            known["model"] = self.model
+        known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
         if self.trace is not None:
             known["trace"] = json.dumps(asdict(self.trace))
         return known
 
     @classmethod
-    def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Any = None) -> Self:
+    def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
         """What `to_store` gave. name : of the store, for errors.
 
         reducer, model : objects that the store cannot bring back, handed in again. Raises StoreError for a store that no
-        engine has used, SettingError where an object is missing.
+        engine has used, SettingError where an object is missing, or is another one than the store was made with.
         """
         if "recipe" not in known:
             raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
+        recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
+        made_with = known.get("described")
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
-        recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
-        if reducer is not None and not isinstance(reducer, str):
-            recipe = replace(recipe, reducer=reducer, params={})
-        elif str(recipe.reducer).startswith(OBJECT):
-            raise SettingError(
-                f"The reducer of {name}, {recipe.reducer}, has no name in TOML: hand it in again, open(url, reducer=...)."
-            )
+        if "model" not in known and model is not None:
+            raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
+        if "model" in known or recipe.name.startswith(OBJECT):
+            if model is None and (reducer is None or isinstance(reducer, str)):
+                raise SettingError(
+                    f"The reducer of {name}, {recipe.reducer}, has no name in TOML: hand it in again, reducer=..."
+                )
+            given = described(reducer) if model is None else as_engine_model(model).description
+            if made_with is not None and given != made_with:
+                raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")
+            recipe = recipe if model is not None else replace(recipe, reducer=reducer, params={})
+        elif reducer is not None and not isinstance(reducer, str):
+            again = Recipe.from_toml(Recipe(reducer).to_toml())
+            if (again.reducer, again.params) != (recipe.reducer, recipe.params):
+                raise SettingError(
+                    f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
+                )
         trace = TraceSpec(**json.loads(known["trace"])) if "trace" in known else None
-        return cls(recipe, int(known["seed"]), known.get("model"), trace)
+        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace)
 
-    def with_model(self, model: EngineModel) -> Self:
-        """The same for a model that was handed in: of our own kind its numbers count, a rival's are its own affair."""
-        own = model.policy
-        changes = {} if own is None else {"alpha": own.alpha, "lower_bound": own.lower_bound, "interval": own.interval}
-        return replace(self, recipe=self.recipe.with_policy(**changes), model=model.name)
+    def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
+        """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
+        if model is None:
+            own = self.recipe.reducer
+            described_ = None if isinstance(own, str) else described(own)
+            return replace(self, described=described_), ModelPrediction.from_recipe(self.recipe, self.seed)
+        template = as_engine_model(model)
+        in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a rival's are its own affair
+        return replace(self, recipe=in_force, model=template.name, described=template.description), template
 
-    def must_agree_with(
-        self,
-        seed: int | None = None,
-        trace: TraceSpec | None = None,
-        reducer: Any = None,
-        recipe: Any = None,
-        **beside: Any,
-    ) -> None:
-        """SettingError where what is asked for is not what is set; None asks for nothing, an unset contract for none."""
-        base = self.recipe if reducer is None and recipe is None else recipe
-        asked = _flat(chosen_recipe(reducer, base, beside)) | {"seed": seed, "trace": trace if self.trace else None}
-        have = _flat(self.recipe) | {"seed": self.seed, "trace": self.trace}
-        given = {name for name in asked if name not in ("seed", "trace") or asked[name] is not None}
-        other = sorted(name for name in given if asked[name] != have[name])
+    def must_agree_with(self, asked: Mapping[str, Any]) -> None:
+        """SettingError where what is asked for, as `DataEngine` takes it, is not what is set; None asks for nothing."""
+        given = {name: value for name, value in asked.items() if value is not None}
+        reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
+        have = _flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
+        unknown = sorted(set(given) - set(have))
+        if unknown:
+            raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
+        wished = {} if recipe is None else _flat(chosen_recipe(reducer, recipe, {}))
+        wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
+        if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
+            wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
+        counts = LOOP if self.model is not None else tuple(have)
+        other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
-            stored, wished = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, asked))
+            stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
             raise SettingError(
-                f"Expected the store's own settings ({stored}), got {wished}; leave them out or name a new store."
+                f"Expected the store's own settings ({stored}), got {got}; leave them out or name a new store."
             )
 
 
@@ -95,6 +124,12 @@ def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recip
     if recipe is not None and reducer is not None and reducer != base.reducer:
         raise SettingError(f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out.")
     return base.with_settings(**beside)
+
+
+def object_of(reducer: Any = None, recipe: Any = None, **others: Any) -> Any:
+    """The reducer among settings that is an object, if any: a store may not be able to bring it back."""
+    found = recipe.reducer if reducer is None and isinstance(recipe, Recipe) else reducer
+    return None if isinstance(found, str) else found
 
 
 def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:

@@ -54,7 +54,7 @@ class ModelVersions:
 
     def learn(self, known: StoredDecision, success: bool, point: Point | None, seq: int) -> None:
         """Take in a label that is stored: tell the rule, make the trace a reference, give it to the next retrain."""
-        self.newest.tell(known.lower, known.upper, success)
+        self.newest.tell_safely(known.lower, known.upper, success)
         self.newest.add_safely(point, int(success), known.content_hash)
         self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
         self.new_labels += 1

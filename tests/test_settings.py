@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from dengine import (
     Action,
+    ConvReducer,
     DataEngine,
     Dataset,
     ModelPrediction,
@@ -148,6 +150,80 @@ def test_a_file_that_is_not_there_is_not_opened(tmp_path: Path) -> None:
     assert not (tmp_path / "none.db").exists()
 
 
+def made_with(data: Dataset, url: Path, **settings) -> None:
+    with DataEngine.open_or_create(url, **settings) as engine:
+        list(engine.run(ReplayCell(data), 60))
+
+
+def ours(**changes) -> ModelPrediction:
+    return ModelPrediction("pca", WilsonRadiusClassifier(**({"radius": 0.5, "alpha": 0.2, "lower_bound": 0.8} | changes)))
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [
+        ({"model": ours()}, {"model": ours(alpha=0.5, lower_bound=0.6)}),
+        ({"model": ours()}, {"model": ours(radius=0.9)}),
+        ({"model": ours()}, {"model": Constant()}),
+        ({"reducer": "pca"}, {"model": ours()}),
+        ({"reducer": PCA(2)}, {"reducer": PCA(3)}),
+        ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
+        ({"reducer": "pca"}, {"reducer": PCA(2)}),
+        ({"reducer": "conv"}, {"reducer": ConvReducer(filters=2)}),
+        ({"reducer": make_pipeline(PCA(2))}, {"reducer": make_pipeline(PCA(3))}),
+        ({"reducer": make_pipeline(PCA(2))}, {"reducer": PCA(2)}),
+    ],
+)
+def test_a_used_store_takes_no_other_object_than_it_was_made_with(first, then, data: Dataset, tmp_path: Path) -> None:
+    made_with(data, tmp_path / "engine.db", **first)
+    with pytest.raises(SettingError):
+        DataEngine.open_or_create(tmp_path / "engine.db", **then)
+    assert DataEngine.open_or_create(tmp_path / "engine.db", **first).version == 1
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"model": ours(), "policy": Policy(audit_rate=0.1)},
+        {"model": ours(), "recipe": "conv"},
+        {"model": Constant(), "retrain_every": 30, "policy": Policy(audit_rate=0.1)},
+        {"recipe": Recipe(PCA(2), policy=POLICY)},
+        {"reducer": make_pipeline(StandardScaler(), PCA(2)), "policy": POLICY},
+    ],
+)
+def test_an_identical_start_goes_on(settings: dict, data: Dataset, tmp_path: Path) -> None:
+    made_with(data, tmp_path / "engine.db", **settings)
+    with DataEngine.open_or_create(tmp_path / "engine.db", **settings) as engine:
+        assert engine.resumed
+        assert engine.version > 0
+
+
+def test_what_is_not_given_is_not_asked_for(data: Dataset, tmp_path: Path) -> None:
+    made_with(data, tmp_path / "engine.db", reducer="pca", policy=POLICY, radius=0.5)
+    for given in ({"reducer": "pca"}, {"policy": POLICY}, {"radius": 0.5}, {"seed": 0}):
+        DataEngine.open_or_create(tmp_path / "engine.db", **given).close()
+    with pytest.raises(SettingError, match="got foo, which it has not"):
+        DataEngine.open_or_create(tmp_path / "engine.db", foo=1)
+
+
+@pytest.mark.parametrize("seed", ["x", 1.5, -1, True])
+def test_a_seed_that_could_not_be_read_back_is_refused(seed, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match="seed of 0 or more"):
+        DataEngine("pca", seed=seed, store=tmp_path / "engine.db")
+    assert not (tmp_path / "engine.db").exists()
+
+
+def test_an_object_of_ours_keeps_the_neighbourhood_of_its_recipe() -> None:
+    assert DataEngine(ConvReducer(filters=2)).recipe.radius == RECIPES["conv"].radius
+    assert DataEngine(PCA(2)).recipe.radius == Recipe().radius
+
+
+@pytest.mark.parametrize("model", [PCA(2), ModelPrediction, 3])
+def test_what_is_no_model_is_refused(model) -> None:
+    with pytest.raises(SettingError, match="Expected a model with fit, add, count"):
+        DataEngine(model=model)
+
+
 # --------------------------------------------------------------------------------------------------------- own reducers
 
 
@@ -212,6 +288,24 @@ def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp
         assert engine.decide(data.X[70]).embedding == before.embedding
 
 
+def test_a_reducer_that_widens_as_it_learns_replays_to_the_end(data: Dataset) -> None:
+    run = replay(data, "sklearn.decomposition:PCA", cycles=120)  # as many components as traces
+    assert run.position.shape == (120, 100)
+    assert np.isfinite(run.position[100:]).all()
+
+
+@pytest.mark.parametrize("params", [{"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}])
+def test_params_that_toml_cannot_say_are_refused_when_the_recipe_is_made(params: dict) -> None:
+    with pytest.raises(SettingError, match="params of plain names and values"):
+        Recipe("conv", params)
+
+
+def test_plain_params_come_back_from_toml() -> None:
+    recipe = Recipe("umap", {"n_epochs": None, "n_neighbors": np.int64(8)})
+    assert Recipe.from_toml(recipe.to_toml()).params == {"n_epochs": None, "n_neighbors": 8}
+    assert 'reducer = "sklearn.decomposition._pca:PCA"' in Recipe(PCA(np.int64(2))).to_toml()
+
+
 def test_the_words_of_the_first_version_are_still_read(data: Dataset) -> None:
     text = 'reducer = "conv"\nmax_steps = 60\n[params]\ndim = 1\nobjective = "supervised"\n'
     recipe = Recipe.from_toml(text)
@@ -225,7 +319,7 @@ def test_the_words_of_the_first_version_are_still_read(data: Dataset) -> None:
     ("name", "message"),
     [
         ("nowhere:Reducer", "can be imported here"),
-        ("dengine.recipe:Recipe", "has no fit and transform"),
+        ("dengine.recipe:Recipe", "has not both fit and transform"),
         ("numpy:pi", "is a float and no class"),
     ],
 )

@@ -43,10 +43,15 @@ class Policy:
     guarantee: str = "local"
 
     def __post_init__(self) -> None:
+        for name in ("alpha", "lower_bound", "audit_rate"):
+            if not isinstance(getattr(self, name), Real):
+                raise SettingError(f"Expected a number as {name}, got {getattr(self, name)!r}.")
+        if not isinstance(self.guarantee, str):
+            raise SettingError(f"Expected a guarantee's name, or module:Class as text, got {self.guarantee!r}.")
         normal_quantile(self.alpha)
         if not 0.5 < self.lower_bound < 1.0:
             raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
-        if self.interval not in INTERVALS:
+        if not isinstance(self.interval, str) or self.interval not in INTERVALS:
             raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {self.interval!r}.")
         if not 0.0 <= self.audit_rate < 1.0:
             raise SettingError(f"Expected 0 <= audit_rate < 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
@@ -60,7 +65,10 @@ class Policy:
         found = find_class(RULES.get(self.guarantee, self.guarantee))
         if not issubclass(found, DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
-        return found(self.alpha, self.lower_bound, self.interval)
+        try:
+            return found(self.alpha, self.lower_bound, self.interval)
+        except TypeError as error:
+            raise SettingError(f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}.") from error
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """(lower, upper) of the success probability, by the policy's interval and alpha."""

@@ -74,8 +74,10 @@ class DecisionRule(nn.Module):
     alpha, lower_bound, interval : as in `Policy`.
     compiles : whether TorchScript can compile the class; one that says False answers in Python and is not exported.
 
-    A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers: the compiled module shares
-    them, a store keeps them with each version, and `DataEngine.open` restores them and tells what came afterwards.
+    A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers of a fixed shape: the
+    compiled module shares them, a store keeps them with each version, and `DataEngine.open` restores them and tells what
+    came afterwards. A rule whose `tell` raises is not asked any more: every part is verified until the engine is opened
+    again, which tells it everything from the beginning.
     """
 
     compiles = True

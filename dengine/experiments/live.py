@@ -183,8 +183,11 @@ def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle
 
 
 def _positions(decisions: list[Decision]) -> NDArray[np.float64]:
-    """(n, d): each embedding's mean over the K spaces, NaN where there is none."""
-    known = [None if d.embedding is None else np.mean(d.embedding, axis=0) for d in decisions]
-    width = next((len(z) for z in known if z is not None), 2)
-    blank = np.full(width, np.nan)
-    return np.array([blank if z is None else z for z in known], dtype=np.float64).reshape(len(known), width)
+    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
+    means = [np.mean(each.embedding, axis=0) if each.embedding else None for each in decisions]
+    known = [mean for mean in means if mean is not None]
+    positions = np.full((len(means), len(known[-1]) if known else 2), np.nan)
+    for i, mean in enumerate(means):
+        if mean is not None and len(mean) == positions.shape[1]:
+            positions[i] = mean
+    return positions

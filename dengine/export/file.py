@@ -91,7 +91,7 @@ def write_checked(target: Path, write: Callable[[Path], None]) -> Path:
         partial.touch()  # torch names an unwritable place in words of its own
         write(partial)
         digest = hashlib.sha256(partial.read_bytes()).hexdigest()
-        sum_file(target).write_text(f"{digest}  {target.name}\n", encoding="ascii")
+        sum_file(target).write_text(f"{digest}  {target.name}\n", encoding="utf-8")
         partial.replace(target)
     except OSError as error:
         raise ExportError(
@@ -116,7 +116,7 @@ def checked_bytes(path: Path) -> bytes:
     """A file's content; ExportError unless its sum is right. libtorch itself does not notice flipped bits."""
     try:
         content = path.read_bytes()
-        words = sum_file(path).read_text(encoding="ascii").split()
+        words = sum_file(path).read_text(encoding="utf-8").split()
     except FileNotFoundError as error:
         raise ExportError(f"{error.filename} is missing; an export is a file and its .sha256, copied together.") from error
     except (OSError, UnicodeDecodeError) as error:

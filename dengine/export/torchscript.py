@@ -34,7 +34,10 @@ def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, tr
     Raises ExportError where nothing was trained yet, or the reducer, the interval or the rule cannot be scripted.
     """
     source = source_of(engine_or_model, trace)
-    frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=["decide", "learn"])
+    try:
+        frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=["decide", "learn"])
+    except RuntimeError as error:
+        raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
     return write_checked(Path(path), lambda partial: _save(frozen, partial, metadata))
 

@@ -15,8 +15,8 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..decision.policy import Policy
 from ..errors import ExportError
+from ..recipe import Recipe
 from ..records import Action, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 
@@ -66,11 +66,13 @@ class Model(Protocol):
 class EngineModel(ABC):
     """What the engine drives: it predicts, takes references, trains a successor, and is stored.
 
+    untold : whether its rule failed to learn what became of a part; it then raises instead of predicting.
     keeps_references : whether its state and the points stored with labels restore its references. A rival keeps what it
         likes, and is restored by a refit.
     """
 
     keeps_references = True
+    untold = False  # whether its rule missed what became of a part
 
     @property
     @abstractmethod
@@ -79,13 +81,17 @@ class EngineModel(ABC):
 
     @property
     @abstractmethod
-    def policy(self) -> Policy | None:
-        """The numbers that it decides by; None for a rival's own rule."""
+    def name(self) -> str:
+        """What to call it in a status or a table."""
 
     @property
     @abstractmethod
-    def name(self) -> str:
-        """What to call it in a status or a table."""
+    def description(self) -> str:
+        """What it is, its numbers included, as text that is the same at every start: a store compares it."""
+
+    def in_force(self, recipe: Recipe) -> Recipe:
+        """A recipe with this model's own numbers in the place of those that have no effect on it."""
+        return recipe
 
     @abstractmethod
     def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
@@ -143,7 +149,15 @@ class EngineModel(ABC):
         """What an exporter starts from; ExportError where there is nothing that can be exported."""
         raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
 
-    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these three.
+    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these four.
+
+    def tell_safely(self, lower: float, upper: float, success: bool) -> None:
+        """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
+        try:
+            self.tell(lower, upper, success)
+        except Exception:
+            self.untold = True
+            log.exception("the rule cannot be told of a part; every part is verified until the engine is opened again")
 
     def prepare_safely(self, previous: EngineModel) -> None:
         """`prepare`; one that fails at it will verify, and say so, on every part."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from inspect import signature
 from typing import Any, Self
 
@@ -18,11 +19,10 @@ from sklearn.base import clone
 
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.neighbors import Counts, RadiusIndex
-from ..decision.policy import Policy
 from ..decision.rule import DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
-from ..recipe import Recipe
+from ..recipe import Recipe, described
 from ..records import Action, TraceSpec
 from ..reducers import make_reducer, reducer_class
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule
@@ -83,14 +83,23 @@ class ModelPrediction(EngineModel):
         return self
 
     @property
-    def policy(self) -> Policy:
-        """The classifier's numbers."""
-        return self.classifier.policy()
-
-    @property
     def name(self) -> str:
         """Its reducer."""
         return type(self.reducer).__name__
+
+    @property
+    def description(self) -> str:
+        """Its reducer, its classifier and its folds, with their settings."""
+        return (
+            f"{described(self.reducer)} under {described(self.classifier)}, {self.folds} folds, {type(self.rule).__name__}"
+        )
+
+    def in_force(self, recipe: Recipe) -> Recipe:
+        """The recipe with the classifier's numbers."""
+        own = self.classifier
+        policy = replace(recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval)
+        near = replace(recipe, radius=own.radius, fraction=own.fraction, reject_fraction=own.reject_fraction)
+        return replace(near, policy=policy, folds=max(2, self.folds))
 
     @property
     def n_spaces(self) -> int:
@@ -127,7 +136,7 @@ class ModelPrediction(EngineModel):
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
         if isinstance(previous, ModelPrediction):
-            self.rule = previous.rule
+            self.rule, self.untold = previous.rule, previous.untold
             self._compile(previous._compiled)
 
     def _compile(self, mould: CompiledPredictor | None = None) -> CompiledPredictor:
@@ -170,10 +179,17 @@ class ModelPrediction(EngineModel):
 
     def tell(self, lower: float, upper: float, success: bool) -> None:
         """Tell the rule what became of a part."""
+        before = dict(self.rule.state_dict())
         self.rule.tell(lower, upper, success)
+        for name, now in self.rule.state_dict().items():
+            if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
+                before[name].copy_(now)
+                setattr(self.rule, name, before[name])
 
     def predict_one(self, x: NDArray[np.float32]) -> Prediction:
         """The whole prediction on one trace (C, T)."""
+        if self.untold:
+            raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
         with torch.inference_mode():
             action, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x))
         embedding = tuple(tuple(row) for row in z.tolist())
@@ -210,7 +226,10 @@ class ModelPrediction(EngineModel):
     def get_state(self) -> State:
         """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
         state = {"trace_shape": np.array(self.trace_shape), "scale": self.scale} | self.index.get_state()
-        state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
+        if self.untold:
+            state["untold"] = np.array(True)  # what the rule learned is not whole: an opened engine tells it all anew
+        else:
+            state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
         return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -220,8 +239,9 @@ class ModelPrediction(EngineModel):
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
+        own = self.rule.state_dict()  # shares its tensors with the rule
         for name, value in _part(state, "rule.").items():
-            self.rule.get_buffer(name).copy_(torch.from_numpy(np.array(value)))
+            own[name].copy_(torch.from_numpy(np.array(value)))
         self._compiled = None
         return self
 

@@ -8,15 +8,19 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..decision.policy import Policy
+from ..errors import SettingError
 from ..records import Action
 from ..reducers.base import Floats, Ints, StopRule
 from .base import EngineModel, Model, Prediction
 
 
 def as_engine_model(model: Model) -> EngineModel:
-    """A model as the engine drives it: our own as it is, a rival adapted."""
-    return model if isinstance(model, EngineModel) else RivalAdapter(model)
+    """A model as the engine drives it: our own as it is, a rival adapted. SettingError for what is no model."""
+    if isinstance(model, EngineModel):
+        return model
+    if isinstance(model, type) or not isinstance(model, Model):
+        raise SettingError(f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}.")
+    return RivalAdapter(model)
 
 
 class RivalAdapter(EngineModel):
@@ -33,14 +37,14 @@ class RivalAdapter(EngineModel):
         return self.model
 
     @property
-    def policy(self) -> Policy | None:
-        """None: a rival has a rule of its own."""
-        return None
-
-    @property
     def name(self) -> str:
         """Its class."""
         return type(self.model).__name__
+
+    @property
+    def description(self) -> str:
+        """Its class: its settings are its author's affair."""
+        return type(self.model).__qualname__
 
     def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Train the rival; it sets its own stop."""

@@ -52,7 +52,7 @@ def reducer_class(name: str) -> type:
         raise SettingError(f"Expected a reducer among {', '.join(_CLASSES)}, or module:Class of your own, got {name!r}.")
     found = find_class(_CLASSES.get(name, name))
     if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no fit and transform.")
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")
     return found
 
 

@@ -226,6 +226,11 @@ def _class_labels(y: Any) -> NDArray[Any]:
 
 def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
     """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
+    if n == 0:
+        return SettingError(
+            f"Expected both classes outside fold {fold}, got 0 traces: all share one fold, since they are the same to "
+            "1/65536 of their unit; look at the sensor, or give the traces in a smaller unit."
+        )
     return SettingError(
         f"Expected both classes outside fold {fold}, got {n} traces of {classes} class; "
         "collect more labels before the first fit."

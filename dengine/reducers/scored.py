@@ -180,6 +180,9 @@ class FeatureReducer(Reducer):
 
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range."""
+        for name in ("n_components", "folds", "max_iter"):
+            if not isinstance(getattr(self, name), int | np.integer):
+                raise SettingError(f"Expected {name} to be an integer, got {getattr(self, name)!r}.")
         if self.n_components not in (1, 2):
             raise SettingError(f"Expected n_components 1 or 2, got {self.n_components!r}.")
         if self.l2 <= 0:

@@ -64,9 +64,12 @@ class SqlDatabase:
             self.failures += write
             self._doubtful |= write
             raise StoreError(
-                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)} "
-                f"{len(self._queue)} decisions wait in memory; the next flush or report writes them."
+                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}{self._waiting()}"
             ) from error
+
+    def _waiting(self) -> str:
+        n = len(self._queue)
+        return f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
 
     @contextmanager
     def transaction(self, write: bool) -> Iterator[sa.Connection]:
