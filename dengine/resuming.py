@@ -35,8 +35,8 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     model = _restored(store, template, version.state, window.newest_seq)
     model.prepare_safely(template)
     trained_to = int(version.state["trained_on"][-1])
-    # A stored state holds what came in during its retrain; a rival was refitted without that.
-    known_to = version.last_seq if model.keeps_references else trained_to
+    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
+    known_to = version.last_seq if "points" in version.state else trained_to
     _add_since(model, store, version, labelled, known_to)
     _tell(model, store, 0 if "untold" in version.state else version.last_seq)
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))

@@ -64,9 +64,10 @@ class EngineSettings:
         made_with = known.get("described")
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
-        if "model" not in known and model is not None:
+        unnamed = str(known.get("dengine")).startswith("0.1.")  # that version did not say whose model it drove
+        if "model" not in known and model is not None and not unnamed:
             raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
-        if "model" in known or recipe.name.startswith(OBJECT):
+        if model is not None or recipe.name.startswith(OBJECT):
             if model is None and (reducer is None or isinstance(reducer, str)):
                 raise SettingError(
                     f"The reducer of {name}, {recipe.reducer}, has no name in TOML: hand it in again, reducer=..."

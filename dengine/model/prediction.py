@@ -234,6 +234,8 @@ class ModelPrediction(EngineModel):
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore references and rule, and the reducer unless it was refitted, so that decisions repeat bit for bit."""
+        if "points" not in state:  # 0.1 drove our own model, handed in, as it drove a rival: it was refitted
+            return self
         if not self.needs_refit(state):
             self.spaces.set_state(_part(state, "reducer."))
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
