@@ -14,8 +14,8 @@ from .decision.rule import script
 from .errors import ReportError
 from .folds import audited
 from .model.base import NOTHING_KNOWN, EngineModel, Prediction
-from .records import Action, Decision, Reason, Source, TraceSpec
-from .traces import REASONS, TraceGate
+from .records import REASONS, Action, Decision, Reason, Source, TraceSpec
+from .traces import TraceGate
 
 log = logging.getLogger("dengine")
 

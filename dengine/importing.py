@@ -27,9 +27,9 @@ from .engine import DataEngine
 from .errors import DataError, StoreError, TraceError
 from .folds import content_hash
 from .recipe import Recipe
-from .records import Action, Decision, Reason, RetrainReport, Source, TraceSpec
+from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .store.base import Store, open_store
-from .traces import REASONS, TraceGate, as_traces
+from .traces import TraceGate, as_traces
 
 CHUNK = 500  # traces committed together
 

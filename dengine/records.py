@@ -27,6 +27,9 @@ class Reason(StrEnum):
     MODEL_ERROR = "model_error"  # the model raised; the cell went on
 
 
+ACTIONS, REASONS = tuple(Action), tuple(Reason)  # by position: the integers of exported files
+
+
 class Source(StrEnum):
     """Where a label came from."""
 

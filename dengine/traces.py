@@ -13,9 +13,8 @@ from torch import Tensor, nn
 
 from .errors import TraceError
 from .folds import CLAMP, QUANTUM, hash_weights
-from .records import Reason, TraceSpec
+from .records import REASONS, Reason, TraceSpec
 
-REASONS = tuple(Reason)
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
 
 

@@ -11,12 +11,11 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..records import Action
+from ..records import ACTIONS
 from .neighbors import Counts, RadiusIndex
 from .policy import Neighbourhood, Policy
 from .rule import DecisionRule, RadiusNeighbours
 
-ACTIONS = tuple(Action)
 CAPACITY = 10_000
 
 

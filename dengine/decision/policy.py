@@ -12,13 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from .._lazy import find_class
 from ..errors import SettingError
-from ..records import Action
+from ..records import ACTIONS, Action
 from .bounds import INTERVALS, Bounds, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
 
-ACTIONS = tuple(Action)
 RULES = {"local": "dengine.decision.rule:DecisionRule"}
 
 

@@ -16,11 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..records import Action
 from .bounds import INTERVALS, normal_quantile
 from .neighbors import ReferenceRing
-
-VERIFY, ACCEPT, REJECT = (list(Action).index(a) for a in (Action.VERIFY, Action.ACCEPT, Action.REJECT))
 
 
 def action_of(lower: float, upper: float, accept_at: float, reject_at: float) -> int:

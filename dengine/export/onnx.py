@@ -30,10 +30,10 @@ from ..decision.rule import DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
 from ..model.module import FIELDS
-from ..records import Reason, TraceSpec
+from ..records import ACTIONS, REASONS, Reason, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
 from .file import METADATA, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
-from .torchscript import ACTIONS, REASONS, TOLERANCE, ExportedDecision
+from .torchscript import TOLERANCE, ExportedDecision
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # where an empty slot waits: no ball reaches it

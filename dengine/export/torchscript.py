@@ -18,13 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..decision.rule import script
 from ..errors import ExportError
-from ..records import Action, Reason, TraceSpec
+from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..traces import as_trace, as_traces
 from .file import METADATA, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
-ACTIONS, REASONS = tuple(Action), tuple(Reason)
 
 
 def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:

@@ -17,14 +17,13 @@ from torch import Tensor, nn
 
 from ..decision.rule import RadiusNeighbours, script
 from ..folds import COIN_BITS, MIX, audit_salt
-from ..records import Reason, TraceSpec
+from ..records import REASONS, Reason, TraceSpec
 from ..reducers.base import Reducer
 from ..traces import TraceGate
 
 Predicted = tuple[int, float, float, int, int, Tensor]
 One = tuple[int, int, float, float, int, int, Tensor]
 Many = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-REASONS = tuple(Reason)
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
 
 

@@ -23,7 +23,7 @@ from ..decision.rule import DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import Recipe, described
-from ..records import Action, TraceSpec
+from ..records import ACTIONS, TraceSpec
 from ..reducers import make_reducer, reducer_class
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule
 from ..reducers.cross_fitting import as_reducer
@@ -31,7 +31,6 @@ from ..traces import as_traces
 from .base import EngineModel, Exportable, Prediction
 from .module import CompiledPredictor, compile_predictor
 
-ACTIONS = tuple(Action)
 WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
 
 
