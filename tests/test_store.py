@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as hnp
 
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import MemoryStore, SqlStore, Store, open_store, sql_queries, sql_queue
+from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, open_store, sql_queries, sql_queue
 
 C, T = 2, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -62,6 +62,10 @@ def put(store: Store, name: str, seed: int = 0, content_hash: int = 7, quarantin
     values = trace(seed)
     store.put_decision(decision(name), values, content_hash, quarantined)
     return values
+
+
+def label(name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION) -> NewLabel:
+    return NewLabel(name, success, source, 0, None, silent)
 
 
 def report(version: int, accepted: bool = True) -> RetrainReport:
@@ -125,6 +129,30 @@ def test_an_unsigned_hash_is_refused_before_it_is_queued(store: Store) -> None:
     store.flush()
 
 
+@pytest.mark.parametrize("part", [None, "", "SN-0042", "Stück 7\\0"])
+def test_the_number_of_the_part_returns_before_and_after_the_flush(store: Store, part: str | None) -> None:
+    store.put_decision(decision("a"), trace(), 1, False, part)
+    for _ in range(2):
+        assert store.get_decision("a").part == part
+        store.flush()
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert store.get_decision("a").part == part
+
+
+def test_a_decision_without_a_part_has_none(store: Store) -> None:
+    put(store, "a")
+    store.flush()
+    assert store.get_decision("a").part is None
+
+
+@pytest.mark.parametrize("part", ["SN\0", "\ud800", 42])
+def test_a_part_that_no_database_holds_is_refused_before_it_is_queued(store: Store, part: object) -> None:
+    with pytest.raises(StoreError, match="part's number"):
+        store.put_decision(decision("a"), trace(), 1, False, part)
+    store.flush()
+    assert store.status()["decisions"] == 0
+
+
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     values=hnp.arrays(np.float32, st.tuples(st.integers(1, 3), st.integers(1, 40)), elements=st.floats(width=32)),
@@ -180,6 +208,53 @@ def test_a_refused_report_loses_no_queued_decision(store: Store) -> None:
         store.put_label("nobody", True, Source.VERIFICATION, 0, None)
     store.flush()
     assert store.get_decision("a") is not None
+
+
+def test_labels_in_one_batch_are_numbered_in_the_order_given(store: Store) -> None:
+    for name in "abcd":
+        put(store, name)
+    assert store.put_label("d", True, Source.VERIFICATION, 0, None) == 1
+    point = np.array([0.5, 1.5], dtype=np.float32)
+    batch = [NewLabel("c", False, Source.STOP, 3, point, 4), label("a"), label("b", False)]
+    seqs = store.put_labels(batch)
+    assert (seqs.tolist(), seqs.dtype) == ([2, 3, 4], np.int64)
+    assert store.labelled().labels.tolist() == [1, 0, 1, 0]
+    assert (store.get_decision("c").success, store.get_decision("c").source) == (False, Source.STOP)
+    added = store.points_since(0, 3)
+    assert (added.seq.tolist(), added.points.tolist()) == ([2], [[0.5, 1.5]])
+    assert store.put_labels([]).tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("last", "error"),
+    [("nobody", "'nobody'"), ("done", "'done': success from confirmed was"), ("a", "'a': success from verification was")],
+)
+def test_a_batch_with_one_bad_report_takes_none_of_its_labels(store: Store, last: str, error: str) -> None:
+    for name in ("done", "a", "b"):
+        put(store, name)
+    store.put_label("done", True, Source.CONFIRMED, 0, None)
+    with pytest.raises(ReportError, match=error):
+        store.put_labels([label("a", silent=5), label("b"), label(last, False)])
+    assert store.labelled().seq.tolist() == [1]
+    assert store.get_decision("a").success is None
+    assert store.silent_total() == 0
+    assert store.put_labels([label("b"), label("a")]).tolist() == [2, 3]
+
+
+def test_a_negative_silence_is_refused(store: Store) -> None:
+    put(store, "a")
+    with pytest.raises(StoreError, match="0 or more, got -1"):
+        store.put_label("a", True, Source.VERIFICATION, 0, None, silent=-1)
+    assert store.get_decision("a").success is None
+
+
+def test_a_batch_longer_than_a_chunk_is_taken_whole(store: Store) -> None:
+    names = [str(i) for i in range(1203)]
+    for name in names:
+        store.put_decision(decision(name), np.zeros((1, 2), np.float32), int(name), False)
+    assert store.put_labels([label(name, silent=1) for name in names]).tolist() == list(range(1, 1204))
+    assert store.labelled().hashes.tolist() == list(range(1203))
+    assert store.silent_total() == 1203
 
 
 def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: Store) -> None:
@@ -277,6 +352,161 @@ def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quaran
     assert len(store.evidence_since(4).seq) == 0
 
 
+@pytest.mark.parametrize("parts", [None, ["x", None, "z"]])
+def test_an_import_keeps_the_number_of_each_part(store: Store, parts: list[str | None] | None) -> None:
+    traces, hashes, labels = trace(1, (3, C, T)), np.arange(3), np.ones(3, dtype=np.int8)
+    store.put_labelled([decision(name) for name in "abc"], traces, hashes, labels, Source.VERIFICATION, parts)
+    assert [store.get_decision(name).part for name in "abc"] == (parts or [None, None, None])
+
+
+@pytest.mark.parametrize(("parts", "said"), [(["x"], "each of 2 traces, got 1"), (["x", "y\0"], "plain text")])
+def test_an_import_with_bad_parts_adds_nothing(store: Store, parts: list[str], said: str) -> None:
+    with pytest.raises(StoreError, match=said):
+        store.put_labelled(
+            [decision("a"), decision("b")], trace(0, (2, C, T)), np.arange(2), np.ones(2), Source.VERIFICATION, parts
+        )
+    assert (store.get_decision("a"), store.status()["decisions"]) == (None, 0)
+
+
+def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Store) -> None:
+    for name, reason in (("a", Reason.NOVEL), ("b", Reason.CERTAIN), ("c", Reason.NOVEL)):
+        store.put_decision(decision(name, reason=reason), trace(), 1, False)
+    store.put_label("c", True, Source.VERIFICATION, 0, None, silent=2)
+    store.put_labels([label("b", silent=3), label("a")])
+    found = store.evidence_since(0)
+    assert (found.novel.tolist(), found.silent.tolist()) == ([True, False, True], [2, 3, 0])
+    assert (found.novel.dtype, found.silent.dtype) == (np.bool_, np.int64)
+    assert (store.evidence_since(2).novel.tolist(), store.evidence_since(2).silent.tolist()) == ([True], [0])
+    empty = store.evidence_since(3)
+    assert (empty.novel.dtype, empty.silent.dtype, empty.novel.shape) == (np.bool_, np.int64, (0,))
+
+
+# What became of decisions
+
+
+def test_a_new_store_has_heard_of_everything_and_nothing_happened(store: Store) -> None:
+    assert (store.unreported_accepts(), store.silent_total(), store.events()) == ([], 0, [])
+    assert store.outcomes() == Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store) -> None:
+    names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
+    store._clock = iter([5.0, 5.0, 5.0, 7.0, 7.0, 7.0, *range(8, 20)]).__next__
+    for name in names:
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
+    store.put_decision(decision("verified"), trace(), 1, False)
+    store.put_decision(decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
+    assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
+    store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
+    assert store.unreported_accepts() == ["amy", "kim", "ann"]
+
+
+def test_unreported_accepts_are_oldest_first_when_the_clock_went_back(store: Store) -> None:
+    store._clock = iter([3.0, 1.0, 2.0]).__next__
+    for name in "abc":
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    assert store.unreported_accepts() == ["b", "c", "a"]
+
+
+def test_the_silent_total_leaves_out_quarantined_labels(store: Store) -> None:
+    for i, silent in enumerate([3, 0, 4, 5]):
+        put(store, str(i), quarantined=i == 2)
+        store.put_label(str(i), True, Source.VERIFICATION, 0, None, silent=silent)
+    assert store.silent_total() == 8
+    assert store.evidence_since(0).silent.sum() == 8
+
+
+def test_outcomes_count_what_became_of_what_was_certain(store: Store) -> None:
+    for i, (action, predicted, success) in enumerate(
+        [(Action.ACCEPT, Action.ACCEPT, success) for success in (None, None, None, False, False, True)]
+        + [(Action.REJECT, Action.REJECT, None)] * 2
+        + [(Action.VERIFY, Action.ACCEPT, success) for success in (True, True, False, None)]
+        + [(Action.VERIFY, Action.REJECT, success) for success in (True, True, True, False, None)]
+        + [(Action.VERIFY, Action.VERIFY, success) for success in (True, False, None)]
+    ):
+        audit = action != predicted
+        store.put_decision(replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
+        if success is not None:
+            store.put_label(str(i), success, Source.AUDIT, 0, None)
+    assert store.outcomes() == Outcomes(
+        accepted=6,
+        stops=2,
+        confirmed=1,
+        audited_accepts=3,
+        audited_accepts_bad=1,
+        rejected=2,
+        audited_rejects=4,
+        audited_rejects_good=3,
+    )
+
+
+LIVES = st.lists(
+    st.tuples(
+        st.sampled_from(Action), st.booleans(), st.sampled_from([None, False, True]), st.integers(0, 5), st.booleans()
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(lives=LIVES)
+def test_counts_grow_by_what_was_put_and_agree_with_each_other(
+    store: Store, lives: list[tuple[Action, bool, bool | None, int, bool]]
+) -> None:
+    """lives : what the model predicted, audited or not, label or None, silent before it, quarantined or not."""
+    before, silent, waiting = store.outcomes(), store.silent_total(), store.unreported_accepts()
+    names, labels = [uuid.uuid4().hex for _ in lives], []
+    for name, (predicted, audit, success, quiet, quarantined) in zip(names, lives, strict=True):
+        action, audit = (Action.VERIFY, predicted is not Action.VERIFY) if audit else (predicted, False)
+        given = replace(decision(name, action), predicted=predicted, audit=audit)
+        store.put_decision(given, trace(), 1, quarantined)
+        labels += [] if success is None else [label(name, success, quiet)]
+    store.put_labels(labels)
+    accepts = [(name, life) for name, life in zip(names, lives, strict=True) if life[0] is Action.ACCEPT and not life[1]]
+    after = store.outcomes()
+    assert after.accepted - before.accepted == len(accepts)
+    assert after.stops - before.stops == sum(life[2] is False for _, life in accepts)
+    assert after.confirmed - before.confirmed == sum(life[2] is True for _, life in accepts)
+    assert store.unreported_accepts() == waiting + [name for name, life in accepts if life[2] is None and not life[4]]
+    assert store.silent_total() - silent == sum(life[3] for life in lives if life[2] is not None and not life[4])
+    assert 0 <= after.stops + after.confirmed <= after.accepted
+    assert 0 <= after.audited_accepts_bad <= after.audited_accepts
+    assert 0 <= after.audited_rejects_good <= after.audited_rejects
+
+
+# Events
+
+
+def test_events_are_numbered_from_one_and_returned_oldest_first(store: Store) -> None:
+    store._clock = iter([1.5, 2.5, 3.5]).__next__
+    for kind in ("started", "safe_mode", "left"):
+        store.put_event(kind, f"was {kind}: ±")
+    every = store.events()
+    assert every[1] == Event(2, 2.5, "safe_mode", "was safe_mode: ±")
+    assert [event.number for event in every] == [1, 2, 3]
+    assert store.events(2) == every[1:]
+    assert (store.events(0), store.events(9)) == ([], every)
+
+
+def test_an_event_writes_what_every_database_refuses_with_escapes(store: Store) -> None:
+    store.put_event(Reason.MODEL_ERROR, "read \0 and \ud800")
+    (event,) = store.events()
+    assert (event.kind, event.text) == ("model_error", "read \\0 and \\ud800")
+    assert type(event.kind) is str
+
+
+def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store: Store) -> None:
+    assert (store.status()["events"], store.status()["last_label_time"]) == ([], None)
+    store._clock = iter(float(i) for i in range(20)).__next__
+    for i in range(7):
+        store.put_event("note", str(i))
+    assert store.status()["events"] == [{"kind": "note", "text": str(i), "time": float(i)} for i in range(2, 7)]
+    put(store, "a")
+    put(store, "b")
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert store.status()["last_label_time"] == 9.0
+
+
 # Versions and settings
 
 
@@ -354,6 +584,28 @@ def test_memory_forgets_old_unreported_decisions_and_says_so() -> None:
         store.put_label("a", True, Source.VERIFICATION, 0, None)
 
 
+def test_memory_counts_the_accepts_that_it_forgot() -> None:
+    class Small(MemoryStore):
+        KEEP_UNLABELLED = 3
+
+    store = Small()
+    for name in "abcde":
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    store.put_label("e", False, Source.STOP, 0, None)
+    assert store.unreported_accepts() == ["c", "d"]
+    assert (store.outcomes().accepted, store.outcomes().stops) == (5, 1)
+
+
+def test_memory_forgets_nothing_of_an_import() -> None:
+    class Small(MemoryStore):
+        KEEP_UNLABELLED = 1
+
+    store = Small()
+    names = [str(i) for i in range(5)]
+    store.put_labelled([decision(n) for n in names], trace(0, (5, C, T)), np.arange(5), np.ones(5), Source.VERIFICATION)
+    assert len(store.labelled().seq) == 5
+
+
 def test_open_store_takes_nothing_a_file_or_a_store(tmp_path: Path) -> None:
     assert isinstance(open_store(None), MemoryStore)
     memory = MemoryStore()
@@ -378,6 +630,10 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         store.save_settings({"k": "v"})
         store.put_label("a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
         store.put_version(report(1), 1, {"w": values})
+        store.put_decision(decision("accepted", Action.ACCEPT), trace(), 1, False, "SN-1")
+        store.put_decision(decision("silent"), trace(), 1, False)
+        store.put_label("silent", True, Source.VERIFICATION, 0, None, silent=4)
+        store.put_event("started", "for the first time")
         put(store, "unreported")
     with SqlStore(*place) as store:
         assert store.settings() == {"k": "v"}
@@ -385,7 +641,12 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         np.testing.assert_array_equal(store.last_version().state["w"], values)
         assert store.points_since(0, 1).points.tolist() == [[0.5]]
         assert store.get_decision("unreported") is not None
-        assert store.put_label("unreported", True, Source.VERIFICATION, 0, None) == 2
+        assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
+        assert store.get_decision("accepted").part == "SN-1"
+        assert [event.text for event in store.events()] == ["for the first time"]
+        store.put_event("started", "again")
+        assert [event.number for event in store.events()] == [1, 2]
+        assert store.put_label("unreported", True, Source.VERIFICATION, 0, None) == 3
 
 
 def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str]) -> None:
@@ -397,6 +658,14 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         assert other.put_label("a", False, Source.STOP, 1, np.ones(2, np.float32)) == 1
         ours.put_version(report(1), 1, {"w": np.zeros(1)})
         ours.save_settings({"k": "v"})
+        ours.put_event("note", "ours")
+        ours.put_decision(decision("b", Action.ACCEPT), trace(), 1, False)
+        ours.put_decision(decision("c"), trace(), 1, False)
+        ours.put_label("c", True, Source.VERIFICATION, 0, None, silent=3)
+        assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
+        assert other.outcomes().accepted == 0
+        other.put_event("note", "other's")
+        assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
         assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
         assert other.labelled().labels.tolist() == [0]
         assert other.points_since(0, 1).points.tolist() == [[1.0, 1.0]]
@@ -420,6 +689,26 @@ def test_label_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str,
             thread.join()
         assert sorted(seqs) == list(range(1, 31))
         assert one.labelled().seq.tolist() == list(range(1, 31))
+
+
+def test_event_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str, str]) -> None:
+    def log(store: SqlStore) -> None:
+        for i in range(15):
+            store.put_event("note", str(i))
+
+    with SqlStore(*place) as one, SqlStore(*place) as two:
+        threads = [threading.Thread(target=log, args=(store,)) for store in (one, two)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [event.number for event in one.events()] == list(range(1, 31))
+
+
+def test_an_event_is_committed_when_it_returns(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store, SqlStore(*place) as other:
+        store.put_event("note", "now")
+        assert [event.text for event in other.events()] == ["now"]
 
 
 def test_the_writer_commits_without_being_asked(place: tuple[str, str]) -> None:
@@ -494,6 +783,9 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
             sql_queries.trace_query("cell", 5, 10),
             sql_queries.decision_query("cell", "a"),
             sql_queries.evidence_query("cell", 5),
+            sql_queries.held_query("cell", ["a", "b"]),
+            sql_queries.silent_query("cell"),
+            sql_queries.event_query("cell", 5),
         ):
             text = query.compile(connection, compile_kwargs={"literal_binds": True})
             plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
@@ -515,7 +807,7 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     SqlStore(str(file)).close()
     with sqlite3.connect(file) as connection:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
-    with pytest.raises(StoreError, match="schema 1, found schema 99"):
+    with pytest.raises(StoreError, match="schema 2, found schema 99"):
         SqlStore(str(file), "another cell")
 
 
@@ -524,7 +816,7 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     file = tmp_path / "a.db"
     with sqlite3.connect(file) as connection:
         connection.execute(f"CREATE TABLE {table}")
-    with pytest.raises(StoreError, match="schema 1, found tables of another program"):
+    with pytest.raises(StoreError, match="schema 2, found tables of another program"):
         SqlStore(str(file))
     with sqlite3.connect(file) as connection:
         assert connection.execute("SELECT count(*) FROM sqlite_master").fetchone() == (1,)

@@ -9,7 +9,7 @@ from .._lazy import lazy_names
 if TYPE_CHECKING:
     from .base import Store, open_store
     from .memory import MemoryStore
-    from .records import AddedPoints, Labelled, ModelVersion, StoredDecision
+    from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
     from .sql import SqlStore
 
 _WHERE = {
@@ -20,8 +20,12 @@ _WHERE = {
     "memory": ("MemoryStore",),
     "records": (
         "AddedPoints",
+        "Event",
+        "Evidence",
         "Labelled",
         "ModelVersion",
+        "NewLabel",
+        "Outcomes",
         "StoredDecision",
     ),
     "sql": ("SqlStore",),
@@ -29,9 +33,13 @@ _WHERE = {
 
 __all__ = [
     "AddedPoints",
+    "Event",
+    "Evidence",
     "Labelled",
     "MemoryStore",
     "ModelVersion",
+    "NewLabel",
+    "Outcomes",
     "SqlStore",
     "Store",
     "StoredDecision",

@@ -19,9 +19,21 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from .memory import MemoryStore
-from .records import AddedPoints, Evidence, Labelled, ModelVersion, StoredDecision
+from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
 
-__all__ = ["AddedPoints", "Labelled", "MemoryStore", "ModelVersion", "Store", "StoredDecision", "open_store"]
+__all__ = [
+    "AddedPoints",
+    "Event",
+    "Evidence",
+    "Labelled",
+    "MemoryStore",
+    "ModelVersion",
+    "NewLabel",
+    "Outcomes",
+    "Store",
+    "StoredDecision",
+    "open_store",
+]
 
 
 @runtime_checkable
@@ -36,8 +48,19 @@ class Store(Protocol):
     def save_settings(self, settings: Mapping[str, str]) -> None:
         """Replace the settings by these."""
 
-    def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
-        """Take a decision and its trace, (C, T) or (T,), without waiting for the disk."""
+    def put_decision(
+        self,
+        decision: Decision,
+        trace: NDArray[np.float32],
+        content_hash: int,
+        quarantined: bool,
+        part: str | None = None,
+    ) -> None:
+        """Take a decision and its trace, (C, T) or (T,), without waiting for the disk.
+
+        part : serial number of the part that the trace was recorded on.
+        content_hash : of the trace's content, or of its part's number where one is given.
+        """
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
@@ -46,11 +69,21 @@ class Store(Protocol):
         """Return the decision with its trace, queued ones included; None where it is unknown."""
 
     def put_label(
-        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None
+        self,
+        decision_id: str,
+        success: bool,
+        source: Source,
+        model_version: int,
+        point: NDArray[np.float32] | None,
+        *,
+        silent: int = 0,
     ) -> int:
-        """Commit a label, with its decision, before returning its sequence number 1, 2, ...
+        """Commit a label, with its decision, before returning its sequence number 1, 2, ...: one of `put_labels`."""
 
-        point : (d,) where the trace joined the references of `model_version`; None where it did not.
+    def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
+        """Commit labels, with their decisions, all or none; returns their sequence numbers, in the order given.
+
+        Raises ReportError for an unknown decision, or for a second label of one.
         """
 
     def put_labelled(
@@ -60,8 +93,12 @@ class Store(Protocol):
         hashes: NDArray[np.int64],
         labels: NDArray[np.int8],
         source: Source,
+        parts: Sequence[str | None] | None = None,
     ) -> NDArray[np.int64]:
-        """Import labelled traces, all or none; returns their sequence numbers."""
+        """Import labelled traces, all or none; returns their sequence numbers.
+
+        parts : serial number of the part of each trace, as in `put_decision`; None: of all unknown.
+        """
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
         """Record a retrain; a dropped candidate has no state."""
@@ -81,8 +118,23 @@ class Store(Protocol):
     def evidence_since(self, seq: int) -> Evidence:
         """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
 
+    def unreported_accepts(self) -> list[str]:
+        """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
+
+    def silent_total(self) -> int:
+        """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
+
+    def outcomes(self) -> Outcomes:
+        """Count what became of what the model was certain of."""
+
+    def put_event(self, kind: str, text: str) -> None:
+        """Commit what happened, in a word and for people to read, to the cell's log."""
+
+    def events(self, limit: int | None = None) -> list[Event]:
+        """Return the newest `limit` events, all where it is None; oldest first."""
+
     def status(self) -> dict[str, Any]:
-        """Count decisions, labels and versions."""
+        """Count decisions, labels and versions; show the newest events."""
 
     def close(self) -> None:
         """Flush and let go."""

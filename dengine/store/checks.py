@@ -58,6 +58,27 @@ def as_point(point: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
     return copy
 
 
+def as_part(part: str | None) -> str | None:
+    """Return a part's number as every database can hold it; a StoreError before it is queued, not at the next write."""
+    if part is None:
+        return None
+    if not isinstance(part, str) or part != as_text(part):
+        raise StoreError(f"Expected a part's number as plain text, or None, got {part!r}; strip what a scanner added.")
+    return str(part)
+
+
+def as_text(text: str) -> str:
+    """Return a text for people, with escapes for what a database refuses: NUL, and half a surrogate pair."""
+    return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
+
+
+def as_silent(silent: int) -> int:
+    """Return how many accepted parts went on unheard of since the previous label; -1: the label is of one of them."""
+    if int(silent) < -1:
+        raise StoreError(f"Expected a count of parts that went on in silence, -1 or more, got {silent}; count from 0.")
+    return int(silent)
+
+
 def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
     """Copy a version's arrays; an accepted version needs them, and none may hold Python objects (a pickle)."""
     if state is None:
@@ -87,6 +108,16 @@ def check_import(
     if twice:
         raise duplicate_id(twice[0])
     return traces
+
+
+def check_parts(parts: Sequence[str | None] | None, n: int) -> list[str | None]:
+    """Return the part's number of each of n traces of an import; None where none is given."""
+    numbers = [as_part(part) for part in ([None] * n if parts is None else parts)]
+    if len(numbers) != n:
+        raise StoreError(
+            f"Expected a part's number for each of {n} traces, got {len(numbers)}; give None where it is unknown."
+        )
+    return numbers
 
 
 def duplicate_id(decision_id: str) -> StoreError:

@@ -1,9 +1,9 @@
-"""What every store hands back: decisions, labelled traces, added points, versions, and the counts of its status."""
+"""What a store is given and what it hands back: decisions, labels, traces, points, versions, events and counts."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Action, Decision, Reason, RetrainReport, Source
-from .checks import mixed_shapes
+from .checks import already_reported, as_point, as_silent, mixed_shapes, unknown_decision
+
+STATUS_EVENTS = 5  # newest ones that a status shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +21,8 @@ class DecidedTrace:
     """A decision on its way into a store.
 
     trace : (C, T) float32, a copy.  time : of the decision, in seconds.
+    content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given.
+    part : serial number of the part that the trace was recorded on.
     """
 
     decision: Decision
@@ -26,6 +30,23 @@ class DecidedTrace:
     content_hash: int
     quarantined: bool
     time: float
+    part: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NewLabel:
+    """A label on its way into a store.
+
+    point : (d,) where the trace joined the references of `model_version`; None where it did not.
+    silent : accepted parts that went on since the previous label, and of which nothing was heard.
+    """
+
+    decision_id: str
+    success: bool
+    source: Source
+    model_version: int
+    point: NDArray[np.float32] | None
+    silent: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +54,11 @@ class StoredDecision:
     """What a report needs to know of a decision; fields as in `Decision`.
 
     trace : (C, T) float32.
-    content_hash : signed 64 bit; equal traces share it.
+    content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given. It deals the
+        permanent fold, and says who may vote once: equal traces share it, or the traces of one part.
     quarantined : kept, but never given to training.
     success, source : the label, if one was reported.
+    part : serial number of the part that the trace was recorded on, where one was given.
     """
 
     id: str
@@ -52,6 +75,7 @@ class StoredDecision:
     quarantined: bool
     success: bool | None
     source: Source | None
+    part: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +85,7 @@ class Labelled:
     seq : (n,) label sequence numbers, increasing.
     traces : (n, C, T); (0, 0, 0) where there is none.
     labels : (n,) 1 success, 0 failure.
-    hashes : (n,) content hashes.
+    hashes : (n,) content hashes: of the trace's content, or of its part's number where one is given.
     """
 
     seq: NDArray[np.int64]
@@ -80,12 +104,51 @@ class AddedPoints:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What became of decisions, in label order: the bound each was decided by, (n,) float64, and its label, (n,) bool."""
+    """What became of decisions, in label order.
+
+    lower, upper : (n,) the bound each was decided by.
+    success : (n,) its label.
+    novel : (n,) whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
+    silent : (n,) accepted parts of which nothing was heard between the previous label and this one.
+    """
 
     seq: NDArray[np.int64]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     success: NDArray[np.bool_]
+    novel: NDArray[np.bool_]
+    silent: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """What became of what the model was certain of, counted over all of a cell's store, quarantined ones included.
+
+    accepted, rejected : decisions with that action.
+    stops, confirmed : labels of the accepted, False and True; of the others nothing was heard.
+    audited_accepts, audited_rejects : labelled audits of what the model would have accepted, and rejected.
+    audited_accepts_bad : of these, label False.
+    audited_rejects_good : of these, label True.
+    """
+
+    accepted: int
+    stops: int
+    confirmed: int
+    audited_accepts: int
+    audited_accepts_bad: int
+    rejected: int
+    audited_rejects: int
+    audited_rejects_good: int
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What happened to an engine, for people; number : 1, 2, ... in each cell.  time : in seconds."""
+
+    number: int
+    time: float
+    kind: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +182,59 @@ def stored_decision(item: DecidedTrace, success: bool | None = None, source: Sou
         quarantined=item.quarantined,
         success=success,
         source=source,
+        part=item.part,
+    )
+
+
+def checked_label(label: NewLabel) -> NewLabel:
+    """Return a label in the store's own types, with a point of its own."""
+    return NewLabel(
+        decision_id=label.decision_id,
+        success=bool(label.success),
+        source=label.source,
+        model_version=int(label.model_version),
+        point=as_point(label.point),
+        silent=as_silent(label.silent),
+    )
+
+
+def imported_labels(decisions: Sequence[Decision], labels: NDArray[np.int8], source: Source) -> list[NewLabel]:
+    """Return the labels that decisions of an import come with."""
+    pairs = zip(decisions, labels, strict=True)
+    return [NewLabel(decision.id, bool(label), source, int(decision.model_version), None) for decision, label in pairs]
+
+
+def refuse_repeats(
+    labels: Sequence[NewLabel], known: Collection[str], said: Mapping[str, tuple[bool, Source]], hint: str = ""
+) -> None:
+    """Raise a ReportError for the first label whose decision is not `known`, or was reported: in `said`, or before it."""
+    reported = dict(said)
+    for label in labels:
+        if label.decision_id not in known:
+            raise unknown_decision(label.decision_id, hint)
+        first, now = reported.get(label.decision_id), (label.success, label.source)
+        if first is not None:
+            raise already_reported(label.decision_id, first, now)
+        reported[label.decision_id] = now
+
+
+def count_outcomes(kinds: Iterable[tuple[str, str, bool, bool | None, int]]) -> Outcomes:
+    """Count outcomes; kinds : (action, predicted, audit, label or None, how many)."""
+    done: Counter[tuple[str, bool | None]] = Counter()  # by action and label
+    audited: Counter[tuple[str, bool | None]] = Counter()  # audits, by prediction and label
+    for action, predicted, audit, success, n in kinds:
+        done[action, success] += n
+        audited[predicted, success] += n if audit else 0
+    accept, reject = Action.ACCEPT.value, Action.REJECT.value
+    return Outcomes(
+        accepted=sum(done[accept, label] for label in (None, False, True)),
+        stops=done[accept, False],
+        confirmed=done[accept, True],
+        audited_accepts=audited[accept, False] + audited[accept, True],
+        audited_accepts_bad=audited[accept, False],
+        rejected=sum(done[reject, label] for label in (None, False, True)),
+        audited_rejects=audited[reject, False] + audited[reject, True],
+        audited_rejects_good=audited[reject, True],
     )
 
 
@@ -138,9 +254,14 @@ def summary(
     sources: Mapping[str, int],
     retrains: Sequence[RetrainReport],
     times: tuple[float | None, float | None],
+    last_label_time: float | None,
+    events: Sequence[Event],
     write_failures: int = 0,
 ) -> dict[str, Any]:
-    """Return the status of a store from its counts; kinds : (action, reason, quarantined, how many)."""
+    """Return the status of a store from its counts; kinds : (action, reason, quarantined, how many).
+
+    events : the newest STATUS_EVENTS.
+    """
     actions: Counter[str] = Counter()
     reasons: Counter[str] = Counter()
     for action, reason, _, n in kinds:
@@ -160,5 +281,7 @@ def summary(
         "last_version": versions[-1] if versions else None,
         "first_time": times[0],
         "last_time": times[1],
+        "last_label_time": last_label_time,
+        "events": [{"kind": event.kind, "text": event.text, "time": event.time} for event in events],
         "write_failures": write_failures,
     }

@@ -3,9 +3,9 @@
     store = SqlStore("engine.db", cell_id="cell-7")
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
 
-What a returned call promises, given a disk that keeps what it synced: `put_label`, `put_labelled`, `put_version`
-and `save_settings` are committed. `put_decision` is not: its row is queued, and committed within about 50 ms by a
-writer thread, by `flush`, or in the same transaction as the next label, whichever comes first.
+What a returned call promises, given a disk that keeps what it synced: all that is put is committed, but for
+`put_decision`: its row is queued, and committed within about 50 ms by a writer thread, by `flush`, or in the same
+transaction as the next label, whichever comes first.
 """
 
 from __future__ import annotations
@@ -21,32 +21,30 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
-from .checks import (
-    already_reported,
-    as_channels,
-    as_hash,
-    as_point,
-    check_import,
-    check_state,
-    duplicate_id,
-    mixed_shapes,
-    unknown_decision,
-)
+from . import sql_queries as ask
+from .checks import as_channels, as_hash, as_part, as_text, check_import, check_parts, check_state, duplicate_id
 from .records import (
+    STATUS_EVENTS,
     AddedPoints,
     DecidedTrace,
+    Event,
     Evidence,
     Labelled,
     ModelVersion,
+    NewLabel,
+    Outcomes,
     StoredDecision,
+    checked_label,
+    count_outcomes,
+    imported_labels,
+    refuse_repeats,
     stack,
     stored_decision,
     summary,
 )
-from .sql_queries import decision_query, evidence_query, newest_query, points_query, trace_query
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, from_npz, imported_row, pack, read_decision, unpack, unpack_trace, version_row
-from .sql_tables import DECISION, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
+from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
 
 
 class SqlStore:
@@ -77,7 +75,7 @@ class SqlStore:
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
-        query = self._of_cell(SETTING).where(SETTING.c.key != SCHEMA_KEY)
+        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key != SCHEMA_KEY)
         return {row.key: row.value for row in self._read(query)}
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
@@ -96,10 +94,17 @@ class SqlStore:
 
     # Decisions
 
-    def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
+    def put_decision(
+        self,
+        decision: Decision,
+        trace: NDArray[np.float32],
+        content_hash: int,
+        quarantined: bool,
+        part: str | None = None,
+    ) -> None:
         """Queue a decision and its trace for the writer thread."""
-        item = DecidedTrace(decision, as_channels(trace), as_hash(content_hash), bool(quarantined), self._clock())
-        self._database.put(item)
+        values, hash_, number = as_channels(trace), as_hash(content_hash), as_part(part)
+        self._database.put(DecidedTrace(decision, values, hash_, bool(quarantined), self._clock(), number))
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
@@ -110,52 +115,45 @@ class SqlStore:
         item = self._database.queued(decision_id)
         if item is not None:
             return stored_decision(item)
-        rows = self._read(decision_query(self.cell_id, decision_id))
+        rows = self._read(ask.decision_query(self.cell_id, decision_id))
         return read_decision(rows[0]) if rows else None
 
     # Labels
 
     def put_label(
-        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None
+        self,
+        decision_id: str,
+        success: bool,
+        source: Source,
+        model_version: int,
+        point: NDArray[np.float32] | None,
+        *,
+        silent: int = 0,
     ) -> int:
         """Commit a label, in one transaction with its decision where that still waits; returns its number."""
-        copy = as_point(point)
-        row = {
-            "cell_id": self.cell_id,
-            "decision_id": decision_id,
-            "time": self._clock(),
-            "success": bool(success),
-            "source": source.value,
-            "model_version": int(model_version),
-            "point": None if copy is None else pack(copy),
-        }
+        return int(self.put_labels([NewLabel(decision_id, success, source, model_version, point, silent)])[0])
 
-        def label(connection: sa.Connection) -> int:
-            seq = self._next_seq(connection)
-            held = self._held_of(connection, decision_id, bool(success), source)
-            connection.execute(sa.insert(LABEL), row | held | {"seq": seq})
-            return seq
+    def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
+        """Commit labels in one transaction, all or none, with decisions that still wait; returns their numbers."""
+        given, now = [checked_label(label) for label in labels], self._clock()
 
-        return self._database.write(label)
+        def add(connection: sa.Connection) -> NDArray[np.int64]:
+            first = self._database.next_number(connection, LABEL.c.seq)
+            held = self._held_of(connection, given)
+            for part in chunks(range(len(given))):
+                rows = [label_row(self.cell_id, given[i], first + i, now, *held[given[i].decision_id]) for i in part]
+                connection.execute(sa.insert(LABEL), rows)
+            return np.arange(first, first + len(given), dtype=np.int64)
 
-    def _held_of(self, connection: sa.Connection, decision_id: str, success: bool, source: Source) -> dict[str, Any]:
-        """Return what a label repeats of its decision; a ReportError where there is none, or a label already."""
-        labels = (LABEL.c.cell_id == DECISION.c.cell_id) & (LABEL.c.decision_id == DECISION.c.id)
-        columns = DECISION.c["content_hash", "quarantined"]
-        query = sa.select(*columns, LABEL.c.success, LABEL.c.source).select_from(DECISION.outerjoin(LABEL, labels))
-        mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
-        found = connection.execute(query.where(mine)).first()
-        if found is None:
-            raise unknown_decision(decision_id)
-        if found.source is not None:
-            raise already_reported(decision_id, (found.success, Source(found.source)), (success, source))
-        return {"content_hash": found.content_hash, "quarantined": found.quarantined}
+        return self._database.write(add)
 
-    def _next_seq(self, connection: sa.Connection) -> int:
-        """Lock the cell (PostgreSQL; SQLite's BEGIN IMMEDIATE did it already), then number its next label."""
-        connection.execute(self._of_cell(SETTING).where(SETTING.c.key == SCHEMA_KEY).with_for_update())
-        newest = sa.select(sa.func.max(LABEL.c.seq)).where(LABEL.c.cell_id == self.cell_id)
-        return (connection.execute(newest).scalar() or 0) + 1
+    def _held_of(self, connection: sa.Connection, labels: Sequence[NewLabel]) -> dict[str, tuple[int, bool]]:
+        """Return what labels repeat of their decisions; a ReportError where one is unknown, or labelled already."""
+        parts = chunks([label.decision_id for label in labels])
+        found = [row for part in parts for row in connection.execute(ask.held_query(self.cell_id, part))]
+        held = {row.id: (row.content_hash, row.quarantined) for row in found}
+        refuse_repeats(labels, held, {row.id: (row.success, Source(row.source)) for row in found if row.source is not None})
+        return held
 
     def put_labelled(
         self,
@@ -164,40 +162,40 @@ class SqlStore:
         hashes: NDArray[np.int64],
         labels: NDArray[np.int8],
         source: Source,
+        parts: Sequence[str | None] | None = None,
     ) -> NDArray[np.int64]:
         """Import labelled traces in one transaction, all or none; returns their sequence numbers."""
         traces, now = check_import(decisions, traces, hashes, labels), self._clock()
+        numbers, given = check_parts(parts, len(decisions)), imported_labels(decisions, labels, source)
         for decision in decisions:
             if self._database.queued(decision.id) is not None:
                 raise duplicate_id(decision.id)
 
         def load(connection: sa.Connection) -> NDArray[np.int64]:
-            first = self._next_seq(connection)
+            first = self._database.next_number(connection, LABEL.c.seq)
             self._refuse_known(connection, [decision.id for decision in decisions])
             for part in chunks(range(len(decisions))):
-                items = [DecidedTrace(decisions[i], traces[i], as_hash(hashes[i]), False, now) for i in part]
+                items = [DecidedTrace(decisions[i], traces[i], as_hash(hashes[i]), False, now, numbers[i]) for i in part]
                 self._database.insert(connection, items)
-                rows = [
-                    imported_row(self.cell_id, item, first + i, bool(labels[i]), source)
-                    for i, item in zip(part, items, strict=True)
-                ]
+                rows = [label_row(self.cell_id, given[i], first + i, now, as_hash(hashes[i]), False) for i in part]
                 connection.execute(sa.insert(LABEL), rows)
             return np.arange(first, first + len(decisions), dtype=np.int64)
 
         return self._database.write(load)
 
     def _refuse_known(self, connection: sa.Connection, ids: Sequence[str]) -> None:
-        query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
         for part in chunks(ids):
-            known = connection.execute(query.where(DECISION.c.id.in_(part))).scalar()
+            known = connection.execute(ask.held_query(self.cell_id, part)).first()
             if known is not None:
-                raise duplicate_id(known)
+                raise duplicate_id(known.id)
 
     def labelled(self, limit: int | None = None) -> Labelled:
         """Return the newest `limit` labelled traces, oldest first; read along the index `label_training`."""
         with self._database.transaction(write=False) as connection:
-            newest = connection.execute(newest_query(self.cell_id, limit)).all()[::-1]
-            traces = self._read_traces(connection, [row.seq for row in newest])
+            newest = connection.execute(ask.newest_query(self.cell_id, limit)).all()[::-1]
+            first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
+            rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
+            traces = read_traces(rows, len(newest))
         return Labelled(
             seq=np.array([row.seq for row in newest], dtype=np.int64),
             traces=traces,
@@ -205,35 +203,30 @@ class SqlStore:
             hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
         )
 
-    def _read_traces(self, connection: sa.Connection, seqs: Sequence[int]) -> NDArray[np.float32]:
-        """Read the traces of labels `seqs` (increasing, none left out between) as (n, C, T), streamed."""
-        if not seqs:
-            return np.zeros((0, 0, 0), dtype=np.float32)
-        rows = iter(connection.execute(trace_query(self.cell_id, seqs[0], seqs[-1]).execution_options(yield_per=CHUNK)))
-        first = unpack_trace(next(rows))
-        traces = np.empty((len(seqs), *first.shape), dtype=np.float32)
-        traces[0] = first
-        for i, row in enumerate(rows, start=1):
-            if (row.channels, row.samples) != first.shape:
-                raise mixed_shapes({first.shape, (row.channels, row.samples)})
-            traces[i] = unpack_trace(row)
-        return traces
-
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
-        rows = self._read(points_query(self.cell_id, int(seq), int(model_version)))
+        rows = self._read(ask.points_query(self.cell_id, int(seq), int(model_version)))
         seqs = np.array([row.seq for row in rows], dtype=np.int64)
         return AddedPoints(seqs, stack([unpack(row.point) for row in rows], (0, 0)))
 
     def evidence_since(self, seq: int) -> Evidence:
         """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
-        rows = self._read(evidence_query(self.cell_id, int(seq)))
-        return Evidence(
-            seq=np.array([row.seq for row in rows], dtype=np.int64),
-            lower=np.array([row.lower for row in rows], dtype=np.float64),
-            upper=np.array([row.upper for row in rows], dtype=np.float64),
-            success=np.array([row.success for row in rows], dtype=bool),
-        )
+        return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq))))
+
+    def unreported_accepts(self) -> list[str]:
+        """Return the ids of accepted decisions without a label, oldest first; what is queued is written first."""
+        self.flush()
+        with self._database.transaction(write=False) as connection:
+            return list(connection.execute(ask.unreported_query(self.cell_id, connection.dialect.name)).scalars())
+
+    def silent_total(self) -> int:
+        """Return how many accepted parts went on unheard of, over all labels but the quarantined ones."""
+        return int(self._read(ask.silent_query(self.cell_id))[0][0])
+
+    def outcomes(self) -> Outcomes:
+        """Count what became of what the model was certain of; what is queued is written first."""
+        self.flush()
+        return count_outcomes(tuple(row) for row in self._read(ask.outcome_query(self.cell_id)))
 
     def _read(self, query: sa.Select[Any]) -> Sequence[Any]:
         with self._database.transaction(write=False) as connection:
@@ -246,45 +239,54 @@ class SqlStore:
         row = version_row(self.cell_id, report, int(last_seq), self._clock(), check_state(report, state))
 
         def record(connection: sa.Connection) -> None:
-            self._next_seq(connection)  # for its lock
-            newest = sa.select(sa.func.max(VERSION.c.retrain)).where(VERSION.c.cell_id == self.cell_id)
-            retrain = (connection.execute(newest).scalar() or 0) + 1
+            retrain = self._database.next_number(connection, VERSION.c.retrain)
             connection.execute(sa.insert(VERSION), row | {"retrain": retrain})
 
         self._database.write(record)
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version."""
-        query = sa.select(*VERSION.c["version", "last_seq", "state"])
-        query = query.where(VERSION.c.cell_id == self.cell_id, VERSION.c.accepted == sa.true())
-        rows = self._read(query.order_by(VERSION.c.retrain.desc()).limit(1))
-        return (
-            ModelVersion(rows[0].version, rows[0].last_seq, from_npz(rows[0].state, self._database.name)) if rows else None
-        )
+        rows = self._read(ask.version_query(self.cell_id))
+        if not rows:
+            return None
+        return ModelVersion(rows[0].version, rows[0].last_seq, from_npz(rows[0].state, self._database.name))
 
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""
-        names = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")
-        query = sa.select(*(VERSION.c[name] for name in names)).where(VERSION.c.cell_id == self.cell_id)
-        return [RetrainReport(*row) for row in self._read(query.order_by(VERSION.c.retrain))]
+        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self.cell_id))]
+
+    # Events
+
+    def put_event(self, kind: str, text: str) -> None:
+        """Commit what happened to the cell's log."""
+        row = {"cell_id": self.cell_id, "time": self._clock(), "kind": as_text(kind), "text": as_text(text)}
+
+        def log(connection: sa.Connection) -> None:
+            number = self._database.next_number(connection, EVENT.c.number)
+            connection.execute(sa.insert(EVENT), row | {"number": number})
+
+        self._database.write(log)
+
+    def events(self, limit: int | None = None) -> list[Event]:
+        """Return the newest `limit` events, oldest first."""
+        return [Event(*row) for row in self._read(ask.event_query(self.cell_id, limit))[::-1]]
 
     # Overview
 
     def status(self) -> dict[str, Any]:
-        """Count decisions, labels and versions; what is queued is written first."""
+        """Count decisions, labels and versions, and show the newest events; what is queued is written first."""
         self.flush()
-        kind = DECISION.c["action", "reason", "quarantined"]
-        kinds = sa.select(*kind, sa.func.count()).where(DECISION.c.cell_id == self.cell_id).group_by(*kind)
-        sources = sa.select(LABEL.c.source, sa.func.count()).where(LABEL.c.cell_id == self.cell_id)
-        times = sa.select(sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time))
-        with self._database.transaction(write=False) as connection:
-            counted = [(row[0], row[1], row[2], row[3]) for row in connection.execute(kinds)]
-            labels = {row[0]: row[1] for row in connection.execute(sources.group_by(LABEL.c.source))}
-            first, last = connection.execute(times.where(DECISION.c.cell_id == self.cell_id)).one()
-        return summary(self.cell_id, counted, labels, self.retrains(), (first, last), self._database.failures)
-
-    def _of_cell(self, table: sa.Table) -> sa.Select[Any]:
-        return sa.select(table).where(table.c.cell_id == self.cell_id)
+        kinds, sources = self._read(ask.kind_query(self.cell_id)), self._read(ask.source_query(self.cell_id))
+        return summary(
+            self.cell_id,
+            [(row[0], row[1], row[2], row[3]) for row in kinds],
+            {row.source: row.n for row in sources},
+            self.retrains(),
+            (min((row.first for row in kinds), default=None), max((row.last for row in kinds), default=None)),
+            max((row.last for row in sources), default=None),
+            self.events(STATUS_EVENTS),
+            self._database.failures,
+        )
 
     def close(self) -> None:
         """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""

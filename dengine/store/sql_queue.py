@@ -7,7 +7,7 @@ import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
@@ -16,7 +16,7 @@ from .checks import duplicate_id
 from .records import DecidedTrace
 from .sql_engine import advice, make_engine
 from .sql_rows import chunks, decision_row, trace_row
-from .sql_tables import DECISION, TRACE, prepare_tables
+from .sql_tables import DECISION, SCHEMA_KEY, SETTING, TRACE, prepare_tables
 
 LINGER = 0.05  # seconds that a decision waits for company before it is committed
 RETRY = 1.0  # seconds before the writer tries again after a failure
@@ -91,6 +91,13 @@ class SqlDatabase:
             self._doubtful = False
             self._forget(batch)
             return result
+
+    def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
+        """Lock the cell (PostgreSQL; SQLite's BEGIN IMMEDIATE did it already), then number the next row of a table."""
+        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
+        connection.execute(sa.select(SETTING).where(mine).with_for_update())
+        newest = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
+        return (connection.execute(newest).scalar() or 0) + 1
 
     # The queue
 

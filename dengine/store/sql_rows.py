@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .records import DecidedTrace, StoredDecision
+from .checks import mixed_shapes
+from .records import DecidedTrace, Evidence, NewLabel, StoredDecision
 
 CHUNK = 500  # rows sent or fetched at a time
 
@@ -40,6 +41,7 @@ def decision_row(cell_id: str, item: DecidedTrace) -> dict[str, Any]:
         "propensity": float(decision.propensity),
         "content_hash": item.content_hash,
         "quarantined": item.quarantined,
+        "part": item.part,
     }
 
 
@@ -55,19 +57,20 @@ def trace_row(cell_id: str, item: DecidedTrace) -> dict[str, Any]:
     }
 
 
-def imported_row(cell_id: str, item: DecidedTrace, seq: int, success: bool, source: Source) -> dict[str, Any]:
-    """Return the row of the table `label` for a decision that came with its label."""
+def label_row(cell_id: str, label: NewLabel, seq: int, time: float, content_hash: int, quarantined: bool) -> dict[str, Any]:
+    """Return the row of the table `label`; the last two are those of its decision."""
     return {
         "cell_id": cell_id,
-        "decision_id": item.decision.id,
+        "decision_id": label.decision_id,
         "seq": seq,
-        "time": item.time,
-        "success": success,
-        "source": source.value,
-        "model_version": int(item.decision.model_version),
-        "point": None,
-        "content_hash": item.content_hash,
-        "quarantined": False,
+        "time": time,
+        "success": label.success,
+        "source": label.source.value,
+        "model_version": label.model_version,
+        "point": None if label.point is None else pack(label.point),
+        "content_hash": content_hash,
+        "quarantined": quarantined,
+        "silent": label.silent,
     }
 
 
@@ -106,7 +109,32 @@ def read_decision(row: Any) -> StoredDecision:
         quarantined=row.quarantined,
         success=row.success,
         source=None if row.source is None else Source(row.source),
+        part=row.part,
     )
+
+
+def read_evidence(rows: Sequence[Any]) -> Evidence:
+    """Read rows of `label` joined with the bounds and the reason of their decisions."""
+    return Evidence(
+        seq=np.array([row.seq for row in rows], dtype=np.int64),
+        lower=np.array([row.lower for row in rows], dtype=np.float64),
+        upper=np.array([row.upper for row in rows], dtype=np.float64),
+        success=np.array([row.success for row in rows], dtype=bool),
+        novel=np.array([row.reason == Reason.NOVEL for row in rows], dtype=bool),
+        silent=np.array([row.silent for row in rows], dtype=np.int64),
+    )
+
+
+def read_traces(rows: Iterable[Any], n: int) -> NDArray[np.float32]:
+    """Read n rows of `trace` as (n, C, T), one at a time; (0, 0, 0) where there is none."""
+    traces = np.zeros((0, 0, 0), dtype=np.float32)
+    for i, row in enumerate(rows):
+        if i == 0:
+            traces = np.empty((n, row.channels, row.samples), dtype=np.float32)
+        if (row.channels, row.samples) != traces.shape[1:]:
+            raise mixed_shapes({traces.shape[1:], (row.channels, row.samples)})
+        traces[i] = unpack_trace(row)
+    return traces
 
 
 def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:

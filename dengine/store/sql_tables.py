@@ -6,7 +6,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 
-SCHEMA = "1"
+SCHEMA = "2"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
 
 METADATA = sa.MetaData()
@@ -34,8 +34,10 @@ DECISION = sa.Table(
     sa.Column("reason", sa.String, nullable=False),
     sa.Column("audit", sa.Boolean, nullable=False),
     sa.Column("propensity", sa.Double),
+    # Of the trace's content, or of its part's number where one is given: it deals the fold, and who may vote once.
     sa.Column("content_hash", sa.BigInteger, nullable=False),
     sa.Column("quarantined", sa.Boolean, nullable=False),
+    sa.Column("part", sa.String),  # serial number of the part that the trace was recorded on; since schema 2
 )
 TRACE = sa.Table(  # apart from `decision`, so that counting decisions does not read traces
     "trace",
@@ -59,6 +61,8 @@ LABEL = sa.Table(
     sa.Column("point", sa.LargeBinary),  # float32, little-endian, (d,)
     sa.Column("content_hash", sa.BigInteger, nullable=False),  # this and the next repeat `decision`, for the index
     sa.Column("quarantined", sa.Boolean, nullable=False),
+    # Accepted parts of which nothing was heard since the previous label; since schema 2.
+    sa.Column("silent", sa.BigInteger, nullable=False, server_default=sa.text("0")),
     sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
     sa.Index("label_training", "cell_id", "quarantined", "seq"),
 )
@@ -78,19 +82,28 @@ VERSION = sa.Table(  # every retrain, dropped candidates included
     sa.Column("state", sa.LargeBinary),  # npz without pickles
     sa.Index("version_accepted", "cell_id", "accepted", "retrain"),
 )
+EVENT = sa.Table(  # since schema 2
+    "event",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("kind", sa.String, nullable=False),
+    sa.Column("text", sa.Text, nullable=False),
+)
 
 
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
-    """Create the tables in an empty database, or check that they are ours; then enter the cell.
+    """Create the tables in an empty database, or check that they are ours and bring them up to date; enter the cell.
 
     name : of the database, for the error.
     """
-    if connection.dialect.name == "postgresql":  # two cells may create the tables at the same moment
+    if connection.dialect.name == "postgresql":  # two cells may create or change the tables at the same moment
         connection.execute(sa.text("SELECT pg_advisory_xact_lock(7236482514)"))
     found, ours = set(sa.inspect(connection).get_table_names()), set(METADATA.tables)
     # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
     if found & ours or (found and connection.dialect.name == "sqlite"):
-        _check_schema(connection, found, name)
+        _bring_up_to_date(connection, found, name)
     else:
         METADATA.create_all(connection)
     entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
@@ -98,15 +111,28 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})
 
 
-def _check_schema(connection: sa.Connection, found: set[str], name: str) -> None:
-    held = "tables of another program: " + ", ".join(sorted(found))
-    columns = {c["name"] for c in sa.inspect(connection).get_columns("setting")} if "setting" in found else set()
-    if columns == set(SETTING.c.keys()):
-        # The one query over all cells: the tables are theirs in common.
-        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
-        held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
-    if held != f"schema {SCHEMA}":
+def _bring_up_to_date(connection: sa.Connection, found: set[str], name: str) -> None:
+    """Change tables of schema 1 to the present one, for all cells at once; refuse any other."""
+    held = _held(connection, found)
+    if held == "schema 1":
+        for column in (DECISION.c.part, LABEL.c.silent):
+            new = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
+            connection.exec_driver_sql(f"ALTER TABLE {column.table.name} ADD COLUMN {new}")
+        EVENT.create(connection)
+        connection.execute(sa.update(SETTING).where(SETTING.c.key == SCHEMA_KEY).values(value=SCHEMA))
+    elif held != f"schema {SCHEMA}":
         raise StoreError(
             f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
             "open it with the dengine that wrote it, or name a new file or database."
         )
+
+
+def _held(connection: sa.Connection, found: set[str]) -> str:
+    """Say what a database holds: the schema of the tables that its cells have in common, or another program's."""
+    columns = {c["name"] for c in sa.inspect(connection).get_columns("setting")} if "setting" in found else set()
+    if columns != set(SETTING.c.keys()):
+        return "tables of another program: " + ", ".join(sorted(found))
+    query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
+    schema = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
+    beside = schema == "schema 1" and EVENT.name in found  # schema 1 had none
+    return f"{schema} and a table {EVENT.name!r} of another program" if beside else schema
