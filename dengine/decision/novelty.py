@@ -1,0 +1,136 @@
+"""Is this trace like those learned from? Its distance to the nearest reference, in level and in texture, against limits.
+
+    >>> gate = fit_novelty(traces, margin=1.5)
+    >>> gate(torch.from_numpy(traces[0]))
+    False
+
+    x (C, T) -> S segments: minimum and maximum (the level), logarithm of the roughness (the texture)   (3*C*S,)
+             -> standardised
+             -> squared distance to the nearest reference over its limit, of the level, of the texture  (2,)
+
+Hotelling's T^2 (1947, in Techniques of Statistical Analysis) taken from the nearest reference and not from the mean: parts
+that seat, jam and miss lie in clouds apart, and one covariance is at home in the emptiness between them (nearest neighbours
+for batch processes: He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). As with T^2 and the residual Q of Jackson and
+Mudholkar (1979, Technometrics 21), two statistics have a limit each, and either alone tells: hum leaves the level where it
+was. Segments for variables: batch trajectories, Nomikos and MacGregor (1994, AIChE Journal 40). Limits from the references
+themselves, not from a normal law: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is read here, and
+nothing is clipped.
+"""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+SEGMENTS = 14
+WIDEST = 42  # segments of all channels together: many channels have fewer each
+REFERENCES = 1000  # searched at each decision
+FEWEST = 20  # traces: fewer cannot say what is usual
+QUANTILE = 0.995
+TAIL_TRACES = 200  # one of so many lies beyond the quantile
+BEYOND = 1e15  # deviations: the square of a distance would overflow
+QUIET = 0.05  # of a channel's roughness: what is quieter is silent
+
+
+class NoveltyGate(nn.Module):
+    """(C, T) -> novel? All that it learns is in buffers whose shapes `channels` and `samples` fix.
+
+    channels, samples : C and T.  asleep : whether nothing is novel, as it is until `fit_novelty` or a stored state wakes
+    it.
+    """
+
+    quiet: Tensor
+    offset: Tensor
+    gain: Tensor
+    points: Tensor
+    norms: Tensor
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__()
+        self.asleep = True
+        segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
+        self.stride = samples // segments
+        self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
+        n_features = 3 * channels * segments  # P
+        self.register_buffer("quiet", torch.ones(channels, segments))
+        # A row for the level and one for the texture, zero in the other one's features.
+        self.register_buffer("offset", torch.zeros(2, n_features))
+        self.register_buffer("gain", torch.zeros(2, n_features))
+        self.register_buffer("points", torch.zeros(n_features, REFERENCES))
+        self.register_buffer("norms", torch.zeros(2, REFERENCES))
+
+    def forward(self, x: Tensor) -> bool:
+        """(C, T) float32, one trace, in the references' unit -> whether it is unlike all of them."""
+        if self.asleep:
+            return False
+        return not float(self.scores(x).amax().item()) <= 1.0  # what overflowed to NaN is novel
+
+    @torch.jit.export
+    def scores(self, x: Tensor) -> Tensor:
+        """(C, T) -> (2,) float32: squared distance to the nearest reference over its limit, in level and in texture."""
+        z = torch.addcmul(self.offset, self.features(x), self.gain)  # (2, P)
+        nearest = torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1)
+        return nearest + (z * z).sum(1)
+
+    def features(self, x: Tensor) -> Tensor:
+        """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of roughness."""
+        pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
+        rough = torch.linalg.vector_norm(torch.diff(pieces), dim=-1)  # the steps from sample to sample
+        lowest, highest = torch.aminmax(pieces, dim=-1)
+        return torch.cat([lowest, highest, rough.add_(self.quiet).log_()], -1).flatten(-2)
+
+
+def fit_novelty(traces: NDArray[np.float32], margin: float) -> NoveltyGate:
+    """The gate that takes traces (n, C, T) for usual: finite, any labels, oldest first. No randomness.
+
+    margin : factor on the limits, 99.5 % quantiles of the references' squared distances to one another.
+    """
+    n, channels, samples = traces.shape
+    gate = NoveltyGate(channels, samples)
+    if n < FEWEST:
+        return gate
+    x = torch.from_numpy(traces[_spread(n)])
+    # Of each trace the middle one, (C,). A channel that never moved is silent at the least number: any sound is far away.
+    steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values if samples > 1 else torch.zeros(channels)
+    gate.quiet.copy_((QUIET * (gate.length / samples) ** 0.5 * steps).clamp(min=1e-12)[:, None])
+    features = gate.features(x).double()
+    offset, gain = _standardising(features)
+    standard = torch.addcmul(offset, features, gain).float()
+    standard = standard[standard.abs().amax(1) < BEYOND]
+    texture = torch.arange(3 * gate.quiet.size(1)).ge(2 * gate.quiet.size(1)).repeat(channels)  # (P,)
+    for i, group in enumerate((~texture, texture)):
+        points = standard[:, group]
+        # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
+        limit = margin * max(1.0, TAIL_TRACES / len(points)) * _usual_distance(points)
+        gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
+        gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
+        gate.points[group, : len(points)] = limit**-0.5 * points.t()
+        gate.norms[i] = float("inf")  # of no reference: never the nearest
+        gate.norms[i, : len(points)] = points.square().sum(1) / limit
+    gate.asleep = False
+    return gate
+
+
+def _spread(n: int) -> NDArray[np.intp]:
+    """Which of n traces are references: all, or REFERENCES of them, evenly in time."""
+    return np.linspace(0, n - 1, min(n, REFERENCES)).round().astype(np.intp)
+
+
+def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:
+    """(n, P) float64 -> offset, gain, (P,) each."""
+    # A glitch among the references must not be the measure of the others: the outermost of each feature are drawn in.
+    ordered = features.t().contiguous().sort(1).values  # (P, n)
+    few = 1 + len(features) // TAIL_TRACES
+    inner = torch.minimum(torch.maximum(features, ordered[:, few]), ordered[:, -1 - few])
+    mean, deviation = inner.mean(0), inner.std(0, unbiased=False)
+    # What never moved is far away once it does, but not by the rounding of its own size.
+    floor = 1e-2 * deviation.median() + 1e-5 * mean.abs() + 1e-12
+    return -mean / (deviation + floor), 1.0 / (deviation + floor)
+
+
+def _usual_distance(points: Tensor) -> float:
+    """QUANTILE of the squared distances from each of points (n, P) to the nearest other one; not zero."""
+    norms = points.square().sum(1)
+    squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)
+    squared.fill_diagonal_(float("inf"))
+    return max(1e-3, float(torch.quantile(squared.amin(1), QUANTILE)))

@@ -1,0 +1,182 @@
+"""The novelty gate: what is like no reference is called novel, what is like one is not, and no label is asked."""
+
+import inspect
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from dengine import load_dataset
+from dengine.decision.novelty import FEWEST, NoveltyGate, fit_novelty
+from dengine.decision.rule import script
+
+Traces = NDArray[np.float32]
+LEARNED = 800
+
+
+def shuffled() -> Traces:
+    X = load_dataset("insertion").X
+    return X[np.random.default_rng(0).permutation(len(X))][:, None]
+
+
+TRACES = shuffled()
+KNOWN, HELD_OUT = TRACES[:LEARNED], TRACES[LEARNED:]
+MEAN, SD = float(KNOWN.mean()), float(KNOWN.std())
+SECONDS = np.arange(KNOWN.shape[2]) / 500.0
+
+
+@pytest.fixture(scope="module")
+def gate() -> NoveltyGate:
+    return fit_novelty(KNOWN, 1.5)
+
+
+def share(gate: NoveltyGate, traces: Traces) -> float:
+    return float(np.mean([gate(torch.from_numpy(np.array(x, dtype=np.float32))) for x in traces]))
+
+
+def noise(x: Traces, rng: np.random.Generator) -> Traces:
+    return (MEAN + SD * rng.normal(size=x.shape)).astype(np.float32)
+
+
+def spike(x: Traces, rng: np.random.Generator) -> Traces:
+    spiked = x.copy()
+    spiked[np.arange(len(x)), 0, rng.integers(0, x.shape[2], len(x))] += 4 * SD
+    return spiked
+
+
+def hum(x: Traces, rng: np.random.Generator) -> Traces:
+    return (x + 10.0 * np.sin(2 * np.pi * 50 * SECONDS + rng.uniform(0, 6.28, (len(x), 1, 1)))).astype(np.float32)
+
+
+def sine(x: Traces, rng: np.random.Generator) -> Traces:
+    return (MEAN + SD * np.sin(2 * np.pi * 5 * SECONDS + rng.uniform(0, 6.28, (len(x), 1, 1)))).astype(np.float32)
+
+
+GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
+    "noise": noise,
+    "sine": sine,
+    "hum": hum,
+    "spike": spike,
+    "offset": lambda x, _: x + np.float32(SD),
+    "late": lambda x, _: np.concatenate([np.repeat(x[..., :1], 270, 2), x[..., :-270]], 2),
+    "reversed": lambda x, _: x[..., ::-1],
+    "silent": lambda x, _: np.zeros_like(x),
+    "stuck": lambda x, _: np.full_like(x, MEAN),
+}
+
+
+@pytest.mark.parametrize("kind", GARBAGE)
+def test_garbage_is_novel(gate: NoveltyGate, kind: str) -> None:
+    # Of the reversed traces those that never touched anything are what they were: one in twenty.
+    assert share(gate, GARBAGE[kind](HELD_OUT[:100], np.random.default_rng(1))) >= 0.94
+
+
+def test_clean_traces_are_hardly_ever_novel(gate: NoveltyGate) -> None:
+    assert share(gate, HELD_OUT) <= 0.01
+
+
+@pytest.mark.parametrize("n", [50, 100, 200])
+def test_few_references_do_not_make_clean_traces_novel(n: int) -> None:
+    starts = range(0, 500, 100)
+    assert np.mean([share(fit_novelty(TRACES[i : i + n], 1.5), HELD_OUT[:300]) for i in starts]) <= 0.015
+
+
+def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
+    rng = np.random.default_rng(1)
+    for kind in ("noise", "sine", "silent"):
+        some = GARBAGE[kind](HELD_OUT[:100], rng)
+        gate = fit_novelty(np.concatenate([KNOWN, some[:50]]), 1.5)
+        assert share(gate, some[50:]) <= 0.1
+        others = {other: share(gate, make(HELD_OUT[100:150], rng)) for other, make in GARBAGE.items() if other != kind}
+        assert np.mean(list(others.values())) >= 0.75, (kind, others)
+
+
+def test_no_label_is_asked_and_nothing_is_random() -> None:
+    assert list(inspect.signature(fit_novelty).parameters) == ["traces", "margin"]
+    one, two = (fit_novelty(KNOWN[:60], 1.5).state_dict() for _ in range(2))
+    assert all(torch.equal(one[name], two[name]) for name in one)
+
+
+@pytest.mark.parametrize("size", [1e6, 1e30, 3e38, -3e38])
+def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate: NoveltyGate, size: float) -> None:
+    x = torch.from_numpy(HELD_OUT[0].copy())
+    x[0, 500] = size
+    for trace in (x, torch.full_like(x, size), size * torch.sin(torch.arange(1000.0))[None]):
+        assert gate(trace)
+        assert not NoveltyGate(1, 1000)(trace)
+
+
+@pytest.mark.parametrize("size", [1e6, 1e30, 3e38])
+def test_a_glitch_among_the_references_blinds_to_nothing_else(size: float) -> None:
+    known = KNOWN.copy()
+    known[100], known[200, 0, 500] = size, -size
+    gate = fit_novelty(known, 1.5)
+    assert share(gate, HELD_OUT[:300]) <= 0.01
+    assert {share(gate, GARBAGE[kind](HELD_OUT[:50], np.random.default_rng(1))) for kind in ("noise", "hum", "offset")} == {
+        1.0
+    }
+
+
+def three_channels(x: Traces) -> Traces:
+    rng = np.random.default_rng(3)
+    copies = [x, 0.6 * x + rng.normal(size=x.shape), -0.3 * x + 2 * rng.normal(size=x.shape)]
+    return np.concatenate(copies, 1).astype(np.float32)
+
+
+@pytest.mark.parametrize("channel", range(3))
+def test_a_channel_that_dies_is_novel(channel: int) -> None:
+    known, held_out = three_channels(KNOWN[:300]), three_channels(HELD_OUT[:50])
+    gate = fit_novelty(known, 1.5)
+    assert share(gate, held_out) <= 0.04
+    for value in (0.0, known[:, channel].mean()):
+        dead = held_out.copy()
+        dead[:, channel] = value
+        assert share(gate, dead) == 1.0
+
+
+@pytest.mark.parametrize("value", [0.0, 7.3, -1e5])
+def test_a_dead_channel_that_comes_alive_is_novel(value: float) -> None:
+    dead = three_channels(KNOWN[:100])
+    dead[:, 1] = value
+    gate = fit_novelty(dead, 1.5)
+    held_out = three_channels(HELD_OUT[:20])
+    moved, still = held_out.copy(), held_out.copy()
+    still[:, 1], moved[:, 1] = value, value + held_out[:, 1]
+    assert share(gate, still) == 0.0
+    assert share(gate, moved) == 1.0
+
+
+def test_references_all_alike_know_only_themselves() -> None:
+    gate = fit_novelty(np.repeat(KNOWN[:1], 40, 0), 1.5)
+    assert share(gate, KNOWN[:1]) == 0.0
+    assert share(gate, KNOWN[1:20]) == 1.0
+
+
+@pytest.mark.parametrize("n", [0, 1, FEWEST - 1])
+def test_few_traces_call_nothing_novel(n: int) -> None:
+    assert share(fit_novelty(KNOWN[:n], 1.5), noise(KNOWN[:5], np.random.default_rng(0))) == 0.0
+
+
+def test_compiled_and_eager_agree_to_the_bit(gate: NoveltyGate) -> None:
+    compiled = script(gate)
+    for x in torch.from_numpy(np.concatenate([HELD_OUT[:50], hum(HELD_OUT[:50], np.random.default_rng(0))])):
+        assert torch.equal(compiled.scores(x), gate.scores(x))
+        assert compiled(x) == gate(x) == (not bool((gate.scores(x) <= 1).all()))
+
+
+@pytest.mark.parametrize(("channels", "samples"), [(1, 1), (1, 2), (1, 30), (2, 399), (6, 101), (50, 20)])
+def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int) -> None:
+    fresh = {name: t.shape for name, t in NoveltyGate(channels, samples).state_dict().items()}
+    for n in (10, 40, 1100):
+        traces = np.random.default_rng(n).normal(size=(n, channels, samples)).astype(np.float32)
+        gate = fit_novelty(traces, 1.5)
+        assert {name: t.shape for name, t in gate.state_dict().items()} == fresh
+        assert gate.scores(torch.from_numpy(traces[0])).shape == (2,)
+
+
+def test_a_margin_lets_more_traces_pass() -> None:
+    narrow, wide = (fit_novelty(KNOWN, margin) for margin in (1.0, 2.0))
+    x = torch.from_numpy(HELD_OUT[0].copy())
+    assert wide.scores(x) == pytest.approx(narrow.scores(x) / 2, rel=1e-4)
