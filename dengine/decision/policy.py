@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +14,15 @@ from .._lazy import find_class
 from ..errors import SettingError
 from ..records import ACTIONS, Action
 from .bounds import INTERVALS, Bounds, normal_quantile
+from .certificate import Stops
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
 
-RULES = {"local": "dengine.decision.rule:DecisionRule"}
+RULES = {  # by guarantee, and by what is known of stops
+    "local": {"some": "dengine.decision.rule:DecisionRule", "all": "dengine.decision.guarantee:WatchedRule"},
+    "pooled": dict.fromkeys(("some", "all"), "dengine.decision.guarantee:PooledRule"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +33,10 @@ class Policy:
     lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
     interval : a name in `INTERVALS`.
     guarantee : the rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a `DecisionRule` of your
-        own. "local" is the paper's: it speaks of the ball around one trace, at one look.
+        own. "local" is the paper's: it speaks of the ball around one trace, at one look. "pooled" speaks of all parts
+        together, however often one looks: see `guarantee`.
+    stops : "all" where every accepted part that is bad stops the system and is reported before the next decision: then
+        silence until that decision confirms the part. "some", the default, where silence says nothing.
     audit_rate : share of certain decisions that are verified all the same, in [0, 1); needed for a guarantee on rejects,
         since a rejected part gives no feedback of its own.
     Raises SettingError for a value out of its range.
@@ -40,6 +47,7 @@ class Policy:
     interval: str = "wilson"
     audit_rate: float = 0.0
     guarantee: str = "local"
+    stops: Stops = "some"
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
@@ -57,11 +65,15 @@ class Policy:
         if ":" not in self.guarantee and self.guarantee not in RULES:
             raise SettingError(f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {self.guarantee!r}.")
 
+        if self.stops not in get_args(Stops):
+            raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {self.stops!r}.")
+
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
         from .rule import DecisionRule  # torch is imported where it is used
 
-        found = find_class(RULES.get(self.guarantee, self.guarantee))
+        named = RULES.get(self.guarantee)
+        found = find_class(self.guarantee if named is None else named[self.stops])
         if not issubclass(found, DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
         try:

@@ -5,7 +5,7 @@
 
 The functions and the modules here compile to TorchScript: the engine, the scikit-learn classifier and the exported file
 run the same lines. A rule can be asked (`forward`), told what became of a decision (`tell`) and restored (its buffers,
-by `state_dict`); the paper's rule learns nothing from being told.
+by `state_dict`); the paper's rule learns nothing from being told. `guarantee.py` has those that do.
 """
 
 import math
@@ -65,6 +65,14 @@ Bound = Callable[[int, int, float], tuple[float, float]]
 SCALAR_BOUNDS: dict[str, Bound] = {"wilson": wilson_bound, "binomial": binomial_bound}
 
 
+SAFE_MODE = (  # why everything is verified, by position: the integers of exported files
+    "",
+    "accepted parts failed more often than the tolerance",
+    "rejected parts were good more often than the tolerance",
+    "too many traces were novel",
+)
+
+
 class DecisionRule(nn.Module):
     """The paper's rule, and the base of any other: accept where lower >= LB, reject where upper <= 1 - LB.
 
@@ -102,6 +110,17 @@ class DecisionRule(nn.Module):
     def tell(self, lower: float, upper: float, success: bool) -> None:
         """What became of a part: the bound that it was decided by, before its label was known, and the label."""
 
+    @torch.jit.export
+    def note(self, silent: int, novel: bool) -> None:
+        """What is known beside, before each `tell`: accepted parts that went on since the last one and of which nothing was
+        heard, and whether this part was like nothing learned from.
+        """
+
+    @torch.jit.export
+    def safe_mode(self) -> int:
+        """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
+        return 0
+
 
 class RadiusNeighbours(nn.Module):
     """Counts the references around one embedded trace and asks the rule.
@@ -116,13 +135,16 @@ class RadiusNeighbours(nn.Module):
         self, ring: ReferenceRing, rule: DecisionRule, radius: float, fraction: float = 0.0, reject_fraction: float = 0.0
     ) -> None:
         super().__init__()
-        self.ring = ring
-        self.rule = rule
+        self.ring: ReferenceRing = ring
+        self.rule: DecisionRule = rule
         self.radius, self.fraction, self.reject_fraction = float(radius), float(fraction), float(reject_fraction)
 
-    def forward(self, z: Tensor) -> tuple[int, float, float, int, int]:
-        """(K, d) float32 scaled embedding -> action (0 verify, 1 accept, 2 reject), lower, upper, n_success, n_failure."""
-        distances = self.ring.squared_distances(z)
+    def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
+        """(K, d) float32 scaled embedding -> action (0 verify, 1 accept, 2 reject), lower, upper, n_success, n_failure.
+
+        part : the hash of its part, which has no vote; 0 for an unknown one.
+        """
+        distances = self.ring.squared_distances(z, part)
         n_success, n_failure = self.ring.count_near(distances, self.radius, self.fraction)
         action, lower, upper = self.rule(n_success, n_failure)
         if action == 0 and self.reject_fraction > 0.0:
