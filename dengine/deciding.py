@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 import uuid
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from .decision.rule import script
-from .errors import ReportError
-from .folds import audited
+from .errors import ReportError, TraceError
+from .folds import audited, part_hash
 from .model.base import NOTHING_KNOWN, EngineModel, Prediction
 from .records import REASONS, Action, Decision, Reason, Source, TraceSpec
+from .store.records import DecidedTrace
 from .traces import TraceGate
 
 log = logging.getLogger("dengine")
@@ -35,23 +37,26 @@ class DecisionMaker:
         """Set the contract that the gate checks."""
         self._gate = script(TraceGate(trace))
 
-    def decide(self, x: NDArray[np.float32], model: EngineModel | None, version: int) -> tuple[Decision, int, bool]:
-        """(C, T) -> the decision, the trace's content hash, and whether the trace is faulty."""
-        fault, hash_ = self._gate(torch.from_numpy(x))
-        prediction, reason = (NOTHING_KNOWN, REASONS[fault]) if fault else _predict(x, model)
-        return self._record(prediction, reason, hash_, version), hash_, bool(fault)
+    def decide(self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int) -> DecidedTrace:
+        """(C, T) of a part with this number -> what goes into the store."""
+        fault, content = self._gate(torch.from_numpy(x))
+        hash_ = content if part is None else part_hash(part)
+        prediction = replace(NOTHING_KNOWN, reason=REASONS[fault]) if fault else _predict(x, hash_, model)
+        decision = self._record(prediction, part, content, version)
+        return DecidedTrace(decision, x, hash_, bool(fault), 0.0, part)
 
-    def lost_accept(self, x: NDArray[np.float32], decision_id: str, version: int) -> tuple[Decision, int, bool]:
+    def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> DecidedTrace:
         """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
-        fault, hash_ = self._gate(torch.from_numpy(x))
-        decision = self._record(replace(NOTHING_KNOWN, action=Action.ACCEPT), Reason.CERTAIN, hash_, version)
+        fault, content = self._gate(torch.from_numpy(x))
+        accept = replace(NOTHING_KNOWN, action=Action.ACCEPT, reason=Reason.CERTAIN)
+        decision = self._record(accept, part, content, version)
         # The part went on unchecked, whatever the audits' coin says.
         went_on = replace(decision, id=decision_id, action=Action.ACCEPT, reason=Reason.CERTAIN, audit=False)
-        return went_on, hash_, bool(fault)
+        return DecidedTrace(went_on, x, content if part is None else part_hash(part), bool(fault), 0.0, part)
 
-    def _record(self, predicted: Prediction, reason: Reason, hash_: int, version: int) -> Decision:
+    def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
         certain, rate = predicted.action is not Action.VERIFY, self.audit_rate
-        audit = certain and rate > 0.0 and bool(audited(np.array([hash_]), rate, self.seed)[0])
+        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self.seed)[0])
         self._count += 1
         return Decision(
             id=f"{self._run}-{self._count}",
@@ -63,21 +68,30 @@ class DecisionMaker:
             n_failure=predicted.n_failure,
             embedding=predicted.embedding,
             model_version=version,
-            reason=Reason.AUDIT if audit else reason,
+            reason=Reason.AUDIT if audit else predicted.reason,
             audit=audit,
             propensity=rate if certain else 1.0,
+            part=part,
         )
 
 
-def _predict(x: NDArray[np.float32], model: EngineModel | None) -> tuple[Prediction, Reason]:
+def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
     if model is None:
-        return NOTHING_KNOWN, Reason.NO_MODEL
+        return NOTHING_KNOWN
     try:
-        prediction = model.predict_one(x)
+        return model.predict_one(x, hash_)
     except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
         log.exception("the model failed on a trace; the part is verified")
-        return NOTHING_KNOWN, Reason.MODEL_ERROR
-    return prediction, Reason.UNCERTAIN if prediction.action is Action.VERIFY else Reason.CERTAIN
+        return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
+
+
+def as_part(part: Any) -> str | None:
+    """A part's number as text; TraceError for what is neither a text nor a whole number."""
+    if part is None:
+        return None
+    if isinstance(part, bool | float | np.floating) or not isinstance(part, str | int | np.integer) or part == "":
+        raise TraceError(f"Expected a part's number, a text or a whole number, got {part!r}.")
+    return str(part)
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Self
@@ -19,12 +19,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
-from .deciding import DecisionMaker, source_of
+from .deciding import DecisionMaker, as_part
+from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
-from .errors import ReportError, StoreError
+from .errors import StoreError
+from .feedback import Feedback, unknown_stop
+from .loop import drive
 from .model.base import EngineModel, Exportable, Model
 from .recipe import Recipe
-from .records import Action, Cycle, Decision, Outcome, RetrainReport, TraceSpec
+from .records import Cycle, Decision, RetrainReport, TraceSpec
 from .retraining import Clock, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
@@ -32,6 +35,8 @@ from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .traces import as_trace, spec_of
 from .versions import ModelVersions
 
+OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
+OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
@@ -44,8 +49,9 @@ class DataEngine:
     store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
     recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
-    model : any `Model`, a rival, in place of reducer and neighbours. It decides by its own rule: of a policy only the audit
-        rate counts then.
+    model : any `Model`, a rival, in place of reducer and neighbours. It decides by its own rule: of a policy only
+        audit_rate and stops count then.
+    on_safe_mode : called with the reason when safe mode begins, "" when it ends.
     executor : None retrains in line, between cycles; a `concurrent.futures.Executor` retrains while the cell goes on.
     replaying : stop a retrain on steps alone and never on the clock, so that a seed repeats exactly.
     clock : seconds, of any origin, by which retrains and decisions are timed.
@@ -71,6 +77,7 @@ class DataEngine:
         executor: Executor | None = None,
         replaying: bool = False,
         clock: Clock = time.perf_counter,
+        on_safe_mode: OnSafeMode = None,
     ) -> None:
         beside = {"radius": radius, "folds": folds, "retrain_every": retrain_every, "budget": budget, "policy": policy}
         if model is not None:
@@ -80,7 +87,7 @@ class DataEngine:
         with opening(store) as opened:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
-            self._start(settings, template, opened, executor, replaying, clock)
+            self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
             self.store.save_settings(self._settings.to_store())
 
     def _start(
@@ -88,14 +95,16 @@ class DataEngine:
         settings: EngineSettings,
         template: EngineModel,
         store: Store,
-        executor: Executor | None,
-        replaying: bool,
-        clock: Clock,
+        executor: Executor | None = None,
+        replaying: bool = False,
+        clock: Clock = time.perf_counter,
+        on_safe_mode: OnSafeMode = None,
     ) -> None:
         torch.set_num_threads(1)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._versions = ModelVersions(template, retrainer, store, clock)
+        self._feedback = Feedback(store, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
         self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
         self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
         if settings.trace is not None:
@@ -107,27 +116,20 @@ class DataEngine:
         return cls(recipe=recipe, store=store, **options)
 
     @classmethod
-    def open(
-        cls,
-        url: StoreLike,
-        *,
-        reducer: Any = None,
-        model: Model | None = None,
-        executor: Executor | None = None,
-        replaying: bool = False,
-        clock: Clock = time.perf_counter,
-    ) -> Self:
+    def open(cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, **options: Any) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
+        options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them.
         Raises StoreError where there is nothing to go on with, SettingError where an object is missing.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True) as store:
             name = "the store" if isinstance(url, Store) else str(url)
             settings = EngineSettings.from_store(store.settings(), name, reducer, model)
-            engine._start(*settings.with_template(model), store, executor, replaying, clock)
+            engine._start(*settings.with_template(model), store, **options)
             engine._versions.resume()
+            engine._feedback.resume()
         engine.resumed = True
         return engine
 
@@ -135,28 +137,30 @@ class DataEngine:
     def open_or_create(cls, store: StoreLike | None, seed: int | None = None, **settings: Any) -> Self:
         """Go on with a store that has been used, or start on a new one: the same line at every start of a program.
 
-        settings : as `DataEngine` takes them. Of a used store they must be what it was made with, where they are given.
-        Raises SettingError where they are others: a running cell's settings do not change in silence.
+        settings : as `DataEngine` takes them. Those given must be what a used store was made with, or a SettingError
+            says so: a running cell's settings do not change in silence.
         """
         with opening(store) as opened:
             if not opened.settings():
                 return cls(store=opened, seed=seed or 0, **settings)
-            options = {name: settings.pop(name) for name in ("model", "executor", "replaying", "clock") if name in settings}
+            options = {name: settings.pop(name) for name in OPTIONS if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
             engine._settings.must_agree_with(settings | {"seed": seed})
             return engine
 
-    def decide(self, trace: ArrayLike, *, wait: bool = False) -> Decision:
+    def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
         """Decide on one trace, (T,) or (channels, T). TraceError for a wrong shape; whatever else fails becomes VERIFY.
+
+        part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
-        self._versions.collect()
-        x = self._as_trace(trace)
-        decision, hash_, faulty = self._maker.decide(x, self._versions.answering, self.version)
-        self.store.put_decision(decision, x, hash_, quarantined=faulty)
+        self._collect()
+        x, number = self._as_trace(trace), as_part(part)
+        self._feedback.settle()
+        item = self._put(self._maker.decide(x, number, self._versions.answering, self.version))
         if wait:
             self.store.flush()
-        return decision
+        return item.decision
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_trace(trace, self.trace)
@@ -164,39 +168,46 @@ class DataEngine:
             self.agree_on(spec_of(x))
         return x
 
-    def report(self, decision_id: str, success: bool, trace: ArrayLike | None = None) -> RetrainReport | None:
+    def _put(self, item: DecidedTrace) -> DecidedTrace:
+        self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
+        self._feedback.decided(item)
+        return item
+
+    def _collect(self, wait: bool = False) -> None:
+        if wait or self._versions.trained:  # a version is stored after all that its rule was told of
+            self._feedback.store_waiting()
+        self._versions.collect(wait)
+
+    def report(
+        self, decision_id: str, success: bool, trace: ArrayLike | None = None, part: str | int | None = None
+    ) -> RetrainReport | None:
         """Tell what became of a decision; the label survives a killed process once this returns.
 
-        success : what the expensive verification said, or False for a system stop after an accept, or True for an
-            accepted part that is known to be fine.
-        trace : only for a system stop whose decision was lost: it is then stored with this trace.
+        success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
+        trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
         Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or a
         report on a rejected part.
         """
-        self._versions.collect()
-        known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace)
-        source = source_of(known.id, known.action, known.audit, success)
-        point = None if known.quarantined else self._versions.reference_point(known)
-        stored = point if self._versions.newest.keeps_references else None
-        seq = self.store.put_label(decision_id, bool(success), source, self.version, stored)
-        if known.quarantined:
-            return None
-        self._versions.learn(known, bool(success), point, seq)
-        return self._versions.start_retrain() if self.new_labels >= self.recipe.retrain_every else None
+        self._collect()
+        known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace, part)
+        self._feedback.report(known, bool(success))
+        return None if known.quarantined else self._retrain_if_due()
 
-    def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None) -> StoredDecision:
+    def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
         if trace is None or success:
-            raise ReportError(
-                f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
-                "a system stop whose decision was lost can be reported with its trace."
-            )
-        x = self._as_trace(trace)
-        decision, hash_, faulty = self._maker.lost_accept(x, decision_id, self.version)
-        self.store.put_decision(decision, x, hash_, quarantined=faulty)
-        return stored_decision(DecidedTrace(decision, x, hash_, faulty, 0.0))
+            raise unknown_stop(decision_id)
+        item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
+        return stored_decision(self._put(item))
+
+    def _retrain_if_due(self) -> RetrainReport | None:
+        if self.new_labels < self.recipe.retrain_every:
+            return None
+        self._feedback.store_waiting()
+        return self._versions.start_retrain()
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
+        self._feedback.store_waiting()
         return self._versions.retrain()
 
     @property
@@ -209,32 +220,18 @@ class DataEngine:
         return self._versions.start_retrain()
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
-        """Drive a cell; yields a record a cycle, as it happens: iterate. An exception of the cell itself propagates,
-        after everything known is written.
-        """
-        try:
-            for index in range(cycles):
-                yield self._cycle(cell, index)
-        finally:
-            self.store.flush()
+        """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written."""
+        return drive(self, cell, cycles)
 
-    def _cycle(self, cell: Cell, index: int) -> Cycle:
-        trace = cell.insert()
-        begin = self.clock()
-        decision = self.decide(trace)
-        seconds = self.clock() - begin
-        outcome, success, source = None, None, None
-        if decision.action is Action.VERIFY:
-            success = bool(cell.verify())
-        elif decision.action is Action.ACCEPT:
-            outcome = cell.proceed()
-            success = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}.get(outcome)  # silence is not a success
-        else:
-            cell.reject()
-        if success is not None:
-            source = source_of(decision.id, decision.action, decision.audit, success)
-            self.report(decision.id, success)
-        return Cycle(index, decision, outcome, success, source, seconds, self._versions.take_news())
+    def settle(self) -> RetrainReport | None:
+        """Do between two cycles what need not wait for a report: a retrain that is due. The newest retrain, once."""
+        self._retrain_if_due()
+        return self._versions.take_news()
+
+    def flush(self) -> None:
+        """Return when all that is known so far is on the disk."""
+        self._feedback.store_waiting()
+        self.store.flush()
 
     @property
     def recipe(self) -> Recipe:
@@ -262,19 +259,29 @@ class DataEngine:
         return self._versions.version
 
     @property
+    def safe_mode(self) -> str:
+        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
+        return self._feedback.safe_mode
+
+    def certificate(self) -> Certificate:
+        """What can be said by now, at level 1 - alpha, of the parts that were decided without a check."""
+        self.flush()
+        return certificate_of(self.store.outcomes(), self.policy)
+
+    @property
     def new_labels(self) -> int:
         """Labels since the last retrain began."""
         return self._versions.new_labels
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
         """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
-        own, recipe = self._versions.newest.exported(trace or self.trace), self.recipe
-        own = replace(own, model_version=self.version, recipe=recipe.to_toml())
-        return replace(own, audit_rate=recipe.policy.audit_rate, seed=self.seed)
+        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
+        coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
+        return replace(own, model_version=self.version, recipe=self.recipe.to_toml(), **coin)
 
     def close(self) -> None:
         """Finish a retrain under way, write everything, and let the store go."""
-        self._versions.collect(wait=True)
+        self._collect(wait=True)
         self.store.close()
 
     def __enter__(self) -> Self:

@@ -1,11 +1,14 @@
-"""A permanent hash of a trace's content: it deals the folds of honest counting and tosses the coin of an audit.
+"""A permanent hash of a part: it deals the folds of honest counting, and knows a part that comes twice.
 
 A label may be counted for a query only in an embedding that never saw that label. So every trace has a fold for
-life, and it must not depend on ids, order or time: duplicates share it, and a controller that knows only the samples
-computes the same. The arithmetic is 64-bit integers that wrap around, the same in NumPy, TorchScript and C++.
+life, and it must not depend on ids, order or time: that of its part's number where one is given, or of its content, so
+that a controller that knows only the samples computes the same. The content's hash also tosses the coin of an audit. The
+arithmetic is 64-bit integers that wrap around, the same in NumPy, TorchScript and C++.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +42,23 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
         steps = np.floor(np.clip(block, -CLAMP, CLAMP) * QUANTUM).astype(np.int64)
         out[start : start + 256] = (steps * weights).sum(axis=1)
     return out
+
+
+def part_hash(part: str) -> int:
+    """The int64 hash of a part's number: 64-bit FNV-1a of its UTF-8 (Fowler, Noll and Vo), read as signed; never 0."""
+    h = 0xCBF29CE484222325
+    for byte in part.encode():
+        h = ((h ^ byte) * 0x100000001B3) & (2**64 - 1)
+    return (h - 2**64 if h >= 2**63 else h) or 1
+
+
+def identity_hash(X: NDArray[np.floating], parts: Sequence[str | None] | None = None) -> FoldArray:
+    """(n,) int64: the hash of each trace's part where its number is known, else of its content."""
+    hashes = content_hash(X)
+    for i, part in enumerate(parts or ()):
+        if part is not None:
+            hashes[i] = part_hash(part)
+    return hashes
 
 
 def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:

@@ -14,7 +14,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,18 @@ import torch
 from numpy.typing import NDArray
 
 from .datasets import Dataset, load_dataset
+from .deciding import source_of
+from .decision.policy import Policy
 from .engine import DataEngine
 from .errors import DataError, StoreError, TraceError
-from .folds import content_hash
+from .folds import content_hash, identity_hash, part_hash
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
-from .store.base import Store, open_store
+from .store.base import NewLabel, Store, opening
 from .traces import TraceGate, as_traces
 
 CHUNK = 500  # traces committed together
+LABELS = {"1": True, "0": False}
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,64 +94,167 @@ def train_until_done(
     return reports
 
 
-def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Dataset:
-    """The labelled traces of a cell program's journal, in order.
+@dataclass(frozen=True, slots=True)
+class JournalLine:
+    """A part in a cell program's journal: its trace (C, T), its label, and what was decided on it, as in `Decision`.
 
-    A line is `label,sample,sample,...`, several channels one after the other; lines that begin with # are comments.
-    DataError names the first line that does not fit the contract.
+    label : None where nothing was heard of an accepted part.
     """
-    expected = 1 + spec.channels * spec.samples
-    rows: list[list[float]] = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in line.split(",")]
-        except ValueError as error:
-            raise DataError(f"Line {number} of {path} is no row of numbers: {error}.") from error
-        if len(row) != expected or row[0] not in (0.0, 1.0):
-            raise DataError(
-                f"Expected a label of 1 or 0 and {expected - 1} samples in line {number} of {path}, "
-                f"got {line.split(',')[0][:20]!r} and {len(row) - 1}; a last line that was cut can be removed."
-            )
-        rows.append(row)
-    if not rows:
+
+    trace: NDArray[np.float32]
+    label: bool | None
+    part: str | None = None
+    action: Action = Action.VERIFY
+    predicted: Action = Action.VERIFY
+    reason: Reason = Reason.NO_MODEL
+    lower: float = 0.0
+    upper: float = 1.0
+    n_success: int = 0
+    n_failure: int = 0
+
+
+def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> list[JournalLine]:
+    """The lines of a cell program's journal, in order.
+
+    A line is `label,part,action,predicted,reason,lower,upper,n_success,n_failure,sample,sample,...`, several channels one
+    after the other, where the first line begins with `# dengine 2`, and `label,sample,sample,...`, of verified parts,
+    where it does not. Lines that begin with # are comments. DataError names the first line that does not fit.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    read = _read_line if text.startswith("# dengine 2 ") else _read_first_form
+    found = [
+        read(line.split(","), spec, f"line {number} of {path}")
+        for number, line in enumerate(text.split("\n"), start=1)
+        if line.strip() and not line.startswith("#")
+    ]
+    if not found:
         raise DataError(f"{path} holds no labels yet.")
-    table = np.array(rows)
-    with np.errstate(over="ignore"):
-        X = table[:, 1:].astype(np.float32).reshape(len(rows), spec.channels, spec.samples)
-    return Dataset(X, table[:, 0].astype(np.int8), Path(path).name, spec.rate_hz, spec.unit)
+    return found
+
+
+def _read_line(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
+    trace = _read_trace(words[9:], spec, where)
+    label, part, *decided = words[:9]
+    try:
+        action, predicted = Action(decided[0]), Action(decided[1])
+        bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
+        reason = Reason(decided[2])
+    except ValueError as error:
+        raise DataError(f"The decision in {where} cannot be read: {error}.") from error
+    silent = label == "" and action is Action.ACCEPT
+    if action is Action.REJECT or not (silent or label in LABELS):
+        raise DataError(f"Expected a verified part with a label of 1 or 0, or an accepted one, in {where}, got {label!r}.")
+    return JournalLine(trace, LABELS.get(label), part or None, action, predicted, reason, *bound)
+
+
+def _read_first_form(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
+    trace = _read_trace(words[1:], spec, where)
+    if words[0] not in LABELS:
+        raise DataError(f"Expected a label of 1 or 0 in {where}, got {words[0][:20]!r}.")
+    return JournalLine(trace, LABELS[words[0]])
+
+
+def _read_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
+    expected = spec.channels * spec.samples
+    if len(words) != expected:
+        raise DataError(
+            f"Expected {expected} samples in {where}, got {len(words)}; a last line that was cut can be removed."
+        )
+    try:
+        with np.errstate(over="ignore"):
+            return np.array([float(word) for word in words]).astype(np.float32).reshape(spec.channels, spec.samples)
+    except ValueError as error:
+        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
 
 
 def import_journal(
     store: str | os.PathLike[str], path: str | os.PathLike[str], on_traces: Callable[[int], None] | None = None
 ) -> ImportReport:
-    """Put a journal's labels into the store of an engine, each once, however often its journal is imported."""
-    opened = open_store(store, must_exist=True)
-    try:
+    """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
+
+    Parts keep their numbers, the bounds that they were decided by and the sources of their labels, so that the rule and the
+    certificate count them as the engine's own. The report counts labels.
+    """
+    with opening(store, must_exist=True) as opened:
         known = opened.settings()
         if "trace" not in known:
             raise StoreError(
                 f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
             )
-        spec = TraceSpec(**json.loads(known["trace"]))
-        return import_labelled(opened, read_journal(path, spec), on_traces=on_traces)
-    finally:
-        opened.close()
+        spec, policy = TraceSpec(**json.loads(known["trace"])), Recipe.from_toml(known["recipe"]).policy
+        lines = _with_known_outcomes(read_journal(path, spec), policy.stops)
+        report = _import_lines(opened, lines, spec, policy, on_traces)
+    opened.close()
+    return report
 
 
-Part = tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.int64], list[str]]
+def _with_known_outcomes(lines: list[JournalLine], stops: str) -> list[JournalLine]:
+    """Where all stops are reported, the next decision confirmed an accepted part; of the last one nothing is known yet."""
+    if stops == "some":
+        return lines
+    known = lines if lines[-1].label is not None else lines[:-1]
+    return [replace(line, label=True) if line.label is None else line for line in known]
+
+
+def _import_lines(
+    store: Store, lines: list[JournalLine], spec: TraceSpec, policy: Policy, on_traces: Callable[[int], None] | None
+) -> ImportReport:
+    gate, counts = TraceGate(spec), Counter[str]()
+    looks = [gate(torch.from_numpy(line.trace)) for line in lines]
+    ids = _ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
+    counts_silence = policy.stops == "some"
+    silent = len(store.unreported_accepts()) - store.silent_total() if counts_silence else 0
+    for start in range(0, len(lines), CHUNK):
+        labels: list[NewLabel] = []
+        for i in range(start, min(start + CHUNK, len(lines))):
+            line, (fault, hash_), held = lines[i], looks[i], store.get_decision(ids[i])
+            if held is None:
+                decision = _decided(ids[i], line, fault, policy.audit_rate)
+                own = hash_ if line.part is None else part_hash(line.part)
+                store.put_decision(decision, line.trace, own, bool(fault), line.part)
+            elif held.success is not None:
+                counts["known"] += 1
+                continue
+            if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
+                silent += (line.label is None) - (held is not None)
+            if line.label is not None:
+                source = source_of(ids[i], line.action, line.reason is Reason.AUDIT, line.label)
+                labels.append(NewLabel(ids[i], line.label, source, 0, None, 0 if fault else silent))
+                silent = silent if fault else 0
+                counts["quarantined" if fault else "imported"] += 1
+        if labels:
+            store.put_labels(labels)
+        if on_traces is not None:
+            on_traces(min(CHUNK, len(lines) - start))
+    store.flush()
+    return ImportReport(counts["imported"], counts["quarantined"], counts["known"], True)
+
+
+def _decided(id_: str, line: JournalLine, fault: int, audit_rate: float) -> Decision:
+    audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
+    counted = line.lower, line.upper, line.n_success, line.n_failure
+    propensity = 1.0 if line.predicted is Action.VERIFY else audit_rate
+    return Decision(id_, line.action, line.predicted, *counted, None, 0, reason, audit, propensity, line.part)
+
+
+Part = tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.int64], list[str], list[str | None]]
 
 
 def _chunks(traces: NDArray[np.float32], data: Dataset) -> Iterator[Part]:
-    hashes, times = content_hash(traces), Counter[int]()
-    ids = []
+    hashes = content_hash(traces)
+    ids = _ids(hashes)
+    for start in range(0, len(data), CHUNK):
+        part = slice(start, start + CHUNK)
+        numbers = [None] * len(ids[part]) if data.part is None else data.part[part].tolist()
+        yield traces[part], data.y[part], hashes[part], ids[part], numbers
+
+
+def _ids(hashes: NDArray[np.int64]) -> list[str]:
+    ids, times = [], Counter[int]()
     for hash_ in hashes.tolist():  # equal traces within one file are events of their own
         ids.append(f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}")
         times[hash_] += 1
-    for start in range(0, len(data), CHUNK):
-        part = slice(start, start + CHUNK)
-        yield traces[part], data.y[part], hashes[part], ids[part]
+    return ids
 
 
 def _import_chunk(
@@ -157,6 +263,7 @@ def _import_chunk(
     labels: NDArray[np.int8],
     hashes: NDArray[np.int64],
     ids: list[str],
+    parts: list[str | None],
     spec: TraceSpec,
     on_traces: Callable[[int], None] | None,
 ) -> tuple[int, int, int]:
@@ -165,16 +272,18 @@ def _import_chunk(
     faults = {i: gate(torch.from_numpy(traces[i]))[0] for i in new}
     good = [i for i in new if not faults[i]]
     if good:
-        decisions = [_verified(ids[i], Reason.NO_MODEL) for i in good]
-        store.put_labelled(decisions, traces[good], hashes[good], labels[good], Source.VERIFICATION)
+        decisions = [_verified(ids[i], Reason.NO_MODEL, parts[i]) for i in good]
+        own = identity_hash(traces[good], [parts[i] for i in good])
+        store.put_labelled(decisions, traces[good], own, labels[good], Source.VERIFICATION, [parts[i] for i in good])
     bad = [i for i in new if faults[i]]
     for i in bad:  # kept, but never given to training
-        store.put_decision(_verified(ids[i], REASONS[faults[i]]), traces[i], int(hashes[i]), quarantined=True)
+        decision = _verified(ids[i], REASONS[faults[i]], parts[i])
+        store.put_decision(decision, traces[i], int(hashes[i]), quarantined=True, part=parts[i])
         store.put_label(ids[i], bool(labels[i]), Source.VERIFICATION, 0, None)
     if on_traces is not None:
         on_traces(len(ids))
     return len(good), len(bad), len(ids) - len(new)
 
 
-def _verified(id_: str, reason: Reason) -> Decision:
-    return Decision(id_, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, reason, False, 1.0)
+def _verified(id_: str, reason: Reason, part: str | None) -> Decision:
+    return Decision(id_, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, reason, False, 1.0, part)

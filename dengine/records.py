@@ -25,6 +25,8 @@ class Reason(StrEnum):
     CONSTANT = "constant"  # every sample of every channel the same: a dead sensor
     SATURATED = "saturated"  # the trace touches the sensor's range, `TraceSpec.limit`
     MODEL_ERROR = "model_error"  # the model raised; the cell went on
+    NOVEL = "novel"  # unlike all that was learned from, whatever its neighbours say
+    SAFE_MODE = "safe_mode"  # everything is verified: what was accepted failed too often, or too much is novel
 
 
 ACTIONS, REASONS = tuple(Action), tuple(Reason)  # by position: the integers of exported files
@@ -79,6 +81,7 @@ class Decision:
     reason : why.
     audit : verified although the model was certain.
     propensity : probability with which this decision is verified: 1 for an uncertain one, else the audit rate.
+    part : the number of the part, where it was given.
     """
 
     id: str
@@ -93,6 +96,7 @@ class Decision:
     reason: Reason
     audit: bool
     propensity: float
+    part: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +130,7 @@ class Cycle:
     source : of that label.
     decide_seconds : wall time of the decision.
     retrain : the retrain this cycle set off or saw finish, if any.
+    safe_mode : why everything is being verified after this cycle; "" where it is not.
     """
 
     index: int
@@ -135,3 +140,4 @@ class Cycle:
     source: Source | None
     decide_seconds: float
     retrain: RetrainReport | None
+    safe_mode: str = ""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .model.base import EngineModel
+from .model.base import EngineModel, Told
 from .retraining import Window
 from .store.base import Store
 from .store.records import Labelled, ModelVersion
@@ -62,7 +62,13 @@ def _add_since(model: EngineModel, store: Store, version: ModelVersion, labelled
         model.add_safely(point, int(labelled.labels[i]), hash_)
 
 
+def tell_all(model: EngineModel, store: Store) -> None:
+    """Let a model's rule forget, and tell it all that the store knows."""
+    model.forget()
+    _tell(model, store, 0)
+
+
 def _tell(model: EngineModel, store: Store, last_seq: int) -> None:
-    evidence = store.evidence_since(last_seq)
-    for lower, upper, success in zip(evidence.lower, evidence.upper, evidence.success, strict=True):
-        model.tell_safely(float(lower), float(upper), bool(success))
+    known = store.evidence_since(last_seq)
+    for row in zip(known.lower, known.upper, known.success, known.novel, known.silent, strict=True):
+        model.tell_safely(Told(float(row[0]), float(row[1]), bool(row[2]), bool(row[3]), int(row[4])))

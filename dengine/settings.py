@@ -18,7 +18,16 @@ from .model.rival import as_engine_model
 from .recipe import OBJECT, Recipe, described
 from .records import TraceSpec
 
-LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate")  # what counts for any model
+LOOP = (
+    "seed",
+    "trace",
+    "retrain_every",
+    "budget",
+    "max_steps",
+    "window",
+    "audit_rate",
+    "stops",
+)  # that count for any model
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,11 +147,11 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
     idle = [name for name in ("radius", "folds") if beside.get(name) is not None]
     idle += [] if reducer is None else ["reducer"]
     policy = beside.get("policy")
-    idle += [] if policy is None or replace(policy, audit_rate=0.0) == Policy() else ["policy"]
+    idle += [] if policy is None or replace(policy, audit_rate=0.0, stops="some") == Policy() else ["policy"]
     if idle:
         raise SettingError(
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
-            "set it on the model, or leave it out (of a policy the audit rate alone counts)."
+            "set it on the model, or leave it out (of a policy audit_rate and stops alone count)."
         )
 
 

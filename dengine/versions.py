@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .model.base import EngineModel
-from .records import RetrainReport
-from .resuming import resume
+from .model.base import EngineModel, Told
+from .records import Reason, RetrainReport
+from .resuming import resume, tell_all
 from .retraining import Retrainer, Trained
 from .store.base import Store
 from .store.records import StoredDecision
@@ -52,12 +52,20 @@ class ModelVersions:
         embedding = known.embedding if known.model_version == self.version else None
         return self.answering.place_safely(known.trace, known.content_hash, embedding)
 
-    def learn(self, known: StoredDecision, success: bool, point: Point | None, seq: int) -> None:
-        """Take in a label that is stored: tell the rule, make the trace a reference, give it to the next retrain."""
-        self.newest.tell_safely(known.lower, known.upper, success)
+    def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
+        """Take in what became of a part: tell the rule, and make the trace a reference."""
+        novel = known.reason is Reason.NOVEL
+        self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
         self.newest.add_safely(point, int(success), known.content_hash)
-        self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
         self.new_labels += 1
+
+    def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
+        """Give a label that is stored to the next retrain."""
+        self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
+
+    def tell_anew(self) -> None:
+        """Tell the rule everything again: what it was told was not what happened."""
+        tell_all(self.newest, self.store)
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
@@ -74,6 +82,11 @@ class ModelVersions:
             self.new_labels = 0
             self.retrainer.start(self.newest)
         return None
+
+    @property
+    def trained(self) -> bool:
+        """Whether an executor has finished what it was given."""
+        return self.retrainer.done
 
     def collect(self, wait: bool = False) -> None:
         """Swap in what an executor has finished."""

@@ -12,6 +12,7 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 import click
 import joblib
@@ -22,7 +23,10 @@ from click.testing import CliRunner, Result
 from dengine import DataEngine, __version__, load_dataset
 from dengine.cli import main
 from dengine.cli.interrupting import INTERRUPTED
+from dengine.cli.options import SETTINGS
 from dengine.cli.output import WIDE, duration, size
+from dengine.decision.certificate import Stops
+from dengine.decision.policy import RULES
 from dengine.importing import import_labelled
 from dengine.store import MemoryStore
 
@@ -358,6 +362,21 @@ def test_a_wrong_call_is_exit_code_2(words: list[str]) -> None:
         ["replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--repeats", "2"],
         ["compare", "--data", "DATA", "--reducers", "a_recipe_of_a_rather_long_name.toml,pca", "--repeats", "1"],
         ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--cycles", "150"],
+        ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", "150"],
+        [
+            "replay",
+            "--data",
+            "DATA",
+            "--reducer",
+            "pca",
+            *POLICY,
+            "--guarantee",
+            "pooled",
+            "--stops",
+            "all",
+            "--repeats",
+            "1",
+        ],
         ["status", "STORE"],
     ],
 )
@@ -500,13 +519,191 @@ def test_status_of_a_handed_in_model_names_it_and_shows_no_number_without_effect
         engine.decide(np.linspace(0, 1, 40))
     out = succeed("status", tmp_path / "e.db")
     assert "HalfHalf, decides by its own rule" in out
-    assert not {"reducer", "policy", "rule", "neighbours"} & {line.split()[1] for line in out.splitlines() if "│" in line}
+    assert not {"reducer", "policy", "guarantee", "neighbours", "novelty"} & {
+        line.split()[1] for line in out.splitlines() if "│" in line
+    }
 
 
 def test_status_says_what_the_engine_decides_by(trained: Path) -> None:
     out = succeed("status", trained)
     for said in ("alpha 0.2, LB 80 %", "local", "radius of 0.2", "every 50 new labels", "450 ms", "40 samples at 500 Hz"):
         assert said in out
+
+
+# ------------------------------------------------------------------ guarantees, the certificate, novelty, safe mode
+
+KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
+
+
+def test_the_choices_are_those_of_a_policy() -> None:
+    options = {option.name: option for option in main.commands["run"].params}
+    assert set(options["guarantee"].type.choices) == set(RULES)
+    assert set(options["stops"].type.choices) == set(get_args(Stops))
+
+
+@pytest.mark.parametrize("verb", ["replay", "compare", "run", "train"])
+def test_every_verb_that_makes_an_engine_takes_the_same_settings(verb: str) -> None:
+    options = {option.name: option for option in main.commands[verb].params}
+    assert {*SETTINGS, "data", "samples", "part"} <= set(options)
+    assert {name: options[name].help for name in SETTINGS} == {
+        option.name: option.help for option in main.commands["run"].params if option.name in SETTINGS
+    }
+
+
+def test_a_replays_row_names_its_guarantee_and_what_is_known_of_stops(data: Path) -> None:
+    words = ["replay", "--data", data, "--reducer", "pca", "--repeats", 1, "--cycles", 120]
+    local, pooled = document(*words, *POLICY)["rows"][0], document(*words, *KNOWN)["rows"][0]
+    assert (local["guarantee"], local["stops"]) == ("local", "some")
+    assert (pooled["guarantee"], pooled["stops"]) == ("pooled", "all")
+    assert pooled["novel"] >= 0 == pooled["safe_mode"]
+    out = " ".join(succeed(*words, *KNOWN).split())
+    assert "pooled, all" in out
+    assert "Guarantee pooled" in out
+
+
+def test_compare_shows_the_guarantee_of_every_recipe(data: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text('reducer = "pca"\n[policy]\nguarantee = "pooled"\nstops = "all"\n')
+    words = ["compare", "--data", data, "--reducers", f"pca,{own}", *POLICY, "--repeats", 1, "--cycles", 80]
+    rows = document(*words)["rows"]
+    assert [(row["recipe"], row["guarantee"]) for row in rows] == [("pca", "local"), ("own", "pooled")]
+    out = " ".join(succeed(*words).split())
+    assert "Guarantee local" in out
+    assert "Guarantee pooled" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--guarantee", "global"], 2, "'global' is not one of 'local', 'pooled'"),
+        (["--stops", "most"], 2, "'most' is not one of 'some', 'all'"),
+        (["--audit-rate", "1"], 2, "1.0 is not in the range 0.0<=x<1.0"),
+        (["--novelty", "-1"], 2, "-1.0 is not in the range x>=0.0"),
+        (["--novelty", "inf"], 1, "0 turns it off"),
+        (["--part", "serial"], 1, "Expected an array serial"),
+    ],
+)
+def test_a_wrong_setting_says_what_was_expected(data: Path, words: list[str], code: int, said: str) -> None:
+    result = dengine("replay", "--data", data, "--reducer", "pca", "--cycles", 20, "--repeats", 1, *words)
+    assert result.exit_code == code
+    assert said in result.stderr
+
+
+@pytest.fixture(scope="module")
+def changing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """700 easy parts in order with numbers of their own; from the 301st to the 400th the sensor is hit by a wave."""
+    rng = np.random.default_rng(1)
+    y = rng.random(700) < 0.6
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (700, 40))
+    X[300:400] = 2 * X[300:400] + 8 * np.sin(2 * np.arange(40))
+    path = tmp_path_factory.mktemp("changing") / "changing.npz"
+    np.savez(path, X=X.astype(np.float32), y=y.astype(np.int8), serial=np.array([f"p{i}" for i in range(700)]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def alarmed(changing: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """A store whose engine was put into safe mode, and the run's document."""
+    store = tmp_path_factory.mktemp("alarmed") / "engine.db"
+    words = ["run", "--cell", "replay", "--data", changing, "--part", "serial", "--store", store, "--reducer", "pca"]
+    shown = document(*words, *KNOWN, "--audit-rate", 0.1, "--cycles", 320)
+    return store, shown
+
+
+def test_a_run_says_when_safe_mode_began_and_what_is_certified(alarmed: tuple[Path, dict]) -> None:
+    _, shown = alarmed
+    (change,) = shown["safe_mode_changes"]
+    assert 300 < change["cycle"] <= 320
+    assert change["reason"] == shown["safe_mode"] == "too many traces were novel"
+    assert shown["stretches"][-1]["novel"] > 0
+    assert shown["stretches"][-1]["safe_mode"] == 320 - change["cycle"] + 1
+    assert shown["certificate"]["sentence"].startswith("Of ")
+    assert shown["certificate"]["accepted"]["upper"] <= 1.0
+
+
+def test_status_shows_the_certificate_the_safe_mode_and_the_newest_events(alarmed: tuple[Path, dict]) -> None:
+    store, shown = alarmed
+    out = " ".join(succeed("status", store).replace("│", " ").split())
+    for said in (
+        "pooled: of all accepted parts together",
+        "of all bad parts: an accepted part that no stop follows counts as good",
+        shown["certificate"]["sentence"],
+        shown["certificate"]["advice"],
+        shown["certificate"]["sentence_on_rejects"],
+        "10 % of what it is certain of",
+        "every part is verified: too many traces were novel",
+        "safe mode: too many traces were novel",
+    ):
+        assert said in out
+    assert re.search(r"safe mode on since \d{4}-\d\d-\d\d ", out)
+    assert re.search(r"novel \d+ of 320 decisions \(\d+\.\d %\); of the newest \d+ that labels tell of, \d+ \(", out)
+
+
+def test_statuss_document_has_all_of_it(alarmed: tuple[Path, dict]) -> None:
+    store, shown = alarmed
+    held = document("status", store)
+    assert (held["guarantee"], held["stops"]) == ("pooled", "all")
+    assert held["certificate"] == shown["certificate"]
+    assert (held["safe_mode"]["on"], held["safe_mode"]["reason"]) == (True, "too many traces were novel")
+    assert held["safe_mode"]["since"] == held["events"][-1]["time"]
+    assert held["novel"]["decisions"] == held["reasons"]["novel"] == sum(part["novel"] for part in shown["stretches"])
+    assert 0 < held["novel"]["share"] < held["novel"]["recent_share"] < 1
+
+
+def test_a_safe_mode_that_ended_is_off_and_the_run_says_both(changing: Path, tmp_path: Path) -> None:
+    store = tmp_path / "engine.db"
+    words = ["run", "--cell", "replay", "--data", changing, "--part", "serial", "--store", store, "--reducer", "pca"]
+    result = dengine(*words, *KNOWN, "--cycles", 700)
+    assert result.exit_code == 0, result.output
+    said = re.findall(r"^After cycle \d+: safe mode.*$", result.stdout, flags=re.M)
+    assert len(said) >= 2
+    assert "safe mode, every part is" in said[0]
+    assert said[-1].endswith("safe mode ended.")
+    assert "too many traces were novel" in result.stderr
+    assert "safe: cycles of safe mode" in " ".join(result.stdout.split())
+    assert "confidence, however often one looks" in " ".join(result.stdout.split())
+    assert "off, ended" in succeed("status", store)
+    held = document("status", store)["safe_mode"]
+    assert (held["on"], held["reason"]) == (False, "")
+    assert held["since"] is not None
+
+
+def test_a_store_whose_engine_was_never_alarmed_is_off_since_ever(trained: Path) -> None:
+    assert document("status", trained)["safe_mode"] == {"on": False, "reason": "", "since": None}
+    assert "Nothing can be said yet" in document("status", trained)["certificate"]["sentence"]
+    assert document("status", trained)["novel"] == {
+        "decisions": 0, "share": 0.0, "recent": 0, "recent_decisions": 160, "recent_share": 0.0
+    }  # fmt: skip
+
+
+def test_a_used_store_says_which_of_the_new_settings_differ(trained: Path, data: Path) -> None:
+    words = ["run", "--cell", "replay", "--data", data, "--store", trained, "--reducer", "pca", *POLICY, "--cycles", 5]
+    for option, value, said in (("--guarantee", "pooled", "guarantee local"), ("--novelty", "0", "novelty 1.5")):
+        result = dengine(*words, option, value)
+        assert result.exit_code == 1
+        assert said in result.stderr
+
+
+def test_parts_that_come_again_are_played_on_from_where_the_run_was(data: Path, tmp_path: Path) -> None:
+    with np.load(data) as file:
+        np.savez(tmp_path / "twice.npz", X=file["X"], y=file["y"], part=np.arange(160) % 80)
+    words = ["run", "--cell", "replay", "--data", tmp_path / "twice.npz", "--store", tmp_path / "e.db"]
+    document(*words, "--reducer", "pca", *KNOWN, "--cycles", 70)
+    assert "from part 71" in document(*words, "--cycles", 10)["title"]
+    assert document("status", tmp_path / "e.db")["decisions"] == 80
+
+
+def test_an_accepted_part_is_not_played_again_although_it_has_no_label_yet(data: Path, tmp_path: Path) -> None:
+    with np.load(data) as file:
+        good, bad = np.flatnonzero(file["y"] == 1), np.flatnonzero(file["y"] == 0)
+        order = np.concatenate([np.random.default_rng(0).permutation(np.concatenate([good[:40], bad[:40]])), good[40:]])
+        np.savez(tmp_path / "good_in_the_end.npz", X=file["X"][order], y=file["y"][order])
+    words = ["run", "--cell", "replay", "--data", tmp_path / "good_in_the_end.npz", "--store", tmp_path / "e.db"]
+    first = document(*words, "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", len(order) - 2)
+    last = first["stretches"][-1]
+    assert last["accepted"] == last["last_cycle"] - last["first_cycle"] + 1
+    assert f"from part {len(order) - 1}" in document(*words, "--cycles", 2)["title"]
+    assert document("status", tmp_path / "e.db")["decisions"] == len(order)
 
 
 def interrupted(folder: Path, ready: str, *words: object) -> tuple[int, str, str]:

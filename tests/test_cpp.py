@@ -4,9 +4,11 @@ import hashlib
 import os
 import shutil
 import subprocess
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -23,6 +25,8 @@ from dengine import (
     load_exported,
 )
 from dengine.engine import DataEngine
+from dengine.export import ExportedModel, read_metadata
+from dengine.importing import import_journal
 from dengine.records import Action, Reason
 
 SAMPLES = 100
@@ -83,10 +87,11 @@ def cell(programs: Path, *arguments: Any, stdin: bytes = b"", fails: bool = Fals
     return [line.split(",") for line in done.stdout.decode().splitlines()], done.stderr.decode()
 
 
-def csv(X: np.ndarray, labels: Any = None) -> bytes:
+def csv(X: np.ndarray, labels: Any = None, parts: Any = None) -> bytes:
     rows = [",".join(f"{value:.9g}" for value in x.ravel()) for x in X]
-    if labels is not None:
-        rows = [f"{label},{row}" for label, row in zip(labels, rows, strict=True)]
+    for column in (labels, parts):
+        if column is not None:
+            rows = [f"{word},{row}" for word, row in zip(column, rows, strict=True)]
     return "\n".join(rows).encode() + b"\n"
 
 
@@ -135,51 +140,184 @@ def test_several_channels_come_one_after_the_other(
     assert_equal(lines, load_exported(path).decide_many(data.X), 2)
 
 
-def test_the_cell_learns_where_it_verified_and_nowhere_else(
-    programs: Path, file: Path, make_data: Callable[..., Dataset], tmp_path: Path
+class Live(NamedTuple):
+    """What comes in at a cell, and what the exported file in Python makes of it, told as the program tells it."""
+
+    lines: list[bytes]
+    decisions: list[Any]
+    written: list[int]  # journal lines after each trace
+    exported: ExportedModel
+
+
+def live(file: Path, X: np.ndarray, labels: list[str], parts: list[str] | None = None) -> Live:
+    exported, decisions, written = load_exported(file), [], []
+    numbers = [None] * len(X) if parts is None else [part or None for part in parts]
+    for x, label, part in zip(X, labels, numbers, strict=True):
+        decision = exported.decide(x, part)
+        accepted = decision.action is Action.ACCEPT
+        if accepted and label == "0":
+            exported.stop(x, part)
+        elif label and decision.action is not Action.REJECT:
+            exported.learn(x, label == "1", part)
+        counted = accepted or (label != "" and decision.action is Action.VERIFY)
+        written.append((written[-1] if written else 0) + counted)
+        decisions.append(decision)
+    return Live(csv(X, labels, parts).splitlines(keepends=True), decisions, written, exported)
+
+
+def a_live_stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, list[str], list[str]]:
+    """Traces, labels and parts: noisy, novel and bad ones, parts that come again, labels that are missing."""
+    rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=3.0)
+    X = data.X.copy()
+    X[rng.random(n) < 0.04] *= 5.0
+    X[rng.random(n) < 0.02, 3] = np.nan
+    parts = [f"P{rng.integers(2 * n)}" if rng.random() < 0.7 else "" for _ in range(n)]
+    y = data.y ^ ((np.arange(n) > 0.75 * n) & (rng.random(n) < 0.5))  # at last the world is another one
+    heard = np.where(y == 0, 0.95, 0.6)
+    return X, [str(label) if rng.random() < p else "" for label, p in zip(y, heard, strict=True)], parts
+
+
+@pytest.fixture(scope="module", params=["local-some", "pooled-some", "pooled-all"])
+def learning(
+    request: pytest.FixtureRequest, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """A store after its engine's first retrain, and the exported file."""
+    guarantee, stops = request.param.split("-")
+    folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=3.0)
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.2, guarantee=guarantee, stops=stops)
+    recipe = Recipe(reducer="pca", policy=policy, retrain_every=10**6, window=2000, fraction=0.1)
+    store = folder / "engine.db"
+    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, limit=500.0), seed=3) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        return store, export_torchscript(engine, folder / "model.ts")
+
+
+def test_the_cell_learns_stops_and_silence_as_python_does(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
-    new = make_data(150, SAMPLES, seed=2, noise=4.0)
-    labels = ["" if i % 10 == 0 else str(y) for i, y in enumerate(new.y)]
-    lines, _ = cell(programs, file, "--learn", "--journal", tmp_path / "cell.csv", stdin=csv(new.X, labels))
-    exported, decisions, learned = load_exported(file), [], []
-    for x, label in zip(new.X, labels, strict=True):
-        decisions.append(exported.decide(x))
-        if decisions[-1].action is Action.VERIFY and label:
-            exported.learn(x, label == "1")
-            learned.append((label, x))
-    assert_equal(lines, decisions, 2)
-    assert 20 < len(learned) < 150
+    X, labels, parts = a_live_stream(make_data, 800)
+    expected = live(learning[1], X, labels, parts)
+    options = ["--parts", "--learn", "--journal", tmp_path / "cell.csv"]
+    lines, _ = cell(programs, learning[1], *options, stdin=b"".join(expected.lines))
+    assert_equal(lines, expected.decisions, 2)
     head, *journal = (tmp_path / "cell.csv").read_text().splitlines()
-    assert head == f"# dengine {hashlib.sha256(file.read_bytes()).hexdigest()}"
-    assert journal == [csv(x[None], [label]).decode().strip() for label, x in learned]
+    assert head == f"# dengine 2 {hashlib.sha256(learning[1].read_bytes()).hexdigest()}"
+    assert len(journal) == expected.written[-1]
+    kinds = Counter((line.split(",")[0], line.split(",")[2]) for line in journal)
+    assert kinds.keys() == {("1", "verify"), ("0", "verify"), ("1", "accept"), ("0", "accept"), ("", "accept")}
+    reasons = {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CERTAIN, Reason.UNCERTAIN}
+    stops_all = read_metadata(learning[1])["stops"] == "all"
+    assert {d.reason for d in expected.decisions} >= reasons | ({Reason.SAFE_MODE} if stops_all else set())
 
 
-def test_a_restarted_cell_learns_its_journal_again(
-    programs: Path, file: Path, make_data: Callable[..., Dataset], tmp_path: Path
+def test_a_killed_cell_goes_on_as_if_nothing_had_happened(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
-    new = make_data(150, SAMPLES, seed=2, noise=4.0)
-    whole, _ = cell(programs, file, "--learn", "--journal", tmp_path / "one.csv", stdin=csv(new.X, new.y))
-    parts = []
-    for half in (slice(0, 75), slice(75, 150)):
-        stdin = csv(new.X[half], new.y[half])
-        parts += cell(programs, file, "--learn", "--journal", tmp_path / "two.csv", stdin=stdin)[0]
-    assert [line[:-1] for line in parts] == [line[:-1] for line in whole]
-    assert (tmp_path / "one.csv").read_text() == (tmp_path / "two.csv").read_text()
+    X, labels, parts = a_live_stream(make_data, 500)
+    expected, journal = live(learning[1], X, labels, parts), tmp_path / "cell.csv"
+    waiting = next(i for i in range(150, 350) if not labels[i] and expected.decisions[i].action is Action.ACCEPT)
+    command = [programs / "dengine_cell", learning[1], "--parts", "--learn", "--journal", journal]
+    found: list[list[str]] = []
+    for end in (1, 90, waiting + 1, 400, 499):
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            for line in expected.lines[len(found) : end]:
+                process.stdin.write(line)
+                process.stdin.flush()
+                found.append(process.stdout.readline().decode().strip().split(","))
+            until = time.monotonic() + 60.0  # the answer comes first, then what is known of the part is written
+            while journal.read_bytes().count(b"\n") < 1 + expected.written[end - 1] and time.monotonic() < until:
+                time.sleep(0.001)
+            process.kill()
+    rest, _ = cell(programs, *command[1:], stdin=expected.lines[-1])
+    assert_equal(found + rest, expected.decisions, 2)
+    assert journal.read_bytes().count(b"\n") == 1 + expected.written[-1]
+
+
+def test_a_journal_is_worth_what_the_engine_would_have_seen_itself(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    store, file = learning
+    X, labels, parts = a_live_stream(make_data, 800)
+    journal, found = tmp_path / "cell.csv", []
+    cell(programs, file, "--parts", "--learn", "--journal", journal, stdin=csv(X, labels, parts))
+    for name in ("imported", "own"):
+        shutil.copy(store, tmp_path / f"{name}.db")
+    import_journal(tmp_path / "imported.db", journal)
+    with DataEngine.open(tmp_path / "own.db", replaying=True) as engine:
+        for x, label, part in zip(X, labels, parts, strict=True):
+            decision = engine.decide(x, part or None)
+            if label and decision.action is not Action.REJECT:
+                engine.report(decision.id, label == "1")
+    for name in ("imported", "own"):
+        with DataEngine.open(tmp_path / f"{name}.db") as engine:
+            known, outcomes = engine.store.evidence_since(400), engine.store.outcomes()
+            rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
+            sources, hashes = engine.store.status()["sources"], engine.store.labelled().hashes.tolist()
+            evidence = [getattr(known, each).tolist() for each in ("lower", "upper", "success", "novel", "silent")]
+            certain = outcomes.stops, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
+            accepted = outcomes.accepted if engine.policy.stops == "some" else 0
+            found.append([evidence, rule, sources, hashes, certain, accepted, outcomes.audited_rejects])
+    assert found[0] == found[1]
+
+
+def test_without_labels_silence_counts_for_nothing(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset]
+) -> None:
+    X = make_data(200, SAMPLES, seed=6, noise=3.0).X
+    exported, decisions = load_exported(learning[1]), []
+    for x in X:
+        decisions.append(exported.decide(x))
+        exported.module.drop()
+    assert_equal(cell(programs, learning[1], stdin=csv(X))[0], decisions, 2)
+    assert_equal(cell(programs, learning[1], "--binary", stdin=X.tobytes())[0], decisions, 2)
+
+
+def test_a_part_has_the_same_hash_in_both_languages(programs: Path, file: Path, many: np.ndarray) -> None:
+    parts = ["P1", "0", "", "007", "Ω-17", "a b", "P1"]  # one that comes again has no vote on itself
+    X = np.concatenate([many[:6], many[:1]])
+    expected = live(file, X, ["1"] * 7, parts)
+    assert_equal(cell(programs, file, "--parts", "--learn", stdin=b"".join(expected.lines))[0], expected.decisions, 2)
+    plain = live(file, X, ["1"] * 7)
+    assert [d[2:6] for d in plain.decisions[:6]] == [d[2:6] for d in expected.decisions[:6]]
 
 
 def test_a_journal_of_another_export_is_not_counted_again(programs: Path, file: Path, tmp_path: Path) -> None:
     journal = tmp_path / "cell.csv"
-    journal.write_text(f"# dengine {'0' * 64}\n")
-    _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
-    assert "belongs to another export; import it and name a new journal" in said
-
-
-def test_a_journal_line_that_was_cut_is_named(programs: Path, file: Path, many: np.ndarray, tmp_path: Path) -> None:
-    journal = tmp_path / "cell.csv"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    journal.write_bytes(f"# dengine {digest}\n".encode() + csv(many[:2], [1, 0])[:-1])
+    for head in (f"# dengine 2 {'0' * 64}", f"# dengine {digest}", "1,2,3"):
+        journal.write_text(head + "\n")
+        _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
+        assert "belongs to another export, or to an older program; take it in with dengine import-labels" in said
+
+
+@pytest.mark.parametrize("kind", ["cut", "shorter", "no label", "another action", "another reason"])
+def test_a_journal_line_that_cannot_be_read_is_named(
+    programs: Path, file: Path, many: np.ndarray, tmp_path: Path, kind: str
+) -> None:
+    journal = tmp_path / "cell.csv"
+    cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:2], [1, 0]))
+    text = journal.read_text()
+    line = text.splitlines()[-1]
+    wrong = {
+        "cut": text[:-1],
+        "shorter": text.rsplit(",", 1)[0] + "\n",
+        "no label": text + line.split(",", 1)[1] + "\n",
+        "another action": text + line.replace("accept", "think").replace("verify", "think") + "\n",
+        "another reason": text + ",".join([*line.split(",")[:4], "because", *line.split(",")[5:]]) + "\n",
+    }
+    journal.write_text(wrong[kind])
     _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
     assert "has a line that was not finished" in said
+
+
+def test_a_file_of_an_older_schema_is_refused(programs: Path, repo: Path) -> None:
+    _, said = cell(programs, repo / "tests" / "golden" / "model.ts", fails=True)
+    assert "it was written by an older dengine" in said
+    assert "export it anew" in said
 
 
 def test_a_malformed_line_is_verified_and_the_cell_goes_on(programs: Path, file: Path, many: np.ndarray) -> None:
@@ -246,7 +384,8 @@ def test_a_file_that_must_not_be_used_is_refused(programs: Path, file: Path, tmp
 
 
 def test_wrong_arguments_show_the_usage(programs: Path, file: Path) -> None:
-    for arguments in ([], [str(file), "--fast"], [str(file), "--learn", "--binary"], [str(file), "--journal", "x"]):
+    wrong = ([], ["--fast"], ["--learn", "--binary"], ["--parts", "--binary"], ["--journal", "x"])
+    for arguments in ([str(file)] * bool(each) + each for each in wrong):
         done = subprocess.run([programs / "dengine_cell", *arguments], capture_output=True, text=True, check=False)
         assert done.returncode == 2
         assert done.stderr.startswith("usage: dengine_cell MODEL.ts")

@@ -121,8 +121,15 @@ def test_a_stop_is_a_failure_with_its_own_source_and_is_counted(trained: DataEng
     assert decision.action is Action.ACCEPT
     trained.report(decision.id, success=False)
     assert trained.store.get_decision(decision.id).source is Source.STOP
+    alike = trained.decide(good(data) + np.float32(1e-3))
+    assert (alike.n_success, alike.n_failure) == (decision.n_success, decision.n_failure + 1)
+
+
+def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, data: Dataset) -> None:
+    decision = trained.decide(good(data))
+    trained.report(decision.id, success=False)
     again = trained.decide(good(data))
-    assert (again.n_success, again.n_failure) == (decision.n_success, decision.n_failure + 1)
+    assert (again.n_success, again.n_failure) == (decision.n_success, decision.n_failure)
 
 
 def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data: Dataset) -> None:

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,12 @@ from dengine import (
     export_torchscript,
     load_exported,
 )
+from dengine.decision.rule import SAFE_MODE, DecisionRule
 from dengine.engine import DataEngine
 from dengine.errors import ExportError, TraceError
 from dengine.export import ExportedModel, read_metadata
-from dengine.folds import content_fold
-from dengine.records import Action, Reason
+from dengine.folds import content_fold, part_hash
+from dengine.records import ACTIONS, REASONS, Action, Reason
 from dengine.reducers import Reducer
 
 SAMPLES = 100
@@ -106,8 +108,142 @@ def test_the_file_decides_exactly_as_the_engine(
         else:
             np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
     reasons = {d.reason for d in found}
-    assert reasons >= {Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
+    assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
     assert {d.action for d in found} == set(Action)
+
+
+def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
+    """Traces, labels and parts' numbers: parts that come again, bad traces, novel ones, and a world that changes."""
+    rng, data = np.random.default_rng(seed), make_data(n, SAMPLES, seed=seed, noise=3.0)
+    for i, (x, y) in enumerate(zip(data.X.copy(), data.y, strict=True)):
+        part = (None, f"P{i}", i)[i % 3]
+        if i > 5 and rng.random() < 0.1:
+            part = int(rng.integers(i))
+        kind = rng.random()
+        if kind < 0.04:
+            x = bad_traces(x)[i % 5]
+        elif kind < 0.08:
+            x = x * 5.0
+        if 0.85 * n < i < 0.9 * n:
+            x = np.ascontiguousarray(x[::-1] + 30.0 * np.sin(np.arange(SAMPLES, dtype=np.float32)))
+        changed = 0.6 * n < i < 0.75 * n and rng.random() < 0.4
+        yield x, bool(y) != changed, part
+
+
+@pytest.mark.parametrize("guarantee", ["local", "pooled"])
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
+    make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
+) -> None:
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.1, guarantee=guarantee, stops=stops)
+    settings = recipe(policy=policy, retrain_every=10**6, fraction=0.1)
+    engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
+    rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
+    with engine:
+        for x, y, part in a_stream(make_data, 500, 1):
+            engine.report(engine.decide(x, part).id, y)
+        engine.retrain()
+        exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
+        for i, (x, y, part) in enumerate(a_stream(make_data, 1500, 2)):
+            known, found = engine.decide(x, part), exported.decide(x, part)
+            assert row(found) == row(known)
+            if known.embedding is not None:
+                np.testing.assert_array_equal(found.embedding, np.array(known.embedding, dtype=np.float32))
+            heard = False
+            if known.action is Action.VERIFY and rng.random() < 0.9:
+                heard = exported.learn(x, y, part) > 0
+            elif known.action is Action.ACCEPT and not y and (stops == "all" or rng.random() < 0.5):
+                heard = exported.stop(x, part) > 0
+            elif known.action is Action.ACCEPT and y and rng.random() < 0.1:
+                heard = exported.learn(x, True, part) > 0
+            if heard:
+                engine.report(known.id, y)
+            happened[f"{known.action}, {'heard' if heard else 'silent'}"] += 1
+            happened[known.reason] += 1
+            assert exported.safe_mode == engine.safe_mode
+            modes.add(engine.safe_mode)
+            if i > 600 and not saved and known.action is Action.ACCEPT and not heard:  # one that waits
+                exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
+        model = engine.model
+        mine = {f"ring.{name}": t for name, t in model.index.ring.state_dict().items()}
+        mine |= {f"rule.{name}": t for name, t in model.rule.state_dict().items()}
+        kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
+        for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
+            torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
+        assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
+        assert type(model.rule) is DecisionRule or {"rule.members", "rule.watch", "rule.open"} <= kept.keys()
+    assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
+    assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED)) > 0
+    assert len(modes) > 1 or stops == "some"
+    assert saved
+
+
+def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
+    new, held = make_data(6, SAMPLES, seed=4).X, 300
+    assert exported.decide(new[0]).action is Action.ACCEPT
+    assert exported.learn(new[1], False) == held + 1  # not the one that waits
+    exported.decide(new[2])
+    assert exported.module.n_references() == held + 2  # the first one is confirmed
+    exported.module.drop()
+    exported.decide(new[3])
+    assert exported.module.n_references() == held + 2
+    assert exported.stop(new[3]) == held + 3
+    assert not exported.module.settle()
+
+
+def test_a_restored_decision_waits_as_if_it_were_of_now(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    path = export_torchscript(lenient_engine(make_data), tmp_path / "model.ts")
+    one, two = load_exported(path), load_exported(path)
+    for i, x in enumerate(make_data(20, SAMPLES, seed=4).X):
+        found = one.decide(x, i // 2)
+        action, reason = ACTIONS.index(found.action), REASONS.index(found.reason)
+        two.module.restore(torch.from_numpy(x), part_hash(str(i // 2)), action, reason, found.lower, found.upper)
+    assert two.module.n_references() == one.module.n_references() == 300 + 19
+    for mine, other in zip(one.module.named_buffers(), two.module.named_buffers(), strict=True):
+        assert mine[0] == other[0]
+        torch.testing.assert_close(mine[1], other[1], rtol=0, atol=0)
+
+
+def lenient_engine(make_data: Callable[..., Dataset]) -> DataEngine:
+    """Accepts whatever comes, and silence confirms it: 300 references."""
+    data = make_data(300, SAMPLES, failures=0.02)
+    policy = Policy(alpha=0.1, lower_bound=0.6, stops="all")
+    engine = DataEngine.from_recipe(recipe(policy=policy, fraction=0.9, novelty=0.0, retrain_every=10**6), replaying=True)
+    for x, y in zip(data.X, data.y, strict=True):
+        engine.report(engine.decide(x).id, bool(y))
+    engine.retrain()
+    return engine
+
+
+def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
+    golden = exported.metadata["golden"]["trace"]
+    assert not exported.module.settle()
+    assert exported.decide(golden).action is Action.ACCEPT  # and so it could have been confirmed
+    assert exported.module.n_references() == 300
+
+
+def test_a_part_may_be_left_out_after_loading(file: Path, many: np.ndarray) -> None:
+    module = load_exported(file).module
+    x = torch.from_numpy(many[0])
+    assert module.decide(x)[:6] == module.decide(x, 0)[:6]
+    assert module.learn(x, True) == module.stop(x) - 1
+    assert module.safe_mode() == 0
+
+
+def test_a_file_of_schema_1_goes_on_as_it_did(repo: Path, tmp_path: Path) -> None:
+    exported = load_exported(repo / "tests" / "golden" / "model.ts")
+    assert exported.metadata["schema"] == 1
+    x, held = exported.metadata["golden"]["trace"], exported.metadata["references"]
+    found = exported.decide(x, "P1")
+    assert row(found) == row(exported.decide(x))
+    assert exported.learn(x, True, "P1") == held + 1
+    assert exported.stop(x) == held + 2
+    assert exported.safe_mode == ""
+    again = load_exported(exported.save(tmp_path / "later.ts"))
+    assert again.metadata["references"] == held + 2
+    assert row(again.decide(x)) == row(exported.decide(x))
 
 
 def test_a_fresh_process_decides_the_same(file: Path, many: np.ndarray, tmp_path: Path) -> None:
@@ -150,8 +286,9 @@ def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tm
     model = fitted(data)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     assert exported.trace.channels == 3
-    known = model.predict_many(data.X)
-    assert [d[2:6] for d in exported.decide_many(data.X)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+    new = make_data(100, 40, 3, seed=1).X  # a reference that is asked about itself has no vote in the file
+    known = model.predict_many(new)
+    assert [d[2:6] for d in exported.decide_many(new)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
 
 
 def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
@@ -170,7 +307,9 @@ def test_the_file_says_what_it_is_without_being_loaded(
 ) -> None:
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
     metadata = read_metadata(file)
-    assert metadata["schema"] == 1
+    assert metadata["schema"] == 2
+    assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == ("local", "some", audited.recipe.novelty)
+    assert metadata["safe_modes"] == list(SAFE_MODE)
     assert metadata["trace"] == {"samples": SAMPLES, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": LIMIT}
     assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
     assert metadata["model_version"] == audited.version
@@ -285,8 +424,8 @@ def with_metadata(path: Path, **changes: Any) -> None:
 
 
 def test_a_newer_schema_is_refused(copy: Path) -> None:
-    with_metadata(copy, schema=2, dengine="9.0")
-    with pytest.raises(ExportError, match=r"schema 2, written by dengine 9\.0; this one reads up to 1: upgrade"):
+    with_metadata(copy, schema=3, dengine="9.0")
+    with pytest.raises(ExportError, match=r"schema 3, written by dengine 9\.0; this one reads up to 2: upgrade"):
         load_exported(copy)
 
 
@@ -338,6 +477,13 @@ def test_a_reducer_without_a_module_names_the_alternative(data: Dataset, tmp_pat
 def test_an_interval_without_a_script_names_the_alternative(data: Dataset, tmp_path: Path, interval: str) -> None:
     with pytest.raises(ExportError, match="use wilson or binomial"):
         export_torchscript(fitted(data, interval=interval), tmp_path / "model.ts")
+
+
+def test_a_rule_that_missed_a_part_is_not_exported(data: Dataset, tmp_path: Path) -> None:
+    model = fitted(data)
+    model.untold = True
+    with pytest.raises(ExportError, match="missed what became of a part"):
+        export_torchscript(model, tmp_path / "model.ts")
 
 
 def test_nothing_trained_is_nothing_to_export(tmp_path: Path) -> None:
@@ -405,8 +551,9 @@ def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
     assert set(ring["spaces"][120:180]) == {0, 1}
     for name, mine in ring.items():
         np.testing.assert_array_equal(mine, getattr(model.index.ring, name).numpy())
-    known = model.predict_many(data.X)
-    assert [d[2:6] for d in exported.decide_many(data.X)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+    other = make_data(100, SAMPLES, seed=2).X
+    known = model.predict_many(other)
+    assert [d[2:6] for d in exported.decide_many(other)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
 
 
 def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path: Path) -> None:

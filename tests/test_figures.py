@@ -1,7 +1,6 @@
 """Tables and figures: what they say of replays that are known by hand."""
 
 import math
-import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from matplotlib.patches import Circle
 from sklearn.decomposition import PCA
 
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
+from dengine.cells.simulation.scenarios import first_change
 from dengine.experiments.figures import curves, embedding_map, run_picture, save, sliding_sum, window_curves
 from dengine.experiments.live import RunLog, RunRecorder
 from dengine.experiments.maps import is_probability
@@ -29,9 +29,12 @@ def evidence(n: int, seed: int = 0) -> dict[str, Any]:
     zeros = np.zeros(n, dtype=np.int64)
     position = np.random.default_rng(seed).normal(size=(n, 2))
     took = np.full(n, 1e-4)
+    never = np.zeros(n, dtype=bool)
     return {"lower": np.zeros(n), "upper": np.ones(n), "n_success": zeros, "n_failure": zeros} | {
         "position": position,
         "decide_seconds": took,
+        "novel": never,
+        "safe_mode": never,
     }
 
 
@@ -64,7 +67,7 @@ def test_nothing_accepted_has_no_precision_and_no_verdict() -> None:
     (row,) = pool(frame_of([replay_of(["verify"] * 5, [1] * 5)]))
     assert math.isnan(row["precision"])
     assert promise_kept(row) is None
-    assert promise_line(row) == "pca: no part was accepted."
+    assert promise_line(row) == "pca (local): no part was accepted."
 
 
 @pytest.mark.parametrize(("bad", "kept"), [(30, True), (31, False)])
@@ -80,14 +83,26 @@ def test_names_keep_recipes_of_one_reducer_apart() -> None:
 
 def test_the_table_says_which_promise_it_shows() -> None:
     table = pooled_table(pool(frame_of([MANY_RIGHT])))
-    assert "pooled" in str(table.caption)
-    assert table.row_count == 1
+    assert "pooled precision is only measured" in str(table.caption)
+    assert "of accepted parts only stops are known" in str(table.caption)
+    assert list(table.columns[0].cells) == ["pca\nlocal, some"]
+
+
+def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
+    pooled = replay_of(["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all"))
+    rows = pool(frame_of([MANY_RIGHT, pooled]))
+    assert [(row["guarantee"], row["stops"]) for row in rows] == [("local", "some"), ("pooled", "all")]
+    table = pooled_table(rows)
+    assert list(table.columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
+    for said in ("is only measured", "keeps all accepted parts together", "no stop follows"):
+        assert said in str(table.caption)
+    assert promise_line(rows[1]).startswith("pca (pooled): 100.0 % of 300")
 
 
 def test_the_csv_has_a_row_a_replay(tmp_path) -> None:
     path = write_csv(frame_of([MANY_RIGHT, ONE_WRONG]), tmp_path / "deep" / "replays.csv")
     header, *rows = path.read_text().splitlines()
-    assert header.startswith("recipe,interval,alpha,lower_bound,seed")
+    assert header.startswith("recipe,interval,alpha,lower_bound,guarantee,stops,seed")
     assert len(rows) == 2
 
 
@@ -249,8 +264,14 @@ def test_no_legend_lies_on_the_data(name: str) -> None:
         assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
 
 
+def test_novel_parts_and_cycles_of_safe_mode_are_counted_in_their_stretch() -> None:
+    novel, safe = np.arange(100) % 10 == 0, np.arange(100) >= 70
+    log = replace(log_of(None), novel=novel, safe_mode=safe)
+    assert (log.summary()["novel"], log.summary()["safe_mode"]) == (10, 30)
+    assert [part["safe_mode"] for part in log.stretches(4)] == [0, 0, 5, 25]
+
+
 @pytest.mark.parametrize(("scenario", "cycle"), [("nominal", None), ("wear", 2), ("variant", 401), ("bias_jump", 401)])
 def test_a_change_is_marked_at_the_first_cycle_that_it_touches(scenario: str, cycle: int | None) -> None:
     # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
-    script = Path(__file__).parent.parent / "training" / "show_scenarios.py"
-    assert runpy.run_path(str(script))["first_change"](scenario, 800) == cycle
+    assert first_change(scenario, 800) == cycle

@@ -32,6 +32,8 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "resuming": 8,
     "deciding": 8,
     "versions": 8,
+    "feedback": 8,
+    "loop": 8,
     "engine": 9,
     "checks": 10,
     "importing": 10,

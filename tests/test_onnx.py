@@ -13,6 +13,7 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
 from dengine import Dataset, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier, export_torchscript  # noqa: E402  # after the skips
+from dengine.decision.rule import DecisionRule  # noqa: E402
 from dengine.engine import DataEngine  # noqa: E402
 from dengine.errors import ExportError, TraceError  # noqa: E402
 from dengine.export.onnx import export_onnx, load_onnx  # noqa: E402
@@ -45,13 +46,15 @@ def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: 
     two = load_exported(export_torchscript(model, tmp_path / "model.ts", trace=SPEC))
     bad = make_data(5, seed=1).X
     bad[0, 3], bad[1, 5], bad[2, 0], bad[3], bad[4] = np.nan, -np.inf, 1e30, 2.5, np.nan
-    X = np.concatenate([make_data(200, seed=9).X, bad])
+    novel = 3.0 * make_data(50, seed=8).X
+    X = np.concatenate([make_data(200, seed=9).X, make_data(50, seed=7, noise=3.0).X, novel, bad])
     for found, expected in zip(one.decide_many(X), two.decide_many(X), strict=True):
         assert found[:2] == expected[:2]
         assert found[2:4] == pytest.approx(expected[2:4], abs=1e-6)
         assert found[4:6] == expected[4:6]
         np.testing.assert_allclose(found.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
     assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {d.reason for d in one.decide_many(bad)}
+    assert {d.reason for d in one.decide_many(novel)} == {Reason.NOVEL}
     assert Action.ACCEPT in {d.action for d in one.decide_many(X)}
 
 
@@ -63,6 +66,32 @@ def test_audits_are_refused_with_the_reason(data: Dataset, tmp_path: Path) -> No
         engine.retrain()
         with pytest.raises(ExportError, match="ONNX carries no audits"):
             export_onnx(engine, tmp_path / "model.onnx")
+
+
+class OwnRule(DecisionRule):
+    """A rule of the user's own; the twin cannot know what it does."""
+
+
+@pytest.mark.parametrize(
+    ("rule", "name"),
+    [
+        (Policy(guarantee="pooled").rule(), "PooledRule"),
+        (Policy(stops="all").rule(), "WatchedRule"),
+        (OwnRule(0.1, 0.9), "OwnRule"),
+    ],
+)
+def test_a_rule_that_learns_is_refused(data: Dataset, tmp_path: Path, rule: DecisionRule, name: str) -> None:
+    model = ModelPrediction("pca", rule=rule).fit(data.X, data.y)
+    with pytest.raises(ExportError, match=f"ONNX carries no {name}, a rule that learns; export torchscript"):
+        export_onnx(model, tmp_path / "model.onnx")
+
+
+def test_parts_that_came_again_are_refused(data: Dataset, tmp_path: Path) -> None:
+    hashes = np.arange(1, len(data) + 1)
+    hashes[7] = hashes[3]
+    model = ModelPrediction("pca").fit(data.X, data.y, hashes=hashes)
+    with pytest.raises(ExportError, match="ONNX carries no votes: 1 of the references"):
+        export_onnx(model, tmp_path / "model.onnx")
 
 
 def test_an_interval_without_a_module_is_refused(data: Dataset, tmp_path: Path) -> None:

@@ -106,6 +106,66 @@ def test_progress_is_told_cycle_by_cycle(data: Dataset) -> None:
     assert seen == list(range(1, 21))
 
 
+# ------------------------------------------------------------------------------------- guarantees and what is known
+
+KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
+
+
+def test_where_all_bad_parts_stop_the_system_a_seed_repeats_exactly(data: Dataset) -> None:
+    told = replay(data, KNOWN, seed=1)
+    assert told.accepted.sum() > 20
+    same(replay(data, KNOWN, seed=1), told)
+
+
+def test_silence_counts_as_a_success_where_all_bad_parts_stop_the_system(data: Dataset, played: Replay) -> None:
+    local = replay(data, RECIPE.with_policy(stops="all"), seed=1)
+    first = int(np.flatnonzero(played.accepted)[0])
+    np.testing.assert_array_equal(local.action[: first + 1], played.action[: first + 1])
+    assert local.n_success[-1] + local.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
+
+
+def test_a_long_stretch_of_accepted_parts_retrains_as_any_other(make_data) -> None:
+    """After the first 120 parts all are good, so that nearly all are accepted and no report comes."""
+    some, good = make_data(120, failures=0.3, noise=0.2), make_data(200, seed=1, failures=0.0, noise=0.2)
+    stream = Dataset(np.concatenate([some.X, good.X]), np.concatenate([some.y, good.y]), "mostly good")
+    told = replay(stream, KNOWN, shuffle=False)
+    stretch = np.flatnonzero(~told.accepted)[-1] + 1  # after the last check
+    assert len(told) - stretch > 2 * KNOWN.retrain_every
+    assert told.retrains[-1].n_traces > stretch
+    assert sum(report.accepted for report in told.retrains) >= 320 // KNOWN.retrain_every - 1
+
+
+@pytest.fixture(scope="module")
+def changed(make_data) -> Replay:
+    """After 300 parts the force doubles and a wave comes upon it: the parts are others, their labels as before."""
+    before, after = make_data(300, noise=0.2), make_data(300, seed=1, noise=0.2)
+    X = 2.0 * after.X + 5.0 * np.sin(np.arange(after.X.shape[1])).astype(np.float32)
+    stream = Dataset(np.concatenate([before.X, X]), np.concatenate([before.y, after.y]), "changed")
+    return replay(stream, KNOWN, shuffle=False)
+
+
+def test_novel_parts_and_the_safe_mode_are_in_the_record(changed: Replay) -> None:
+    assert changed.novel[:300].mean() < 0.05
+    assert changed.novel[300:320].all()
+    assert (changed.action[changed.novel] == "verify").all()
+    assert not changed.safe_mode[:300].any()
+    assert changed.safe_mode[300:330].any()
+    assert not changed.safe_mode[-1]
+    (first,) = np.flatnonzero(changed.safe_mode)[:1]
+    assert (changed.action[first + 1 :][changed.safe_mode[first:-1]] == "verify").all()  # from the next part on
+
+
+def test_the_summary_says_what_was_guaranteed_and_counts_novel_parts_and_cycles_of_safe_mode(changed: Replay) -> None:
+    row = changed.summary()
+    assert (row["guarantee"], row["stops"]) == ("pooled", "all")
+    assert (row["novel"], row["safe_mode"]) == (changed.novel.sum(), changed.safe_mode.sum())
+    assert row["saved_s"] == 5.0 * row["certain"]
+
+
+def test_novelty_can_be_turned_off(data: Dataset) -> None:
+    assert not replay(data, replace(RECIPE, novelty=0.0), seed=1).novel.any()
+
+
 # ------------------------------------------------------------------------------------------------------- records
 
 
@@ -195,6 +255,12 @@ def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:
     assert {k: row[k] for k in ("certain", "accepted", "rejected")} == {
         k: alone[k] for k in ("certain", "accepted", "rejected")
     }
+
+
+def test_a_grid_keeps_a_recipes_guarantee_and_stops(data: Dataset) -> None:
+    table = run_grid(data, [RECIPE, KNOWN], (0.1,), (0.9,), repeats=1, n_jobs=1, cycles=60)
+    assert table["guarantee"].tolist() == ["local", "pooled"]
+    assert table["stops"].tolist() == ["some", "all"]
 
 
 def test_parallel_replays_equal_serial_ones(data: Dataset) -> None:

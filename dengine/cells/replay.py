@@ -31,6 +31,11 @@ class ReplayCell:
         """Whether the part just inserted is good."""
         return bool(self.data.y[self.order[self.position]])
 
+    @property
+    def part(self) -> str | None:
+        """The number of the part just inserted; None where the data set tells none."""
+        return None if self.data.part is None else str(self.data.part[self.order[self.position]])
+
     def insert(self) -> NDArray[np.floating]:
         """The next trace."""
         if self.position + 1 >= len(self.order):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,12 +22,14 @@ Command = Callable[..., Any]
 
 @dataclass(frozen=True)
 class RecipeChoice:
-    """Which recipe was asked for, if any; None leaves a setting to the recipe, or to the store."""
+    """Which recipe was asked for, if any; what was not given is left to the recipe, or to the store.
 
-    reducer: str | None
-    recipe: str | None
-    alpha: float | None
-    lower_bound: float | None
+    settings : by name, of a policy or `novelty`: those that were given.
+    """
+
+    reducer: str | None = None
+    recipe: str | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -37,19 +39,35 @@ class RecipeChoice:
     @property
     def asked(self) -> bool:
         """Whether any of it was given."""
-        return any(value is not None for value in (self.reducer, self.recipe, self.alpha, self.lower_bound))
+        return bool(self.reducer or self.recipe or self.settings)
 
     def load(self, name: str | None = None) -> Recipe:
-        """The recipe, or the one of another name with this policy. SettingError where its reducer cannot be found."""
+        """The recipe, or the one of another name with these settings. SettingError where its reducer cannot be found."""
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
 
-        policy = {"alpha": self.alpha, "lower_bound": self.lower_bound}
-        given = {key: value for key, value in policy.items() if value is not None}
-        recipe = Recipe.load(name or self.recipe or self.reducer or "conv").with_policy(**given)
+        policy = dict(self.settings)
+        novelty = policy.pop("novelty", None)
+        recipe = Recipe.load(name or self.recipe or self.reducer or "conv").with_policy(**policy)
+        recipe = recipe.with_settings(novelty=novelty)
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)  # now, and not when a store was made for it
         return recipe
+
+
+@dataclass(frozen=True)
+class DataChoice:
+    """Which data set was asked for: a name or file, how many samples, and the name of its array of parts' numbers."""
+
+    data: str
+    samples: int | None = None
+    part: str = "part"
+
+    def load(self) -> Dataset:
+        """The data set; DataError for what cannot be read."""
+        from ..datasets import load_dataset
+
+        return load_dataset(self.data, self.samples, self.part)
 
 
 def short_name(name: str) -> str:
@@ -57,34 +75,63 @@ def short_name(name: str) -> str:
     return Path(name.rpartition(":")[2]).stem
 
 
+SETTINGS = {  # of a policy, and of a recipe: what they are by default is the recipe's affair
+    "alpha": click.option(
+        "--alpha",
+        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+        help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
+    ),
+    "lower_bound": click.option(
+        "--lower-bound",
+        type=click.FloatRange(0.5, 1.0, min_open=True, max_open=True),
+        help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
+    ),
+    "guarantee": click.option(
+        "--guarantee",
+        type=click.Choice(["local", "pooled"]),
+        help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled).",
+    ),
+    "stops": click.option(
+        "--stops",
+        type=click.Choice(["some", "all"]),
+        help="Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good.",
+    ),
+    "audit_rate": click.option(
+        "--audit-rate",
+        type=click.FloatRange(0.0, 1.0, max_open=True),
+        metavar="SHARE",
+        help="Share of what the model is certain of that is verified all the same; rejects are known by it alone.",
+    ),
+    "novelty": click.option(
+        "--novelty",
+        type=click.FloatRange(0.0),
+        metavar="FACTOR",
+        help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
+    ),
+}
+
+
 def policy_options(command: Command) -> Command:
-    """`--alpha` and `--lower-bound`."""
-    for option in (
-        click.option(
-            "--lower-bound",
-            type=click.FloatRange(0.5, 1.0, min_open=True, max_open=True),
-            help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
-        ),
-        click.option(
-            "--alpha",
-            type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
-            help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
-        ),
-    ):
-        command = option(command)
-    return command
+    """The options of SETTINGS, handed on as `settings`, one dict of those that were given."""
+
+    @wraps(command)
+    def gathered(**given: Any) -> Any:
+        asked = {name: given.pop(name) for name in SETTINGS}
+        return command(settings={name: value for name, value in asked.items() if value is not None}, **given)
+
+    for option in reversed(SETTINGS.values()):
+        gathered = option(gathered)
+    return gathered
 
 
 def recipe_options(command: Command) -> Command:
-    """`--reducer` or `--recipe`, `--alpha` and `--lower-bound`, handed on as one `RecipeChoice`."""
+    """`--reducer` or `--recipe`, and what is set beside them, handed on as one `RecipeChoice`, `choice`."""
 
     @wraps(command)
-    def chosen(
-        reducer: str | None, recipe: str | None, alpha: float | None, lower_bound: float | None, **others: Any
-    ) -> Any:
+    def chosen(reducer: str | None, recipe: str | None, settings: Mapping[str, Any], **others: Any) -> Any:
         if reducer and recipe:
             raise click.UsageError("--reducer and --recipe exclude each other; a recipe names its reducer.")
-        return command(choice=RecipeChoice(reducer, recipe, alpha, lower_bound), **others)
+        return command(choice=RecipeChoice(reducer, recipe, settings), **others)
 
     with_recipe = click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file.")
     with_reducer = click.option(
@@ -96,30 +143,38 @@ def recipe_options(command: Command) -> Command:
 
 
 def data_options(default: str | None = "insertion") -> Callable[[Command], Command]:
-    """`--data` and `--samples`, handed on as two; `read` makes a data set of them."""
+    """`--data`, `--samples` and `--part`, handed on as one `DataChoice`, `source`."""
 
     def decorate(command: Command) -> Command:
-        command = click.option(
-            "--samples",
-            type=click.IntRange(1),
-            help="Use only the first so many samples of each trace: decides earlier, on less.  [default: all]",
-        )(command)
+        @wraps(command)
+        def sourced(data: str, samples: int | None, part: str, **others: Any) -> Any:
+            return command(source=DataChoice(data, samples, part), **others)
+
         shown: dict[str, Any] = {"required": True} if default is None else {"default": default, "show_default": True}
-        return click.option(
-            "--data",
-            metavar="NAME|FILE",
-            help="The bundled set, insertion, or an .npz file: X (traces, samples) and y (1 success, 0 failure).",
-            **shown,
-        )(command)
+        for option in (
+            click.option(
+                "--part",
+                metavar="KEY",
+                default="part",
+                show_default=True,
+                help="The file's array of parts' numbers, if any: a part that comes again has one vote.",
+            ),
+            click.option(
+                "--samples",
+                type=click.IntRange(1),
+                help="Use only the first so many samples of each trace: decides earlier, on less.  [default: all]",
+            ),
+            click.option(
+                "--data",
+                metavar="NAME|FILE",
+                help="The bundled set, insertion, or an .npz file: X (traces, samples) and y (1 success, 0 failure).",
+                **shown,
+            ),
+        ):
+            sourced = option(sourced)
+        return sourced
 
     return decorate
-
-
-def read(data: str, samples: int | None) -> Dataset:
-    """The data set that the options name."""
-    from ..datasets import load_dataset
-
-    return load_dataset(data, samples)
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:

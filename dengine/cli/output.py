@@ -16,6 +16,7 @@ import click
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ..decision.certificate import Certificate
     from ..importing import ImportReport
 
 WIDE = 80  # columns where no terminal says otherwise; every table fits them
@@ -82,6 +83,12 @@ def imported_line(report: ImportReport, store: str) -> str:
     bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
     known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
     return f"Imported {report.imported} labelled traces into {store}.{bad}{known}"
+
+
+def certificate_record(certificate: Certificate) -> dict[str, Any]:
+    """A certificate as JSON has it: its numbers, and what they say in words."""
+    said = {name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects", "advice")}
+    return asdict(certificate) | said
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import click
 
 from .interrupting import end_interrupted
 from .options import (
+    DataChoice,
     RecipeChoice,
     data_options,
     example,
@@ -18,7 +19,6 @@ from .options import (
     n_jobs_option,
     out_option,
     policy_options,
-    read,
     recipe_options,
     seed_option,
     short_name,
@@ -72,7 +72,7 @@ def replay(choice: RecipeChoice, **options: Any) -> None:
 )
 @policy_options
 @stream_options
-def compare(reducers: str, alpha: float | None, lower_bound: float | None, **options: Any) -> None:
+def compare(reducers: str, settings: Mapping[str, Any], **options: Any) -> None:
     """Replay the same streams through several reducers.
 
     UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
@@ -80,8 +80,8 @@ def compare(reducers: str, alpha: float | None, lower_bound: float | None, **opt
     asked = [name.strip() for name in reducers.split(",") if name.strip()]
     if not asked:
         raise click.UsageError("--reducers names none; give at least one, as in conv,pca.")
-    policy = RecipeChoice(None, None, alpha, lower_bound)
-    _replay("compare", {name: policy.load(one) for name, one in _names(asked).items()}, **options)
+    choice = RecipeChoice(settings=settings)
+    _replay("compare", {name: choice.load(one) for name, one in _names(asked).items()}, **options)
 
 
 def _names(asked: list[str]) -> dict[str, str]:
@@ -111,8 +111,7 @@ class Finished:
 def _replay(
     verb: str,
     recipes: dict[str, Recipe],
-    data: str,
-    samples: int | None,
+    source: DataChoice,
     repeats: int | None,
     seed: int,
     cycles: int | None,
@@ -125,7 +124,7 @@ def _replay(
     if in_order and repeats not in (None, 1):
         raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
     seeds = range(seed, seed + (1 if in_order else repeats or 30))
-    dataset = read(data, samples)
+    dataset = source.load()
     with progress(f"replaying {dataset.name}", len(seeds) * len(recipes) * (cycles or len(dataset)), as_json) as advance:
         finished = _run(dataset, recipes, seeds, cycles, n_jobs, advance, not in_order, confirm)
     if len(finished):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,21 +11,22 @@ import click
 
 from .interrupting import EndAskedError, end_interrupted, interruptible
 from .options import (
+    DataChoice,
     RecipeChoice,
     data_options,
     example,
     json_option,
     must_have_mujoco,
     out_option,
-    read,
     recipe_options,
     scenario_option,
     short_name,
 )
-from .output import progress, show, write_json
+from .output import certificate_record, progress, show, write_json
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
+    from ..decision.certificate import Certificate
     from ..engine import DataEngine
     from ..experiments.live import RunLog
     from ..records import Cycle
@@ -56,8 +57,7 @@ STRETCHES = 6
 def run(
     choice: RecipeChoice,
     kind: str,
-    data: str,
-    samples: int | None,
+    source: DataChoice,
     scenario: str,
     cycles: int,
     store: str | None,
@@ -68,38 +68,69 @@ def run(
     """Drive a cell: verify, learn, and verify less.
 
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
-    on after its last part with a label in the store: no part is learned from twice. Ctrl-C ends the run after the cycle
-    that is under way and shows what was done; pressed twice, it ends at once.
+    on after its last part that was labelled or accepted: no part is learned from twice. Where too much goes wrong, or
+    looks like nothing known, everything is verified until fresh evidence says otherwise: the safe mode. Ctrl-C ends
+    the run after the cycle that is under way and shows what was done; pressed twice, it ends at once.
     """
     if kind == "simulated":
         must_have_mujoco()
     from ..engine import DataEngine
 
     with DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None) as engine:
-        cell, name = CELLS[kind](engine.store, engine.seed, data, samples, scenario, cycles)
-        log = _drive(engine, cell, cycles, name, as_json)
+        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles)
+        log, changes = _drive(engine, cell, cycles, name, as_json)
+        told = Told(changes, engine.safe_mode, engine.certificate())
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
-        _report(log, cell, kind, title, cycles, out, as_json)
+        _report(log, told, cell, kind, title, cycles, out, as_json)
     if len(log) < cycles:
         _say_interrupted(len(log), cycles, store)
 
 
-def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) -> RunLog:
+@dataclass(frozen=True)
+class ModeChange:
+    """The safe mode began after this cycle, counted from 1, for a reason; or ended, for none."""
+
+    cycle: int
+    reason: str
+
+    @property
+    def line(self) -> str:
+        """For people."""
+        what = f"safe mode, every part is verified: {self.reason}" if self.reason else "safe mode ended"
+        return f"After cycle {self.cycle}: {what}."
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the engine said of itself: the safe mode's changes, why it is on in the end, and the certificate."""
+
+    changes: list[ModeChange]
+    safe_mode: str
+    certificate: Certificate
+
+
+def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) -> tuple[RunLog, list[ModeChange]]:
     from ..experiments.live import RunRecorder
 
-    recorder = RunRecorder(cell)
+    recorder, changes, mode = RunRecorder(cell), list[ModeChange](), engine.safe_mode
     with interruptible() as asked, progress(name, cycles, quiet) as advance:
 
         def count(cycle: Cycle) -> None:
+            nonlocal mode
             advance(1)
+            if cycle.safe_mode != mode:
+                mode = cycle.safe_mode
+                changes.append(ModeChange(cycle.index + 1, mode))
+                if not quiet:
+                    click.echo(changes[-1].line, err=True)
             if asked():  # between two cycles: no part is left half dealt with
                 raise EndAskedError
 
         # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
         with suppress(EndAskedError, KeyboardInterrupt):
             recorder.follow(engine, cycles, count)
-    return recorder.log()
+    return recorder.log(), changes
 
 
 def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
@@ -112,7 +143,7 @@ def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
     )
 
 
-def _simulated(store: Store, seed: int, data: str, samples: int | None, scenario: str, cycles: int) -> tuple[Cell, str]:
+def _simulated(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
 
     # Another seed for a resumed run: the same parts again would be counted twice.
@@ -120,15 +151,20 @@ def _simulated(store: Store, seed: int, data: str, samples: int | None, scenario
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
 
-def _recorded(store: Store, seed: int, data: str, samples: int | None, scenario: str, cycles: int) -> tuple[Cell, str]:
+def _recorded(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int) -> tuple[Cell, str]:
     import numpy as np
 
     from ..cells.replay import ReplayCell
     from ..errors import SettingError
     from ..folds import content_hash
 
-    dataset = read(data, samples)
-    known = np.flatnonzero(np.isin(content_hash(dataset.X), store.labelled().hashes))
+    dataset = source.load()
+    # By content: of a part that comes twice the store's own hash would name both.
+    hashes = content_hash(store.labelled().traces)
+    for id_ in store.unreported_accepts()[-1:]:
+        newest = store.get_decision(id_)
+        hashes = hashes if newest is None else np.append(hashes, content_hash(newest.trace[None]))
+    known = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
     first = int(known[-1]) + 1 if len(known) else 0
     left = len(dataset) - first
     if cycles > left:
@@ -141,7 +177,9 @@ def _recorded(store: Store, seed: int, data: str, samples: int | None, scenario:
 CELLS = {"simulated": _simulated, "replay": _recorded}
 
 
-def _report(log: RunLog, cell: Cell, kind: str, title: str, cycles: int, out: Path | None, as_json: bool) -> None:
+def _report(
+    log: RunLog, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: Path | None, as_json: bool
+) -> None:
     from ..experiments.tables import retrain_line
 
     total, stretches = log.summary(), log.stretches(STRETCHES)
@@ -151,12 +189,14 @@ def _report(log: RunLog, cell: Cell, kind: str, title: str, cycles: int, out: Pa
     if as_json:
         about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
         counts = {"total": total, "stretches": stretches, "cell": clock}
-        write_json(about | counts | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
+        said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
+        said |= {"certificate": certificate_record(told.certificate)}
+        write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
         return
     show(_table([*stretches, total], title, clock is not None))
     if clock is not None:
         show(_clock_line(clock))
-    show(retrain_line(log.retrains))
+    show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
     show(*(f"Wrote {path}" for path in files))
 
 
@@ -173,7 +213,8 @@ def _clock_line(clock: dict[str, Any]) -> str:
 
 CAPTION = (
     "\nFP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
-    "cell tells the truth about parts that were not verified."
+    "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
+    "cycles of safe mode."
 )
 
 
@@ -184,7 +225,8 @@ def _table(rows: list[dict[str, Any]], title: str, timed: bool) -> Any:
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
     caption = CAPTION + (" good/h: good parts passed on an hour.\n" if timed else "\n")
     table = Table(title=f"\n{title}\n", caption=caption, pad_edge=False, show_edge=False, **look)
-    for name in ("cycles", "verified", "accepted", "FP", "stops", "rejected", "FN", *(["good/h"] if timed else [])):
+    names = ("cycles", "verified", "accepted", "FP", "stops", "rejected", "FN", "novel", "safe")
+    for name in (*names, *(["good/h"] if timed else [])):
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows[:-1]:
         table.add_row(*_cells(row, timed))
@@ -194,12 +236,12 @@ def _table(rows: list[dict[str, Any]], title: str, timed: bool) -> Any:
 
 
 def _cells(row: dict[str, Any], timed: bool) -> list[str]:
-    counts = [str(row[name]) for name in ("accepted", "false_positive", "stops", "rejected", "false_negative")]
+    names = ("accepted", "false_positive", "stops", "rejected", "false_negative", "novel", "safe_mode")
     rate = row["parts_per_hour"]
     return [
         f"{row['first_cycle']} to {row['last_cycle']}",
         f"{100 * row['verified_share']:.0f} %",
-        *counts,
+        *(str(row[name]) for name in names),
         *(["-" if rate is None else f"{rate:.1f}"] if timed else []),
     ]
 
@@ -210,7 +252,8 @@ def _save(log: RunLog, title: str, out: Path) -> list[Path]:
     from ..experiments.figures import run_picture, save
     from ..experiments.tables import write_csv
 
-    columns = {"action": log.action, "truth": log.truth, "stopped": log.stopped}
+    columns: dict[str, Any] = {"action": log.action, "truth": log.truth, "stopped": log.stopped}
+    columns |= {"novel": log.novel, "safe_mode": log.safe_mode}
     frame = pd.DataFrame(columns | ({} if log.clock_s is None else {"clock_s": log.clock_s}))
     frame.insert(0, "cycle", range(1, len(log) + 1))
     return [write_csv(frame, out / "run.csv"), save(run_picture(log, title), out / "run.png")]

@@ -1,43 +1,75 @@
-"""`dengine status`: what a store holds."""
+"""`dengine status`: what a store holds, and what can be said of the parts that went on without a check."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from .options import example, json_option
-from .output import duration, show, write_json
+from .output import certificate_record, duration, show, write_json
 
 if TYPE_CHECKING:
+    from ..decision.certificate import Certificate
     from ..recipe import Recipe
     from ..records import RetrainReport
+    from ..store.base import Event, Store
+
+RECENT = 200  # labels
+GUARANTEES = {
+    "local": "local: of the ball around each part, at one look",
+    "pooled": "pooled: of all accepted parts together, however often one looks",
+}
+STOPS = {
+    "some": "of some bad parts: silence after an accept says nothing",
+    "all": "of all bad parts: an accepted part that no stop follows counts as good",
+}
 
 
 @click.command(epilog=example("dengine status engine.db"))
 @click.argument("store", metavar="STORE")
 @json_option
 def status(store: str, as_json: bool) -> None:
-    """Say what a store holds and what its engine decides by.
+    """Say what a store holds, and what can be certified by it.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`.
     """
-    settings, counts, retrains = _read(store)
-    worst = max((r.seconds for r in retrains), default=None)
+    held = _read(store)
     if as_json:
-        listed = [asdict(r) for r in retrains]
-        write_json(
-            {"verb": "status", "store": store} | counts | {"settings": settings, "worst_retrain_s": worst, "all": listed}
-        )
+        write_json({"verb": "status", "store": store} | _record(held))
         return
-    show(_table(store, [*_settings_rows(settings), *_count_rows(counts), *_retrain_rows(retrains)]))
+    groups = (_settings_rows(held), _count_rows(held), _promise_rows(held), _retrain_rows(held.retrains), _event_rows(held))
+    show(_table(store, [row for rows in groups for row in rows]))
 
 
-def _read(store: str) -> tuple[dict[str, str], dict[str, Any], list[RetrainReport]]:
+@dataclass(frozen=True)
+class Held:
+    """What was read of a store.
+
+    counts : `Store.status`.  novel, recent : traces that were novel among those that the newest labels tell of, and how
+        many they tell of: verified, audited and accepted parts.  mode : the newest event of the safe mode, if any.
+    """
+
+    settings: dict[str, str]
+    recipe: Recipe
+    counts: dict[str, Any]
+    retrains: list[RetrainReport]
+    certificate: Certificate
+    novel: int
+    recent: int
+    mode: Event | None
+
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified; "" where it is not."""
+        return "" if self.mode is None or self.mode.text.startswith("ended") else self.mode.text
+
+
+def _read(store: str) -> Held:
     from ..errors import StoreError
     from ..store.base import open_store
 
@@ -46,9 +78,51 @@ def _read(store: str) -> tuple[dict[str, str], dict[str, Any], list[RetrainRepor
         settings = opened.settings()
         if "recipe" not in settings:
             raise StoreError(f"Expected a store that an engine has used, {store} is empty.")
-        return settings, opened.status(), opened.retrains()
+        return _held(opened, settings)
     finally:
         opened.close()
+
+
+def _held(store: Store, settings: dict[str, str]) -> Held:
+    from ..decision.certificate import certificate_of
+    from ..recipe import Recipe
+
+    recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
+    newest = store.evidence_since(counts["labels"] - RECENT)  # labels are numbered from 1
+    modes = [event for event in store.events() if event.kind == "safe mode"]
+    return Held(
+        settings=settings,
+        recipe=recipe,
+        counts=counts,
+        retrains=store.retrains(),
+        certificate=certificate_of(store.outcomes(), recipe.policy),
+        novel=int(newest.novel.sum()),
+        recent=len(newest.seq) + int(newest.silent.sum()),
+        mode=modes[-1] if modes else None,
+    )
+
+
+def _record(held: Held) -> dict[str, Any]:
+    """As JSON has it."""
+    counts, policy = held.counts, held.recipe.policy
+    novel = {"decisions": counts["reasons"]["novel"], "share": _share(counts["reasons"]["novel"], counts["decisions"])}
+    novel |= {"recent": held.novel, "recent_decisions": held.recent, "recent_share": _share(held.novel, held.recent)}
+    mode = {"on": held.safe_mode != "", "reason": held.safe_mode, "since": held.mode.time if held.mode else None}
+    worst = max((r.seconds for r in held.retrains), default=None)
+    return counts | {
+        "guarantee": policy.guarantee,
+        "stops": policy.stops,
+        "certificate": certificate_record(held.certificate),
+        "novel": novel,
+        "safe_mode": mode,
+        "settings": held.settings,
+        "worst_retrain_s": worst,
+        "all": [asdict(r) for r in held.retrains],
+    }
+
+
+def _share(some: int, of: int) -> float | None:
+    return some / of if of else None
 
 
 def _table(store: str, rows: list[tuple[str, str]]) -> Any:
@@ -62,13 +136,12 @@ def _table(store: str, rows: list[tuple[str, str]]) -> Any:
     return table
 
 
-def _settings_rows(settings: dict[str, str]) -> Iterator[tuple[str, str]]:
-    from ..recipe import Recipe
-
-    recipe, seed = Recipe.from_toml(settings["recipe"]), settings.get("seed", "0")
+def _settings_rows(held: Held) -> Iterator[tuple[str, str]]:
+    settings, recipe, seed = held.settings, held.recipe, held.settings.get("seed", "0")
     # Of a model that was handed in, reducer and numbers of the recipe have no effect: to show them would be a lie.
     handed_in = settings.get("model")
     yield from _own_rows(recipe, seed) if handed_in is None else [("model", f"{handed_in}, decides by its own rule")]
+    yield "stops known", STOPS[recipe.policy.stops]
     yield "audits", f"{100 * recipe.policy.audit_rate:g} % of what it is certain of"
     yield (
         "retrain",
@@ -81,8 +154,9 @@ def _own_rows(recipe: Recipe, seed: str) -> Iterator[tuple[str, str]]:
     policy = recipe.policy
     yield "reducer", f"{recipe.name}, seed {seed}"
     yield "policy", f"alpha {policy.alpha:g}, LB {100 * policy.lower_bound:g} %, {policy.interval} interval"
-    yield "rule", policy.guarantee
+    yield "guarantee", GUARANTEES.get(policy.guarantee, policy.guarantee)
     yield "neighbours", _neighbours(recipe)
+    yield "novelty", "off" if not recipe.novelty else f"verified beyond {recipe.novelty:g} times the usual distance"
 
 
 def _neighbours(recipe: Recipe) -> str:
@@ -104,7 +178,8 @@ def _contract(trace: str | None) -> str:
     return f"{channels}{spec.samples} samples at {spec.rate_hz:g} Hz ({seconds}), in {spec.unit}{limit}"
 
 
-def _count_rows(counts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
+    counts = held.counts
     yield "cell", counts["cell_id"]
     yield "decisions", f"{counts['decisions']}: {_listed(counts['actions'])}"
     yield "reasons", _listed(counts["reasons"])
@@ -113,6 +188,31 @@ def _count_rows(counts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "first, last", " to ".join(_when(counts[key]) for key in ("first_time", "last_time"))
     if counts["write_failures"]:
         yield "write failures", str(counts["write_failures"])
+
+
+def _promise_rows(held: Held) -> Iterator[tuple[str, str]]:
+    novel, decisions = held.counts["reasons"]["novel"], held.counts["decisions"]
+    recent = f"; of the newest {held.recent:,} that labels tell of, {held.novel:,}{_percent(held.novel, held.recent)}"
+    yield "novel", f"{novel:,} of {decisions:,} decisions{_percent(novel, decisions)}{recent}"
+    yield "safe mode", _mode(held)
+    yield "accepted", f"{held.certificate.sentence} {held.certificate.advice}"
+    yield "rejected", held.certificate.sentence_on_rejects
+
+
+def _percent(some: int, of: int) -> str:
+    return f" ({100 * some / of:.1f} %)" if of else ""
+
+
+def _mode(held: Held) -> str:
+    if held.mode is None:
+        return "off"
+    when = _when(held.mode.time)
+    return f"on since {when}, every part is verified: {held.safe_mode}" if held.safe_mode else f"off, ended {when}"
+
+
+def _event_rows(held: Held) -> Iterator[tuple[str, str]]:
+    for i, event in enumerate(reversed(held.counts["events"])):
+        yield "newest events" if i == 0 else "", f"{_when(event['time'])} {event['kind']}: {event['text']}"
 
 
 def _retrain_rows(retrains: list[RetrainReport]) -> Iterator[tuple[str, str]]:

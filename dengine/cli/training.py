@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .interrupting import Asked, EndAskedError, end_interrupted, interruptible
-from .options import RecipeChoice, data_options, example, json_option, read, recipe_options, short_name
+from .options import DataChoice, RecipeChoice, data_options, example, json_option, recipe_options, short_name
 from .output import imported_line, progress, show, write_json
 
 if TYPE_CHECKING:
@@ -33,16 +33,14 @@ RETRAINS = 10
     help="At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one.",
 )
 @json_option
-def train(
-    choice: RecipeChoice, data: str, samples: int | None, store: str, seed: int | None, retrains: int, as_json: bool
-) -> None:
+def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, retrains: int, as_json: bool) -> None:
     """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant) is kept, but never
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    dataset, recipe = read(data, samples), choice.load() if choice.asked else None
+    dataset, recipe = source.load(), choice.load() if choice.asked else None
     with interruptible() as asked:
         imported = _import(dataset, store, recipe, seed, as_json, asked)
         trained = _train(store, retrains, as_json, asked)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..cells.base import Cell
 from ..engine import DataEngine
-from ..records import Action, Cycle, Decision, Outcome, RetrainReport
+from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,6 +27,8 @@ class RunLog:
     truth : (n,) 1 good, 0 bad, NaN where the cell does not tell: real ones tell only what was verified.
     lower, upper, n_success, n_failure : (n,) the evidence.
     position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
+    novel : (n,) bool, verified as unlike all that was learned from.
+    safe_mode : (n,) bool, every part is verified after this cycle, whatever the model says.
     decide_seconds : (n,) wall time of each decision.
     clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
     retrains : the reports of those that ended in this run.
@@ -41,6 +43,8 @@ class RunLog:
     position: NDArray[np.float64]
     decide_seconds: NDArray[np.float64]
     stopped: NDArray[np.bool_]
+    novel: NDArray[np.bool_]
+    safe_mode: NDArray[np.bool_]
     clock_s: NDArray[np.float64] | None = None
     retrains: tuple[RetrainReport, ...] = ()
 
@@ -104,6 +108,8 @@ class RunLog:
             "false_positive": int(self.false_positive[part].sum()),
             "false_negative": int(self.false_negative[part].sum()),
             "stops": int(self.stopped[part].sum()),
+            "novel": int(self.novel[part].sum()),
+            "safe_mode": int(self.safe_mode[part].sum()),
             "parts_per_hour": self._parts_per_hour(begin, end),
         }
 
@@ -165,6 +171,8 @@ class RunRecorder:
             position=_positions(decisions),
             decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
             stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
+            novel=np.array([d.reason is Reason.NOVEL for d in decisions], dtype=np.bool_),
+            safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
             clock_s=self._clock(),
             retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
         )

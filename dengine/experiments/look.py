@@ -89,10 +89,12 @@ def draw_errors(axes: Axes, false_positive: NDArray[np.bool_], false_negative: N
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
 
 
-def draw_verified(axes: Axes, verified: NDArray[np.bool_], window: int) -> None:
+def draw_verified(
+    axes: Axes, verified: NDArray[np.bool_], window: int, colour: str = VERIFIED, label: str = "verified"
+) -> None:
     """Share of the parts that were checked, (n,), over the last `window` cycles."""
     x, seen = np.arange(1, len(verified) + 1), sliding_sum(np.ones(len(verified)), window)
-    axes.plot(x, 100 * sliding_sum(verified, window) / seen, color=VERIFIED, label="verified")
+    axes.plot(x, 100 * sliding_sum(verified, window) / seen, color=colour, label=label)
     axes.set(ylim=(0, 104))
 
 

@@ -44,6 +44,8 @@ class Replay(RunLog):
             "interval": policy.interval,
             "alpha": policy.alpha,
             "lower_bound": policy.lower_bound,
+            "guarantee": policy.guarantee,
+            "stops": policy.stops,
             "seed": self.seed,
             "cycles": len(self),
             "certain": accepted + rejected,
@@ -53,6 +55,8 @@ class Replay(RunLog):
             "false_negative": false_negative,
             "precision": 1.0 - false_positive / accepted if accepted else float("nan"),
             "npv": 1.0 - false_negative / rejected if rejected else float("nan"),
+            "novel": counts["novel"],
+            "safe_mode": counts["safe_mode"],
             "retrains": len(self.retrains),
             "retrain_p50_s": _quantile(self.retrain_seconds, 0.5),
             "retrain_max_s": _quantile(self.retrain_seconds, 1.0),
@@ -77,7 +81,8 @@ def replay(
     dataset : anything `load_dataset` takes.  recipe : anything `Recipe.load` takes.
     seed : of the shuffle and of the engine; the same seed gives the same decisions.
     shuffle : False plays the stream as it was recorded, drift and all.
-    confirm : whether accepted good parts are confirmed; by default only stops are seen.
+    confirm : whether accepted good parts are confirmed by the cell; by default only stops are seen. With
+        `Policy(stops="all")` the engine takes the silence after them for as much.
     on_cycle : called with the number of cycles done, for a progress bar.
     """
     data, recipe = load_dataset(dataset), Recipe.load(recipe)

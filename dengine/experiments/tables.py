@@ -3,8 +3,9 @@
     frame = frame_of(replays)
     Console().print(pooled_table(pool(frame)))   # and promise_line(row) for each
 
-Which promise is shown: the *pooled* one. Among all parts accepted in all replays the share of bad ones should be at most
-1 - LB, and likewise the share of good ones among the rejected.
+Which promise is shown: the one about all parts together. Among all parts accepted in all replays the share of bad ones
+should be at most 1 - LB, and likewise the share of good ones among the rejected. Each row names its guarantee: under
+"pooled" the rule itself keeps the accepted parts to it, under "local" it is only measured.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-CONDITION = ["recipe", "interval", "alpha", "lower_bound"]
-COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative"]
+CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops"]
+COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode"]
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
 PROMISE = (
     "certain: cycles decided without a check, and their share of all cycles. accept, reject: such decisions; below them "
@@ -30,8 +31,16 @@ PROMISE = (
     "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
     "99th percentile. saved: checks left out, at 5 s each, before what stops and wrong rejects cost. Counts and saved "
     "are means a replay; shares are pooled, that is, counted over the parts of all replays together. The pooled "
-    "precision is compared with LB; it is measured here, no rule enforces it. Rejected parts get no feedback but audits."
+    "precision is compared with LB. {} Rejected parts get no feedback but audits."
 )
+SHOWN = {  # by guarantee
+    "local": "Guarantee local: the rule speaks of the ball around each part; the pooled precision is only measured.",
+    "pooled": "Guarantee pooled: the rule itself keeps all accepted parts together to LB, at level alpha.",
+}
+KNOWN = {  # by what is known of stops
+    "some": "Beside it, some: of accepted parts only stops are known.",
+    "all": "Beside it, all: an accepted part that no stop follows counts as good, and is learned from.",
+}
 
 
 def frame_of(replays: Sequence[Replay], names: Sequence[str] | None = None) -> pd.DataFrame:
@@ -87,12 +96,20 @@ def promise_kept(row: Mapping[str, Any]) -> bool | None:
 def promise_line(row: Mapping[str, Any]) -> str:
     """The promise of one row in words."""
     if not row["total_accepted"]:
-        return f"{row['recipe']}: no part was accepted."
+        return f"{row['recipe']} ({row['guarantee']}): no part was accepted."
     verdict = {True: "kept", False: "broken", None: f"fewer than {ENOUGH} accepted parts, too few to say"}[
         promise_kept(row)
     ]
     good, bound = _percent(row["precision"]), 100 * row["lower_bound"]
-    return f"{row['recipe']}: {good} of {row['total_accepted']} accepted parts were good, LB {bound:g} %: {verdict}."
+    who = f"{row['recipe']} ({row['guarantee']})"
+    return f"{who}: {good} of {row['total_accepted']} accepted parts were good, LB {bound:g} %: {verdict}."
+
+
+def guarantee_line(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What the rows' guarantees say, and what is known of stops; one that a user wrote is not explained."""
+    asked = dict.fromkeys(str(row["guarantee"]) for row in rows)
+    known = dict.fromkeys(str(row["stops"]) for row in rows)
+    return " ".join([*(SHOWN[name] for name in asked if name in SHOWN), *(KNOWN[name] for name in known)])
 
 
 def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> Table:
@@ -102,12 +119,13 @@ def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> T
 
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
     look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
-    table = Table(title=f"\n{title}\n", caption=f"\n{PROMISE}\n", **look)
-    table.add_column("recipe\n ", overflow="fold")  # the one that gives way: 80 columns are enough for every number
+    table = Table(title=f"\n{title}\n", caption=f"\n{PROMISE.format(guarantee_line(rows))}\n", **look)
+    # The one that gives way: 80 columns are enough for every number.
+    table.add_column("recipe\nguarantee", overflow="fold")
     for name in _CELLS_OF:
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(str(row["recipe"]), *(show(row) for show in _CELLS_OF.values()))
+        table.add_row(f"{row['recipe']}\n{row['guarantee']}, {row['stops']}", *(show(row) for show in _CELLS_OF.values()))
     return table
 
 

@@ -19,13 +19,14 @@ from typing import Any
 import torch
 
 from .. import __version__
-from ..decision.rule import SCALAR_BOUNDS
+from ..decision.policy import RULES
+from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS
 from ..errors import ExportError
 from ..model.base import Exportable
-from ..model.module import FIELDS, DecisionModule
 from ..records import Action, Reason, TraceSpec
+from .module import FIELDS, DecisionModule
 
-SCHEMA = 1
+SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
 METADATA = "dengine.json"
 SCRIPTABLE = "conv, pca or rocket"
 
@@ -51,10 +52,13 @@ def decision_module(source: Exportable) -> DecisionModule:
             f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not compile to TorchScript; "
             f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
         )
+    if model.untold:
+        raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     predictor = model.predictor
     if model.spaces.module() is None:
         raise ExportError(f"{model.name} cannot be scripted: it has no module; use {SCRIPTABLE} instead.")
-    return DecisionModule(source.trace, predictor, model.n_spaces, model.index.dim, source.audit_rate, source.seed)
+    size = model.n_spaces, model.index.dim
+    return DecisionModule(source.trace, predictor, *size, source.audit_rate, source.seed, source.stops_all)
 
 
 def describe(source: Exportable) -> dict[str, Any]:
@@ -69,6 +73,9 @@ def describe(source: Exportable) -> dict[str, Any]:
         "alpha": model.classifier.alpha,
         "lower_bound": model.classifier.lower_bound,
         "interval": model.classifier.interval,
+        "guarantee": _guarantee_of(model.rule),
+        "stops": "all" if source.stops_all else "some",
+        "novelty": model.novelty,
         "spaces": model.n_spaces,
         "dim": index.dim,
         "capacity": index.capacity,
@@ -77,11 +84,18 @@ def describe(source: Exportable) -> dict[str, Any]:
         "fields": list(FIELDS),
         "actions": [str(a) for a in Action],
         "reasons": [str(r) for r in Reason],
+        "safe_modes": list(SAFE_MODE),
         "model_version": source.model_version,
         "recipe": source.recipe,
         "audit_rate": source.audit_rate,
         "seed": source.seed,
     }
+
+
+def _guarantee_of(rule: Any) -> str:
+    """What `Policy.guarantee` calls a rule of this class."""
+    own = f"{type(rule).__module__}:{type(rule).__qualname__}"
+    return next((name for name, rules in RULES.items() if own in rules.values()), own)
 
 
 def write_checked(target: Path, write: Callable[[Path], None]) -> Path:

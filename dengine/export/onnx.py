@@ -4,7 +4,8 @@
     >>> load_onnx("model.onnx").decide(trace)
 
 A pure-tensor twin of the decision that TorchScript carries, checked against it when it is written. What ONNX cannot
-carry: references that grow, so nothing is learned in the cell, and the content hash, so there are no audits.
+carry: references that grow and rules that learn, so nothing is learned in the cell; hashes, so there are no audits, no
+votes of parts that came again, and a reference that is asked about itself counts itself.
 """
 
 from __future__ import annotations
@@ -29,16 +30,16 @@ from torch import Tensor, nn
 from ..decision.rule import DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
-from ..model.module import FIELDS
 from ..records import ACTIONS, REASONS, Reason, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
 from .file import METADATA, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
+from .module import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # where an empty slot waits: no ball reaches it
 OPSET = 18
-CERTAIN, UNCERTAIN = REASONS.index(Reason.CERTAIN), REASONS.index(Reason.UNCERTAIN)
+CERTAIN, UNCERTAIN, NOVEL = (REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.NOVEL))
 CHECKED = 64  # random traces that the file is held against before it is kept
 BOUND_TOLERANCE = 1e-6
 EDGE = 2  # another runtime adds in another order: a reference on the ball's very surface may fall on either side
@@ -47,16 +48,13 @@ EDGE = 2  # another runtime adds in another order: a reference on the ball's ver
 def export_onnx(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:
     """Write `path` and `path`.sha256: the decision of a `DataEngine` or a fitted `ModelPrediction` as ONNX.
 
-    Raises ExportError where the engine audits, nothing was trained yet, the reducer or the interval has no module, a
-    package is missing, or onnxruntime does not decide as the model does.
+    Raises ExportError where the engine audits, its rule learns, a part came again, nothing was trained yet, the reducer or
+    the interval has no module, a package is missing, or onnxruntime does not decide as the model does.
     """
     onnx = _package("onnx")
     source = source_of(engine_or_model, trace)
-    if source.audit_rate > 0.0:
-        raise ExportError(
-            "ONNX carries no audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0."
-        )
     decision_module(source)  # the same refusals as for TorchScript
+    _refuse_what_changes(source)
     twin = Twin(source).eval()
     metadata = describe(source) | {"format": "onnx", "learns": False}
 
@@ -81,6 +79,23 @@ def load_onnx(path: str | os.PathLike[str]) -> OnnxModel:
     except Exception as error:  # protobuf's own errors have no common base
         raise ExportError(f"{target} is not a dengine export in ONNX: it holds no {METADATA}.") from error
     return OnnxModel(content, checked_schema(metadata, target))
+
+
+def _refuse_what_changes(source: Exportable) -> None:
+    rule, repeats = type(source.model.rule), int(source.model.index.ring.repeats)
+    if source.audit_rate > 0.0:
+        raise ExportError(
+            "ONNX carries no audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0."
+        )
+    if rule is not DecisionRule:  # one of the user's own as well: the twin knows the paper's alone
+        raise ExportError(
+            f"ONNX carries no {rule.__name__}, a rule that learns; export torchscript, or set guarantee = 'local' and "
+            "stops = 'some'."
+        )
+    if repeats:
+        raise ExportError(
+            f"ONNX carries no votes: {repeats} of the references are of parts that were there already; export torchscript."
+        )
 
 
 class OnnxModel:
@@ -120,6 +135,7 @@ class Twin(nn.Module):
         self.radius, self.fraction, self.reject_fraction = around.radius, around.fraction, around.reject_fraction
         self.limit = float("inf") if limit is None else limit
         self.encoder = model.spaces.module()
+        self.novelty = model.gate
         self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])
         # A reference of space k stands far away in every other space: one subtraction, no gathering.
         places = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
@@ -132,19 +148,22 @@ class Twin(nn.Module):
         """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
         fault = self.fault(trace)
         good = fault == 0
-        z = self.encoder(torch.where(good, trace, torch.zeros_like(trace)).unsqueeze(0))[0] / self.scale  # (K, d)
+        x = torch.where(good, trace, torch.zeros_like(trace))
+        z = self.encoder(x.unsqueeze(0))[0] / self.scale  # (K, d)
+        usual = (self.novelty.scores(x) <= 1.0).all()  # what overflowed to NaN is not
+        known = good & usual
         distances = (self.places - z[:, :, None]).square().sum(1).amin(0)  # (n,): in its own space it is nearest
         action, lower, upper, n_success, n_failure = self.counted(distances)
         verify, empty = torch.zeros_like(action), torch.zeros_like(lower)
-        action = torch.where(good, action, verify)
-        certain = torch.where(action == 0, UNCERTAIN, CERTAIN)
+        action = torch.where(known, action, verify)
+        certain = torch.where(usual, torch.where(action == 0, UNCERTAIN, CERTAIN), NOVEL)
         return (
             action,
             torch.where(good, certain, fault),
-            torch.where(good, lower, empty),
-            torch.where(good, upper, empty + 1.0),
-            torch.where(good, n_success, verify),
-            torch.where(good, n_failure, verify),
+            torch.where(known, lower, empty),
+            torch.where(known, upper, empty + 1.0),
+            torch.where(known, n_success, verify),
+            torch.where(known, n_failure, verify),
             torch.where(good, z, float("nan")),
         )
 

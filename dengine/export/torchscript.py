@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import os
@@ -15,12 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
 
-from ..decision.rule import script
+from ..deciding import as_part
+from ..decision.rule import SAFE_MODE, script
 from ..errors import ExportError
+from ..folds import part_hash
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..traces import as_trace, as_traces
 from .file import METADATA, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
+from .module import METHODS
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
@@ -34,7 +39,7 @@ def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, tr
     """
     source = source_of(engine_or_model, trace)
     try:
-        frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=["decide", "learn"])
+        frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=list(METHODS))
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
@@ -52,7 +57,7 @@ def _golden(module: Any, spec: TraceSpec) -> dict[str, Any]:
     if spec.limit is not None:
         x = x * np.float32(0.5 * spec.limit)
     with torch.inference_mode():
-        embedding = module.decide(torch.from_numpy(x))[6]
+        embedding = module(torch.from_numpy(x)[None])[6][0]  # `decide` would wait for its label
     return {"trace": x.tolist(), "embedding": embedding.tolist()}
 
 
@@ -75,30 +80,82 @@ class ExportedModel:
         self.module = module
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
-        self._decide = module.decide
+        self._asked = module if metadata["schema"] > 1 else FirstSchema(module, metadata["references"])
+        self._decide = self._asked.decide
 
-    def decide(self, trace: ArrayLike) -> ExportedDecision:
-        """Decide on one trace, (T,) or (C, T); TraceError for a wrong shape."""
+    def decide(self, trace: ArrayLike, part: str | int | None = None) -> ExportedDecision:
+        """Decide on one trace, (T,) or (C, T), of the part with this number; TraceError for a wrong shape.
+
+        Where the file says `stops` "all", this confirms a part that was accepted before it and of which nothing was heard.
+        """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
-            action, reason, lower, upper, n_success, n_failure, z = self._decide(x)
+            action, reason, lower, upper, n_success, n_failure, z = self._decide(x, _hash_of(part))
         return ExportedDecision(ACTIONS[action], REASONS[reason], lower, upper, n_success, n_failure, z.numpy())
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T)."""
+        """Decide on each trace of (n, T) or (n, C, T), one after the other."""
         return [self.decide(x) for x in as_traces(X, self.trace)]
 
-    def learn(self, trace: ArrayLike, success: bool) -> int:
-        """Make a verified trace a reference; returns how many are held. A faulty trace is not learned from."""
+    def learn(self, trace: ArrayLike, success: bool, part: str | int | None = None) -> int:
+        """Tell what became of a part after its `decide` and before the next; returns how many references are held.
+
+        The trace becomes a reference, and the rule is told. A faulty trace is not learned from.
+        """
+        return self._tell(self._asked.learn, trace, bool(success), _hash_of(part))
+
+    def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
+        """Tell that an accepted part was bad and stopped the system; as `learn`."""
+        return self._tell(self._asked.stop, trace, _hash_of(part))
+
+    def _tell(self, method: Any, trace: ArrayLike, *what: Any) -> int:
         with torch.inference_mode():
-            held: int = self.module.learn(torch.from_numpy(as_trace(trace, self.trace)), bool(success))
+            held: int = method(torch.from_numpy(as_trace(trace, self.trace)), *what)
         self.metadata["references"] = held
         return held
 
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified at present, in words; "" where it is not."""
+        return SAFE_MODE[self._asked.safe_mode()]
+
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write what was learned to a file of the same kind, with its checksum."""
-        metadata = self.metadata | {"references_sha256": None}  # of the references as first exported, no longer true
-        return write_checked(Path(path), lambda partial: _save(self.module, partial, metadata))
+        """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum."""
+        now = {"references": self._asked.n_references(), "references_sha256": None}  # the sum is that of the first export
+        return write_checked(Path(path), lambda partial: _save(self.module, partial, self.metadata | now))
+
+
+class FirstSchema:
+    """A module of schema 1 under the methods of today's: it knows no parts, and a stop is a failure as any other."""
+
+    def __init__(self, module: Any, held: int) -> None:
+        self.module, self.held = module, held
+
+    def decide(self, x: Tensor, part: int = 0) -> Any:
+        """`DecisionModule.decide`."""
+        return self.module.decide(x)
+
+    def learn(self, x: Tensor, success: bool, part: int = 0) -> int:
+        """`DecisionModule.learn`."""
+        self.held = int(self.module.learn(x, success))
+        return self.held
+
+    def stop(self, x: Tensor, part: int = 0) -> int:
+        """`DecisionModule.stop`."""
+        return self.learn(x, False)
+
+    def safe_mode(self) -> int:
+        """There is none."""
+        return 0
+
+    def n_references(self) -> int:
+        """References held."""
+        return self.held
+
+
+def _hash_of(part: Any) -> int:
+    number = as_part(part)
+    return 0 if number is None else part_hash(number)
 
 
 def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
@@ -118,8 +175,9 @@ def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
             f"{target} has its checksum but is no loadable TorchScript: {str(error).splitlines()[0]}."
         ) from error
     try:
+        # A copy runs the same compiled code, and this module must not learn of the golden trace.
+        _check_golden(ExportedModel(copy.deepcopy(module), dict(metadata)), target)
         model = ExportedModel(module, metadata)
-        _check_golden(model, target)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ExportError(f"{target} is not a dengine export: its description does not fit its module: {error}.") from error
     return model
@@ -130,5 +188,7 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
     trace, expected = np.array(golden["trace"], dtype=np.float32), np.array(golden["embedding"], dtype=np.float32)
     for _ in range(WARM_UP):
         found = model.decide(trace).embedding
+        model.learn(trace, True)
+        model.stop(trace)
     if found.shape != expected.shape or not np.allclose(found, expected, atol=TOLERANCE, rtol=TOLERANCE):
         raise ExportError(f"{path} loads, but this machine does not reproduce its golden embedding; export it anew here.")

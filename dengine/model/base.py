@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ExportError
 from ..recipe import Recipe
-from ..records import Action, TraceSpec
+from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 
 log = logging.getLogger("dengine")
@@ -33,9 +33,26 @@ class Prediction:
     n_success: int
     n_failure: int
     embedding: tuple[tuple[float, ...], ...] | None
+    reason: Reason
 
 
-NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None)
+NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, Reason.NO_MODEL)
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What became of a part.
+
+    lower, upper : the bound that it was decided by, before its label was known.  success : its label.
+    novel : whether it was like nothing learned from.
+    silent : accepted parts that went on since the last that was told of, and of which nothing was heard.
+    """
+
+    lower: float
+    upper: float
+    success: bool
+    novel: bool = False
+    silent: int = 0
 
 
 @runtime_checkable
@@ -98,8 +115,8 @@ class EngineModel(ABC):
         """Learn from traces (n, C, T), labels (n,) and content hashes (n,), from where an earlier training ended."""
 
     @abstractmethod
-    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
-        """What it says of one trace (C, T)."""
+    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+        """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
 
     @abstractmethod
     def reference_point(
@@ -121,8 +138,16 @@ class EngineModel(ABC):
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
         """Be ready to answer at once, in the place of `previous`."""
 
-    def tell(self, lower: float, upper: float, success: bool) -> None:  # noqa: B027  # a default: nothing to learn
-        """What became of a part: the bound that it was decided by, before its label was known, and the label."""
+    def tell(self, told: Told) -> None:  # noqa: B027  # a default: nothing to learn
+        """What became of a part."""
+
+    def forget(self) -> None:  # noqa: B027  # a default: nothing was learned
+        """Be as if nothing had been told."""
+
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified at present; "" where it is not."""
+        return ""
 
     def defect(self) -> str:
         """Why it must not answer after a training, label-free reasons only; "" where there is nothing against it."""
@@ -151,10 +176,10 @@ class EngineModel(ABC):
 
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these four.
 
-    def tell_safely(self, lower: float, upper: float, success: bool) -> None:
+    def tell_safely(self, told: Told) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
         try:
-            self.tell(lower, upper, success)
+            self.tell(told)
         except Exception:
             self.untold = True
             log.exception("the rule cannot be told of a part; every part is verified until the engine is opened again")
@@ -191,6 +216,7 @@ class Exportable:
     """What an exporter starts from.
 
     model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
+    stops_all : whether silence until the next decision confirms an accepted part.
     model_version, recipe : what the file says of the engine; 0 and "" without one.
     """
 
@@ -198,5 +224,6 @@ class Exportable:
     trace: TraceSpec
     audit_rate: float = 0.0
     seed: int = 0
+    stops_all: bool = False
     model_version: int = 0
     recipe: str = ""

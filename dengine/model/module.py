@@ -1,7 +1,7 @@
 """The compiled module that answers: trace -> embedding -> counts -> action. What the engine asks is what export saves.
 
-`Predictor` is the model's part, encoder, references and rule; `DecisionModule` puts the trace gate before it and the
-audits' coin behind it. Both compile to TorchScript.
+`Predictor` is the model's part, encoder, references and rule; it compiles to TorchScript, and `export.module` puts the
+trace gate before it and the audits' coin behind it.
 """
 
 import copy
@@ -15,20 +15,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..decision.novelty import NoveltyGate
 from ..decision.rule import RadiusNeighbours, script
-from ..folds import COIN_BITS, MIX, audit_salt
-from ..records import REASONS, Reason, TraceSpec
+from ..records import REASONS, Reason
 from ..reducers.base import Reducer
-from ..traces import TraceGate
 
-Predicted = tuple[int, float, float, int, int, Tensor]
-One = tuple[int, int, float, float, int, int, Tensor]
-Many = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
+Predicted = tuple[int, int, float, float, int, int, Tensor]
+CERTAIN, UNCERTAIN, NOVEL, SAFE = (
+    REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.NOVEL, Reason.SAFE_MODE)
+)
 
 
 class Predictor(nn.Module):
-    """Encoder, scale, references and rule as one module; compiles where the rule does.
+    """Encoder, scale, novelty, references and rule as one module; compiles where the rule does.
 
     encoder : (B, C, T) -> (B, K, d).
     scale : (K,) what each space is divided by.
@@ -36,12 +35,14 @@ class Predictor(nn.Module):
 
     scale: Tensor
 
-    def __init__(self, encoder: nn.Module, scale: Tensor, neighbours: RadiusNeighbours) -> None:
+    def __init__(self, encoder: nn.Module, scale: Tensor, novelty: NoveltyGate, neighbours: RadiusNeighbours) -> None:
         super().__init__()
         self.encoder = encoder
         self.register_buffer("scale", scale[:, None])
         self.scaled = bool((scale != 1.0).any())
-        self.neighbours = neighbours
+        self.novelty = novelty
+        self.neighbours: RadiusNeighbours = neighbours
+        self.certain, self.uncertain, self.novel, self.safe = CERTAIN, UNCERTAIN, NOVEL, SAFE
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
@@ -50,38 +51,62 @@ class Predictor(nn.Module):
         return z / self.scale if self.scaled else z
 
     @torch.jit.export
-    def add(self, x: Tensor, label: float, space: int) -> None:
-        """Make one labelled trace (C, T) a reference of `space`."""
-        self.neighbours.ring.put(self.embed(x)[space], label, space)
+    def add(self, point: Tensor, label: float, space: int, part: int) -> None:
+        """Make one labelled point (d,) of a part a reference of `space`."""
+        self.neighbours.ring.put(point, label, space, part)
 
     @torch.jit.export
     def n_references(self) -> int:
         """References held."""
         return self.neighbours.ring.size()
 
-    def forward(self, x: Tensor) -> Predicted:
-        """(C, T) one trace -> action, lower, upper, n_success, n_failure, scaled embedding (K, d)."""
+    @torch.jit.export
+    def tell(self, lower: float, upper: float, success: bool, silent: int, novel: bool) -> None:
+        """Tell the rule what became of a part."""
+        self.neighbours.rule.note(silent, novel)
+        self.neighbours.rule.tell(lower, upper, success)
+
+    @torch.jit.export
+    def safe_mode(self) -> int:
+        """Position in `SAFE_MODE` of the rule."""
+        return int(self.neighbours.rule.safe_mode())
+
+    def forward(self, x: Tensor, part: int = 0) -> Predicted:
+        """(C, T) one trace -> action, reason, lower, upper, n_success, n_failure, scaled embedding (K, d).
+
+        part : the hash of its part, which has no vote on itself; 0 for an unknown one.
+        """
         z = self.embed(x)
-        action, lower, upper, n_success, n_failure = self.neighbours(z)
-        return action, lower, upper, n_success, n_failure, z
+        if self.novelty(x):
+            return 0, self.novel, 0.0, 1.0, 0, 0, z
+        action, lower, upper, n_success, n_failure = self.neighbours(z, part)
+        reason = self.certain
+        if action == 0:
+            reason = self.uncertain if self.neighbours.rule.safe_mode() == 0 else self.safe
+        return action, reason, lower, upper, n_success, n_failure, z
 
 
 class PythonPredictor:
     """The same around a reducer that has no module, UMAP for one."""
 
-    def __init__(self, reducer: Reducer, scale: NDArray[np.float32], neighbours: nn.Module) -> None:
+    def __init__(self, reducer: Reducer, scale: NDArray[np.float32], novelty: Any, neighbours: Any) -> None:
         self.reducer = reducer
         self.scale = torch.from_numpy(scale)[:, None]
+        self.novelty = novelty
         self.neighbours = neighbours
 
     def embed(self, x: Tensor) -> Tensor:
         """(C, T) one trace -> (K, d), scaled."""
         return torch.from_numpy(self.reducer.embed(x[None].numpy())[0]) / self.scale
 
-    def __call__(self, x: Tensor) -> Predicted:
-        """(C, T) one trace -> action, lower, upper, n_success, n_failure, scaled embedding (K, d)."""
+    def __call__(self, x: Tensor, part: int = 0) -> Predicted:
+        """`Predictor.forward`."""
         z = self.embed(x)
-        return (*self.neighbours(z), z)
+        if self.novelty(x):
+            return 0, NOVEL, 0.0, 1.0, 0, 0, z
+        action, *counted = self.neighbours(z, part)
+        unsure = UNCERTAIN if self.neighbours.rule.safe_mode() == 0 else SAFE
+        return (action, CERTAIN if action else unsure, *counted, z)
 
 
 @dataclass(frozen=True)
@@ -93,15 +118,21 @@ class CompiledPredictor:
 
 
 def compile_predictor(
-    reducer: Reducer, scale: NDArray[np.float32], neighbours: RadiusNeighbours, like: CompiledPredictor | None = None
+    reducer: Reducer,
+    scale: NDArray[np.float32],
+    novelty: NoveltyGate,
+    neighbours: RadiusNeighbours,
+    like: CompiledPredictor | None = None,
 ) -> CompiledPredictor:
     """The fastest form that the reducer and the rule allow; a copy of `like` where that has the same structure."""
     module, compiles = reducer.module(), neighbours.rule.scriptable
     if module is None:
-        return CompiledPredictor(PythonPredictor(reducer, scale, script(neighbours) if compiles else neighbours))
+        return CompiledPredictor(
+            PythonPredictor(reducer, scale, script(novelty), script(neighbours) if compiles else neighbours)
+        )
     if not compiles:
-        return CompiledPredictor(Predictor(script(module), torch.from_numpy(scale), neighbours).eval())
-    eager = Predictor(module, torch.from_numpy(scale), neighbours).eval()
+        return CompiledPredictor(Predictor(script(module), torch.from_numpy(scale), script(novelty), neighbours).eval())
+    eager = Predictor(module, torch.from_numpy(scale), novelty, neighbours).eval()
     structure = _structure(eager)
     if like is None or like.structure != structure:
         return CompiledPredictor(script(eager), structure)
@@ -132,83 +163,3 @@ def _structure(eager: Predictor) -> tuple[Any, ...]:
         )
         for name, module in eager.named_modules()
     )
-
-
-class DecisionModule(nn.Module):
-    """The whole decision, raw trace in, action out: gate, predictor and audits. What the cell controller runs.
-
-    Actions are positions in `Action` (0 verify, 1 accept, 2 reject), reasons in `Reason`.
-
-    `decide(trace)` answers on one trace in scalars; `forward(traces)` on a batch in tensors; both in the order of `FIELDS`.
-    `learn(trace, success)` makes a verified trace a reference: bounded, in its own fold's space, the oldest one leaving
-    first whatever its label. It does not retrain the encoder.
-    """
-
-    def __init__(
-        self, spec: TraceSpec, predictor: Predictor, n_spaces: int, dim: int, audit_rate: float, seed: int
-    ) -> None:
-        super().__init__()
-        self.gate = TraceGate(spec)
-        self.predictor = predictor
-        self.channels = spec.channels
-        self.samples = spec.samples
-        self.n_spaces = n_spaces
-        self.dim = dim
-        self.audit_below = int(audit_rate * 2**COIN_BITS)
-        self.salt = audit_salt(seed)
-        self.mix = MIX
-        self.shift = 63 - COIN_BITS
-        self.mask = 2**COIN_BITS - 1
-        self.certain, self.uncertain, self.audit = (
-            REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT)
-        )
-
-    @torch.jit.export
-    def decide(self, trace: Tensor) -> One:
-        """One trace, (T,) or (C, T) of any real dtype -> action, reason, lower, upper, n_success, n_failure, (K, d)."""
-        x = self.as_trace(trace)
-        fault, content = self.gate(x)
-        if fault != 0:
-            return 0, fault, 0.0, 1.0, 0, 0, torch.full((self.n_spaces, self.dim), float("nan"))
-        action, lower, upper, n_success, n_failure, z = self.predictor(x)
-        reason = self.uncertain if action == 0 else self.certain
-        if action != 0 and self.audit_below > 0 and self.toss(content ^ self.salt) < self.audit_below:
-            action, reason = 0, self.audit
-        return action, reason, lower, upper, n_success, n_failure, z
-
-    def forward(self, traces: Tensor) -> Many:
-        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure: (B,); embedding (B, K, d)."""
-        batch = traces.unsqueeze(0) if traces.dim() == 1 else traces
-        n = batch.size(0)
-        whole = torch.zeros(n, 4, dtype=torch.int64)
-        bounds = torch.zeros(n, 2, dtype=torch.float64)
-        embedding = torch.zeros(n, self.n_spaces, self.dim)
-        for i in range(n):
-            action, reason, lower, upper, n_success, n_failure, z = self.decide(batch[i])
-            whole[i] = torch.tensor([action, reason, n_success, n_failure])
-            bounds[i, 0].fill_(lower)  # assigned, or made a tensor, a scripted float goes through float32
-            bounds[i, 1].fill_(upper)
-            embedding[i] = z
-        return whole[:, 0], whole[:, 1], bounds[:, 0], bounds[:, 1], whole[:, 2], whole[:, 3], embedding
-
-    @torch.jit.export
-    def learn(self, trace: Tensor, success: bool) -> int:
-        """Add one verified trace to the references; returns how many there are. A faulty trace is not learned from."""
-        x = self.as_trace(trace)
-        fault, content = self.gate(x)
-        if fault == 0:
-            self.predictor.add(x, 1.0 if success else 0.0, self.toss(content) % self.n_spaces)
-        return self.predictor.n_references()
-
-    def as_trace(self, trace: Tensor) -> Tensor:
-        """(C, T) float32; raises for another shape, which is a caller's bug."""
-        x = trace.unsqueeze(0) if trace.dim() == 1 else trace
-        if x.dim() != 2 or x.size(0) != self.channels or x.size(1) != self.samples:
-            raise ValueError(f"Expected one trace of {self.channels} x {self.samples} samples, got shape {trace.size()}.")
-        return x.to(torch.float32).contiguous()
-
-    def toss(self, content: int) -> int:
-        """`folds.toss` of one hash: 64-bit integers that wrap around."""
-        h = (content ^ (content >> 32)) * self.mix
-        h = (h ^ (h >> 32)) * self.mix
-        return int((h >> self.shift) & self.mask)

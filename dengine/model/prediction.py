@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from inspect import signature
 from typing import Any, Self
 
 import numpy as np
@@ -19,17 +18,19 @@ from sklearn.base import clone
 
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.neighbors import Counts, RadiusIndex
-from ..decision.rule import DecisionRule
+from ..decision.novelty import NoveltyGate, fit_novelty
+from ..decision.rule import SAFE_MODE, DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
-from ..recipe import Recipe, described
-from ..records import ACTIONS, TraceSpec
-from ..reducers import make_reducer, reducer_class
-from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule
+from ..recipe import NOVELTY, Recipe, described
+from ..records import ACTIONS, REASONS, TraceSpec
+from ..reducers import make_reducer, reducer_of
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, space_scale
 from ..reducers.cross_fitting import as_reducer
 from ..traces import as_traces
-from .base import EngineModel, Exportable, Prediction
+from .base import EngineModel, Exportable, Prediction, Told
 from .module import CompiledPredictor, compile_predictor
+from .repeats import repeats_note
 
 WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
 
@@ -41,6 +42,7 @@ class ModelPrediction(EngineModel):
     classifier : a `WilsonRadiusClassifier` holding radius and policy; it is cloned, never fitted itself.
     folds : K, for a label-using transformer that does not cross-fit by itself.
     rule : what turns counts into an action; None: the classifier's policy.
+    novelty : how far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
 
     Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius` means the same in every
     reducer; the scale of space k comes from fold k's traces, whose labels that space never saw. One whose axis has a
@@ -53,13 +55,16 @@ class ModelPrediction(EngineModel):
         classifier: WilsonRadiusClassifier | None = None,
         folds: int = 2,
         rule: DecisionRule | None = None,
+        novelty: float = NOVELTY,
     ) -> None:
+        self.novelty = novelty
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
         self.classifier = classifier or WilsonRadiusClassifier()
         self.folds = folds
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
         self._compiled: CompiledPredictor | None = None
+        self._note = ""
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
@@ -74,7 +79,7 @@ class ModelPrediction(EngineModel):
             reject_fraction=recipe.reject_fraction,
             capacity=recipe.window,
         )
-        return cls(_reducer_of(recipe, seed), classifier, recipe.folds, policy.rule())
+        return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
     def user_model(self) -> ModelPrediction:
@@ -98,7 +103,7 @@ class ModelPrediction(EngineModel):
         own = self.classifier
         policy = replace(recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval)
         near = replace(recipe, radius=own.radius, fraction=own.fraction, reject_fraction=own.reject_fraction)
-        return replace(near, policy=policy, folds=max(2, self.folds))
+        return replace(near, policy=policy, folds=max(2, self.folds), novelty=self.novelty)
 
     @property
     def n_spaces(self) -> int:
@@ -107,8 +112,9 @@ class ModelPrediction(EngineModel):
 
     @property
     def report(self) -> FitReport:
-        """What the last fit says of itself."""
-        return self.spaces.report
+        """What the last fit says of itself, and of the traces."""
+        own = self.spaces.report
+        return replace(own, note="; ".join(filter(None, (own.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
@@ -118,17 +124,22 @@ class ModelPrediction(EngineModel):
     def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference.
 
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) content hashes where they are known.
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) of their parts (`folds.identity_hash`), or
+        None: of their content.
         Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
         """
         X, y = as_traces(X), np.asarray(y, dtype=np.int64)
-        folds = fold_of(content_hash(X) if hashes is None else hashes, self.n_spaces)
+        parts = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
+        folds = fold_of(parts, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop)
         self.trace_shape = X.shape[1:]
         own_unit = self.spaces.own_unit
-        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else _scale(points, folds, self.n_spaces)
+        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
-        self.index.add(points / self.scale[folds, None], y, folds)
+        self.index.add(points / self.scale[folds, None], y, folds, parts)
+        self.index.weigh()
+        self._note = repeats_note(X, parts)
+        self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
         self._compiled = None  # built by `prepare`, or when it is asked
         return self
 
@@ -140,7 +151,7 @@ class ModelPrediction(EngineModel):
 
     def _compile(self, mould: CompiledPredictor | None = None) -> CompiledPredictor:
         around = self.classifier.around(self.index, self.rule)
-        self._compiled = compile_predictor(self.spaces, self.scale, around, mould)
+        self._compiled = compile_predictor(self.spaces, self.scale, self.gate, around, mould)
         if self._compiled.structure is not None and (mould is None or mould.structure != self._compiled.structure):
             for _ in range(WARM_UP):
                 self.predict_one(np.zeros(self.trace_shape, dtype=np.float32))
@@ -171,28 +182,39 @@ class ModelPrediction(EngineModel):
 
     def add_reference(self, point: Floats, y: int, hash_: int) -> None:
         """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
-        self.index.add(point[None], np.array([y]), np.array([self._fold(hash_)]))
+        self.index.ring.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_)
 
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
-    def tell(self, lower: float, upper: float, success: bool) -> None:
+    def tell(self, told: Told) -> None:
         """Tell the rule what became of a part."""
         before = dict(self.rule.state_dict())
-        self.rule.tell(lower, upper, success)
+        self.rule.note(told.silent, told.novel)
+        self.rule.tell(told.lower, told.upper, told.success)
         for name, now in self.rule.state_dict().items():
             if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
                 before[name].copy_(now)
                 setattr(self.rule, name, before[name])
 
-    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
-        """The whole prediction on one trace (C, T)."""
+    def forget(self) -> None:
+        """The rule as it was before it was told anything; in place, for the compiled module reads it."""
+        fresh = type(self.rule)(self.rule.alpha, self.rule.accept_at, self.rule.interval)
+        self.rule.load_state_dict(fresh.state_dict())
+
+    @property
+    def safe_mode(self) -> str:
+        """Why the rule lets nothing pass at present; "" where it does."""
+        return SAFE_MODE[self.rule.safe_mode()]
+
+    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+        """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
         if self.untold:
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
         with torch.inference_mode():
-            action, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x))
+            action, reason, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x), hash_)
         embedding = tuple(tuple(row) for row in z.tolist())
-        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding)
+        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
         """The prediction on each trace of (n, T) or (n, C, T)."""
@@ -214,7 +236,7 @@ class ModelPrediction(EngineModel):
 
     def successor(self) -> ModelPrediction:
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
-        new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule)
+        new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule, self.novelty)
         new.spaces = copy.deepcopy(self.spaces)
         return new
 
@@ -229,6 +251,8 @@ class ModelPrediction(EngineModel):
             state["untold"] = np.array(True)  # what the rule learned is not whole: an opened engine tells it all anew
         else:
             state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
+        if not self.gate.asleep:
+            state |= {f"novelty.{name}": buffer.numpy().copy() for name, buffer in self.gate.state_dict().items()}
         return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -240,9 +264,12 @@ class ModelPrediction(EngineModel):
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
-        own = self.rule.state_dict()  # shares its tensors with the rule
-        for name, value in _part(state, "rule.").items():
-            own[name].copy_(torch.from_numpy(np.array(value)))
+        self.gate = NoveltyGate(*self.trace_shape)
+        self.gate.asleep = not _part(state, "novelty.")
+        for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
+            own = module.state_dict()  # shares its tensors with the module
+            for name, value in _part(state, prefix).items():
+                own[name].copy_(torch.from_numpy(np.array(value)))
         self._compiled = None
         return self
 
@@ -262,25 +289,5 @@ class ModelPrediction(EngineModel):
         return self.__dict__ | {"_compiled": None}
 
 
-def _reducer_of(recipe: Recipe, seed: int) -> Any:
-    """A recipe's reducer: an object as it is, or one made by name with the seed and the folds, where it knows them."""
-    if not isinstance(recipe.reducer, str):
-        return recipe.reducer
-    known = signature(reducer_class(recipe.reducer)).parameters
-    # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
-    own = {name: value for name, value in (("random_state", seed), ("folds", recipe.folds)) if name in known}
-    return make_reducer(recipe.reducer, **own | dict(recipe.params))
-
-
 def _part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
     return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
-def _scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
-    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread."""
-    scale = np.ones(n_spaces, dtype=np.float32)
-    for k in range(n_spaces):
-        own = points[folds == k]
-        rms = float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(own) else 0.0
-        scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
-    return scale

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingError
-from ..records import Action
+from ..records import Action, Reason
 from ..reducers.base import Floats, Ints, StopRule
 from .base import EngineModel, Model, Prediction
 
@@ -51,13 +51,14 @@ class RivalAdapter(EngineModel):
         self.model.fit(X, y)
         return self
 
-    def predict_one(self, x: NDArray[np.float32]) -> Prediction:
-        """The rival's own decision on one trace (C, T), with its evidence."""
+    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+        """The rival's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
         (n_success,), (n_failure,) = self.model.count(X)
         action = Action(self.model.decide(X)[0])
-        return Prediction(action, float(lower), float(upper), int(n_success), int(n_failure), None)
+        reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
+        return Prediction(action, float(lower), float(upper), int(n_success), int(n_failure), None, reason)
 
     def reference_point(
         self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None

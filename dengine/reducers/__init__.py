@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._lazy import find_class, lazy_names
 from ..errors import SettingError
+from ..recipe import Recipe
 
 if TYPE_CHECKING:
     from .base import Reducer
@@ -64,6 +65,16 @@ def make_reducer(name: str, **params: Any) -> Any:
     if unknown:
         raise SettingError(f"{found.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}.")
     return found(**params)
+
+
+def reducer_of(recipe: Recipe, seed: int) -> Any:
+    """A recipe's reducer: an object as it is, or one made by name with the seed and the folds, where it knows them."""
+    if not isinstance(recipe.reducer, str):
+        return recipe.reducer
+    known = signature(reducer_class(recipe.reducer)).parameters
+    # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
+    own = {name: value for name, value in (("random_state", seed), ("folds", recipe.folds)) if name in known}
+    return make_reducer(recipe.reducer, **own | dict(recipe.params))
 
 
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _CLASSES}

@@ -195,6 +195,16 @@ def own_places(Z: Floats, folds: Ints) -> Floats:
     return np.ascontiguousarray(Z[np.arange(len(Z)), own])
 
 
+def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
+    """(K,) root mean square radius of each fold's points in its own space; 1 where a fold is empty or has no spread."""
+    scale = np.ones(n_spaces, dtype=np.float32)
+    for k in range(n_spaces):
+        own = points[folds == k]
+        rms = float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())) if len(own) else 0.0
+        scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
+    return scale
+
+
 def binary_labels(y: Any, n: int, name: str) -> Ints:
     """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are. SettingError for others."""
     if y is None:

@@ -3,12 +3,15 @@
 //   dengine_cell model.ts < traces.csv                      one trace a line, samples separated by commas
 //   dengine_cell model.ts --binary < traces.f32             blocks of little-endian float32, a trace each
 //   dengine_cell model.ts --learn --journal cell.csv < labelled.csv    a line begins with its label: 1, 0 or nothing
+//   dengine_cell model.ts --parts ...                       a line begins with its part's number, before any label
 //
 // Out, a line a trace: action,reason,lower,upper,n_success,n_failure,embedding...,microseconds
 //
-// --learn takes a label in after the decision on its trace, and only where that was to verify: an accepted or a rejected
-// part was not measured, so a live cell has no such label. A line that cannot be read is answered with
-// verify,malformed; the program goes on and ends with exit code 1. So does a model that must not be used.
+// --learn takes in, after the decision on a trace, what became of its part. Where that was to verify, the label is what was
+// found. Where it was to accept, 0 is a stop, 1 a confirmation, and nothing is silence until the next decision, which
+// counts as the file says. A rejected part went back to the bin, so its label is not read. Without --learn no silence
+// counts. A line that cannot be read is answered with verify,malformed; the program goes on and ends with exit code 1. So
+// does a model that must not be used.
 #include <ATen/Parallel.h>
 #include <c10/core/InferenceMode.h>
 
@@ -26,7 +29,7 @@
 
 struct Options {
     std::string model, journal;
-    bool binary = false, learn = false;
+    bool binary = false, learn = false, parts = false;
 };
 
 static std::optional<Options> parse_options(int argc, char** argv) {
@@ -37,6 +40,8 @@ static std::optional<Options> parse_options(int argc, char** argv) {
             options.binary = true;
         } else if (word == "--learn") {
             options.learn = true;
+        } else if (word == "--parts") {
+            options.parts = true;
         } else if (word == "--journal" && i + 1 < argc) {
             options.journal = argv[++i];
         } else if (word.starts_with("--") || !options.model.empty()) {
@@ -45,7 +50,8 @@ static std::optional<Options> parse_options(int argc, char** argv) {
             options.model = word;
         }
     }
-    const bool consistent = !(options.learn && options.binary) && (options.learn || options.journal.empty());
+    const bool words = options.learn || options.parts;  // stand beside the samples in a line
+    const bool consistent = !(words && options.binary) && (options.learn || options.journal.empty());
     return !options.model.empty() && consistent ? std::optional(options) : std::nullopt;
 }
 
@@ -64,15 +70,13 @@ static int run(const Options& options) {
     const auto size = static_cast<std::size_t>(model.channels * model.samples);
 
     std::optional<Journal> journal;
-    if (!options.journal.empty()) {
-        const auto learn = [&](Input& known) { model.learn(known.samples.data(), *known.success); };
-        journal.emplace(options.journal, model.sum, size, learn);
-    }
+    if (!options.journal.empty()) journal.emplace(options.journal, model);
     const Decision unknown{0, 0, 0.0, 1.0, 0, 0, std::vector<float>(model.width, std::numeric_limits<float>::quiet_NaN())};
     int malformed = 0;
     Input input;
+    const Columns columns{options.parts, options.learn};
     const auto next = [&] {
-        return options.binary ? next_block(std::cin, size, input) : next_line(std::cin, options.learn, size, input);
+        return options.binary ? next_block(std::cin, size, input) : next_line(std::cin, columns, size, input);
     };
     for (long long number = 1; next(); ++number) {
         if (!input.fault.empty()) {
@@ -82,12 +86,14 @@ static int run(const Options& options) {
             continue;
         }
         const auto begin = std::chrono::steady_clock::now();
-        const Decision decision = model.decide(input.samples.data());
+        const Decision decision = model.decide(input.samples.data(), input.part);
         const std::chrono::duration<double, std::micro> elapsed = std::chrono::steady_clock::now() - begin;
         print(model.actions.at(decision.action), model.reasons.at(decision.reason), decision, elapsed.count());
-        if (options.learn && input.success && decision.action == 0) {
-            if (journal) journal->append(*input.success, input.samples);  // written before it is counted
-            model.learn(input.samples.data(), *input.success);
+        if (!options.learn) {
+            model.drop();
+        } else if (decision.action == ACCEPT || (decision.action == VERIFY && input.success)) {
+            if (journal) journal->append(input, decision);  // written before it is counted
+            if (input.success) model.tell(input.samples.data(), input.part, decision.action, *input.success);
         }
     }
     return malformed > 0 ? 1 : 0;
@@ -97,7 +103,7 @@ int main(int argc, char** argv) {
     std::ios::sync_with_stdio(false);
     const auto options = parse_options(argc, argv);
     if (!options) {
-        std::fprintf(stderr, "usage: dengine_cell MODEL.ts [--binary | --learn [--journal FILE]] < TRACES\n");
+        std::fprintf(stderr, "usage: dengine_cell MODEL.ts [--binary | [--parts] [--learn [--journal FILE]]] < TRACES\n");
         return 2;
     }
     try {

@@ -14,6 +14,7 @@
 static_assert(std::endian::native == std::endian::little, "binary traces are little-endian");
 
 struct Input {
+    std::string part;  // its number; empty where it is unknown
     std::vector<float> samples;
     std::optional<bool> success;  // the label, where one was given
     std::string fault;            // why the line cannot be read; empty where it can
@@ -23,6 +24,15 @@ inline std::string_view trimmed(std::string_view word) {
     const auto first = word.find_first_not_of(" \t\r");
     if (first == std::string_view::npos) return {};
     return word.substr(first, word.find_last_not_of(" \t\r") - first + 1);
+}
+
+// The word before the next comma, which is taken off; `more` says whether there was one.
+inline std::string_view take_word(std::string_view& line, bool& more) {
+    const auto comma = line.find(',');
+    const auto word = trimmed(line.substr(0, comma));
+    more = comma != std::string_view::npos;
+    line.remove_prefix(more ? comma + 1 : line.size());
+    return word;
 }
 
 inline std::string quoted(std::string_view word) { return '"' + std::string(word.substr(0, 20)) + '"'; }
@@ -37,27 +47,33 @@ inline bool parse(std::string_view word, float& out) {
     return error == std::errc() && end == word.data() + word.size();
 }
 
-// `[label,]sample,sample,...`; a label is 1 (success), 0 (failure) or empty (unknown).
-inline void parse_line(std::string_view line, bool labelled, std::size_t expected, Input& input) {
-    input.samples.clear();
-    input.success.reset();
-    input.fault.clear();
-    for (std::size_t column = 0;; ++column) {
-        const auto comma = line.find(',');
-        const auto word = trimmed(line.substr(0, comma));
+// What a line begins with, in this order.
+struct Columns {
+    bool part = false, label = false;
+};
+
+// `[part,][label,]sample,sample,...`; a label is 1 (success), 0 (failure) or empty (unknown).
+inline void parse_line(std::string_view line, Columns columns, std::size_t expected, Input& input) {
+    input = {};
+    bool more = true;
+    if (columns.part) input.part = take_word(line, more);
+    if (columns.label && more) {
+        const auto word = take_word(line, more);
+        if (word != "" && word != "0" && word != "1") {
+            input.fault = "expected a label of 1, 0 or nothing, got " + quoted(word);
+        }
+        if (word != "") input.success = word == "1";
+    }
+    const std::size_t first = 1 + columns.part + columns.label;
+    while (more) {
+        const auto word = take_word(line, more);
         float value = 0.0F;
-        if (labelled && column == 0) {
-            if (word != "" && word != "0" && word != "1") {
-                input.fault = "expected a label of 1, 0 or nothing, got " + quoted(word);
-            }
-            if (word != "") input.success = word == "1";
-        } else if (parse(word, value)) {
+        if (parse(word, value)) {
             input.samples.push_back(value);
         } else if (input.fault.empty()) {
-            input.fault = "expected a number in column " + std::to_string(column + 1) + ", got " + quoted(word);
+            const auto column = std::to_string(first + input.samples.size());
+            input.fault = "expected a number in column " + column + ", got " + quoted(word);
         }
-        if (comma == std::string_view::npos) break;
-        line.remove_prefix(comma + 1);
     }
     if (input.fault.empty() && input.samples.size() != expected) {
         input.fault = "expected " + std::to_string(expected) + " samples, got " + std::to_string(input.samples.size());
@@ -65,10 +81,10 @@ inline void parse_line(std::string_view line, bool labelled, std::size_t expecte
 }
 
 // The next line that is not empty; false at the end.
-inline bool next_line(std::istream& in, bool labelled, std::size_t expected, Input& input) {
+inline bool next_line(std::istream& in, Columns columns, std::size_t expected, Input& input) {
     for (std::string line; std::getline(in, line);) {
         if (trimmed(line).empty()) continue;
-        parse_line(line, labelled, expected, input);
+        parse_line(line, columns, expected, input);
         return true;
     }
     return false;

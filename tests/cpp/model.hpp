@@ -4,19 +4,23 @@
 #include <torch/script.h>
 
 #include <cmath>
+#include <cstdint>
 #include <fstream>
 #include <iterator>
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 #include <vector>
 
 #include "metadata.hpp"
 #include "sha256.hpp"
 
-constexpr int SCHEMA = 1;
+constexpr int SCHEMA = 2;
 constexpr int WARM_UP = 3;  // the first calls compile
 constexpr double TOLERANCE = 1e-4;
+
+enum Action : std::int64_t { VERIFY, ACCEPT, REJECT };
 
 struct Decision {
     std::int64_t action, reason;
@@ -42,13 +46,24 @@ inline std::string checked_bytes(const std::string& path, std::string& sum) {
     return bytes;
 }
 
+// What a model knows a part by: 64-bit FNV-1a (Fowler, Noll and Vo) of its number's bytes, as in Python. Never 0, which is
+// a part of unknown number: that one is known by its trace.
+inline std::int64_t part_hash(std::string_view part) {
+    if (part.empty()) return 0;
+    std::uint64_t h = 0xCBF29CE484222325;
+    for (const unsigned char byte : part) h = (h ^ byte) * 0x100000001B3;
+    return h == 0 ? 1 : static_cast<std::int64_t>(h);
+}
+
 class Model {
   public:
     explicit Model(const std::string& path)
         : module_(load(path)), metadata_(description()), decide_(module_.get_method("decide")) {
-        if (metadata_.number("schema") > SCHEMA) {
+        if (const double schema = metadata_.number("schema"); schema != SCHEMA) {
             const auto& version = metadata_.text("dengine");
-            throw std::runtime_error("it was written by a newer dengine, " + version + "; build a newer cell program");
+            throw std::runtime_error(schema > SCHEMA
+                ? "it was written by a newer dengine, " + version + "; build a newer cell program"
+                : "it was written by an older dengine, " + version + "; export it anew");
         }
         channels = static_cast<std::int64_t>(metadata_.number("trace.channels"));
         samples = static_cast<std::int64_t>(metadata_.number("trace.samples"));
@@ -58,18 +73,29 @@ class Model {
         check_golden();
     }
 
-    // x: channels * samples floats, channel by channel; read, not kept.
-    Decision decide(float* x) {
-        const auto result = decide_({tensor(x)});
-        const auto& field = result.toTupleRef().elements();
-        const at::Tensor z = field[6].toTensor().contiguous();
-        const float* first = z.const_data_ptr<float>();
-        return {field[0].toInt(), field[1].toInt(), field[2].toDouble(), field[3].toDouble(),
-                field[4].toInt(), field[5].toInt(), {first, first + z.numel()}};
+    // x: channels * samples floats, channel by channel; read, not kept. Tells the model also that the next part has come:
+    // an accepted one before it, of which nothing was heard, went on.
+    Decision decide(float* x, const std::string& part) { return decide(decide_, x, part); }
+
+    // What became of the part that was decided last.
+    void tell(float* x, const std::string& part, std::int64_t action, bool success) {
+        if (action == ACCEPT && !success) {
+            module_.run_method("stop", tensor(x), part_hash(part));
+        } else {
+            module_.run_method("learn", tensor(x), success, part_hash(part));
+        }
     }
 
-    // Make a verified trace a reference; returns how many are held.
-    std::int64_t learn(float* x, bool success) { return module_.run_method("learn", tensor(x), success).toInt(); }
+    // Nothing will be heard of the part that was decided last, and its silence says nothing.
+    void drop() { module_.run_method("drop"); }
+
+    // What the model alone would have done with the part that was decided last: audits are verified all the same.
+    std::int64_t predicted() { return module_.run_method("predicted").toInt(); }
+
+    // A decision of an earlier run, in the place of `decide`.
+    void restore(float* x, const std::string& part, std::int64_t action, std::int64_t reason, double lower, double upper) {
+        module_.run_method("restore", tensor(x), part_hash(part), action, reason, lower, upper);
+    }
 
     std::int64_t channels, samples;
     std::vector<std::string> actions, reasons;
@@ -77,6 +103,15 @@ class Model {
     std::string sum;
 
   private:
+    Decision decide(torch::jit::Method& method, float* x, const std::string& part) const {
+        const auto result = method({tensor(x), part_hash(part)});
+        const auto& field = result.toTupleRef().elements();
+        const at::Tensor z = field[6].toTensor().contiguous();
+        const float* first = z.const_data_ptr<float>();
+        return {field[0].toInt(), field[1].toInt(), field[2].toDouble(), field[3].toDouble(),
+                field[4].toInt(), field[5].toInt(), {first, first + z.numel()}};
+    }
+
     torch::jit::Module load(const std::string& path) {
         std::istringstream stream(checked_bytes(path, sum));
         try {
@@ -104,8 +139,13 @@ class Model {
         if (trace.size() != static_cast<std::size_t>(channels * samples) || expected.size() != width) {
             throw std::runtime_error("its golden trace does not fit its own contract");
         }
+        // A copy runs the same compiled code, and this module must not learn of the golden trace.
+        torch::jit::Module copy = module_.deepcopy();
+        torch::jit::Method method = copy.get_method("decide");
         for (int i = 0; i < WARM_UP; ++i) {
-            const auto found = decide(trace.data()).embedding;
+            const auto found = decide(method, trace.data(), "").embedding;
+            copy.run_method("learn", tensor(trace.data()), true, 0);
+            copy.run_method("stop", tensor(trace.data()), 0);
             for (std::size_t j = 0; j < width; ++j) {
                 const double want = std::strtod(expected[j].c_str(), nullptr);
                 if (!(std::abs(found.at(j) - want) <= TOLERANCE * (1.0 + std::abs(want)))) {

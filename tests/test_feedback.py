@@ -1,0 +1,268 @@
+"""What becomes of parts: silence, confirmation, late stops, safe mode, parts that come twice, the certificate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, Source
+from dengine.errors import ReportError, TraceError
+from dengine.folds import content_hash, fold_of, part_hash
+from dengine.store import MemoryStore
+
+LOCAL = Policy(alpha=0.1, lower_bound=0.9)
+POOLED = replace(LOCAL, guarantee="pooled")
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40)
+
+
+def make(policy: Policy, **options) -> DataEngine:
+    return DataEngine(recipe=replace(RECIPE, policy=policy), replaying=True, **options)
+
+
+def play(engine: DataEngine, data: Dataset, first: int = 0, last: int | None = None, **options) -> list:
+    order = np.arange(len(data))[first:last]
+    return list(engine.run(ReplayCell(data, order, **options), len(order)))
+
+
+def evidence(cycle) -> tuple:
+    d = cycle.decision
+    counted = d.n_success, d.n_failure
+    return (d.action, d.predicted, d.lower, d.upper, *counted, d.embedding, d.model_version, d.reason, cycle.safe_mode)
+
+
+@pytest.fixture(scope="module")
+def stream(make_data) -> Dataset:
+    return make_data(500, samples=60, seed=3)
+
+
+def accepted(engine: DataEngine, data: Dataset) -> list:
+    """Decisions on the good traces of a stream, until one is accepted."""
+    for x in data.X[data.y == 1]:
+        decision = engine.decide(x)
+        if decision.action is Action.ACCEPT:
+            return [decision, x]
+        if decision.action is Action.VERIFY:
+            engine.report(decision.id, True)
+    raise AssertionError("nothing was accepted")
+
+
+# ---------------------------------------------------------------------------------------------- silence
+
+
+def test_silence_until_the_next_decision_confirms_a_part_where_all_stops_are_known(stream: Dataset) -> None:
+    engine = make(replace(LOCAL, stops="all"))
+    play(engine, stream, 0, 200)
+    decision, _ = accepted(engine, stream)
+    engine.flush()
+    assert engine.store.get_decision(decision.id).source is None  # nothing is known of it yet
+    engine.decide(stream.X[0])
+    engine.flush()
+    assert engine.store.get_decision(decision.id).source is Source.CONFIRMED
+
+
+def test_silence_says_nothing_by_default(stream: Dataset) -> None:
+    engine = make(LOCAL)
+    play(engine, stream)
+    assert engine.store.status()["sources"]["confirmed"] == 0
+    assert engine.store.outcomes().accepted > 100
+
+
+def test_confirmed_parts_set_off_retrains_though_nothing_is_reported(stream: Dataset) -> None:
+    engine = make(replace(LOCAL, stops="all"))
+    cycles = play(engine, stream)
+    assert sum(c.retrain is not None for c in cycles if c.decision.action is Action.ACCEPT) >= 2
+
+
+def test_a_stop_reported_in_time_is_a_stop_and_no_confirmation(stream: Dataset) -> None:
+    engine = make(replace(LOCAL, stops="all"))
+    play(engine, stream, 0, 200)
+    decision, _ = accepted(engine, stream)
+    engine.report(decision.id, False)
+    engine.decide(stream.X[0])
+    engine.flush()
+    assert engine.store.get_decision(decision.id).source is Source.STOP
+
+
+def test_a_stop_that_comes_late_is_kept_and_the_rule_is_told_what_really_happened(stream: Dataset, tmp_path: Path) -> None:
+    engine = make(replace(POOLED, stops="all"), store=str(tmp_path / "late.db"))
+    play(engine, stream, 0, 300)
+    decision, _ = accepted(engine, stream)
+    engine.decide(stream.X[0])  # takes it for confirmed
+    engine.report(decision.id, False)
+    assert engine.store.get_decision(decision.id).source is Source.STOP
+    rule = {name: value.clone() for name, value in engine.model.rule.state_dict().items()}
+    engine.close()
+    with DataEngine.open(tmp_path / "late.db", replaying=True) as again:
+        for name, value in again.model.rule.state_dict().items():
+            np.testing.assert_array_equal(value.numpy(), rule[name].numpy(), err_msg=name)
+
+
+def test_a_stop_on_a_part_whose_confirmation_is_stored_is_refused(stream: Dataset) -> None:
+    engine = make(replace(LOCAL, stops="all"))
+    play(engine, stream, 0, 200)
+    decision, _ = accepted(engine, stream)
+    engine.decide(stream.X[0])
+    engine.flush()
+    with pytest.raises(ReportError, match="confirmed"):
+        engine.report(decision.id, False)
+
+
+def test_a_thousand_accepted_parts_lose_no_confirmation(make_data) -> None:
+    data = make_data(1200, samples=40, seed=5, failures=0.1)
+    engine = make(replace(LOCAL, stops="all"))
+    cycles = play(engine, data)
+    n_accepted = sum(c.decision.action is Action.ACCEPT for c in cycles)
+    outcomes = engine.store.outcomes()
+    open_now = cycles[-1].decision.action is Action.ACCEPT and cycles[-1].source is None
+    assert outcomes.stops + outcomes.confirmed == n_accepted - open_now
+
+
+# ---------------------------------------------------------------------------------------------- going on
+
+
+@pytest.mark.parametrize("stops", ["some", "all"])
+@pytest.mark.parametrize("guarantee", ["local", "pooled"])
+def test_an_engine_opened_again_decides_and_counts_on_as_if_it_had_not_stopped(
+    stream: Dataset, tmp_path: Path, guarantee: str, stops: str
+) -> None:
+    policy = replace(LOCAL, guarantee=guarantee, stops=stops, audit_rate=0.1)
+    whole = [evidence(c) for c in play(make(policy), stream)]
+    url = str(tmp_path / "parted.db")
+    parted = []
+    for first in range(0, 500, 125):
+        with DataEngine.open_or_create(url, recipe=replace(RECIPE, policy=policy), replaying=True) as engine:
+            parted += [evidence(c) for c in play(engine, stream, first, first + 125)]
+    assert parted == whole
+
+
+def test_a_killed_engine_confirms_after_it_was_opened_what_had_gone_on(stream: Dataset, tmp_path: Path) -> None:
+    url = str(tmp_path / "killed.db")
+    engine = make(replace(LOCAL, stops="all"), store=url)
+    play(engine, stream, 0, 200)
+    decision, _ = accepted(engine, stream)
+    engine.decide(stream.X[0], wait=True)
+    engine.store.close()  # the confirmation was still in memory
+    with DataEngine.open(url, replaying=True) as again:
+        again.decide(stream.X[1])
+        again.flush()
+        assert again.store.get_decision(decision.id).source is Source.CONFIRMED
+
+
+# ---------------------------------------------------------------------------------------------- safe mode
+
+
+def collapse(stream: Dataset, policy: Policy) -> tuple[DataEngine, list, list]:
+    """An engine that learned a stream, and then one in which what was good is bad."""
+    heard: list[str] = []
+    engine = make(policy, on_safe_mode=heard.append)
+    play(engine, stream)
+    order = np.flatnonzero(stream.y == 1)[:60]
+    spoiled = Dataset(stream.X[order] + np.float32(0.01), np.zeros(60, np.int8))
+    return engine, play(engine, spoiled), heard
+
+
+@pytest.mark.parametrize("guarantee", ["local", "pooled"])
+def test_safe_mode_begins_with_a_recorded_reason_a_call_and_a_mark_on_every_cycle(stream: Dataset, guarantee: str) -> None:
+    engine, cycles, heard = collapse(stream, replace(LOCAL, guarantee=guarantee, stops="all"))
+    reason = "accepted parts failed more often than the tolerance"
+    assert heard == [reason] == [e.text for e in engine.store.events()]
+    assert engine.safe_mode == reason == cycles[-1].safe_mode
+    first = next(i for i, c in enumerate(cycles) if c.safe_mode)
+    assert sum(c.decision.action is Action.ACCEPT for c in cycles) <= 7
+    assert {c.decision.action for c in cycles[first + 1 :]} == {Action.VERIFY}
+    assert Reason.SAFE_MODE in {c.decision.reason for c in cycles[first + 1 :]}
+
+
+def test_safe_mode_ends_when_fresh_evidence_keeps_the_tolerance(stream: Dataset, make_data) -> None:
+    engine, _, heard = collapse(stream, replace(POOLED, stops="all"))
+    play(engine, make_data(400, samples=60, seed=9))
+    assert heard[-1] == ""
+    assert engine.safe_mode == ""
+    assert engine.store.events()[-1].text.startswith("ended")
+
+
+# ---------------------------------------------------------------------------------------------- parts
+
+
+def test_the_part_hash_is_fnv_1a() -> None:
+    for text, known in (("", 0xCBF29CE484222325), ("a", 0xAF63DC4C8601EC8C), ("foobar", 0x85944171F73967E8)):
+        assert part_hash(text) % 2**64 == known  # the vectors of its authors' reference
+
+
+def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset) -> None:
+    store = MemoryStore()
+    engine = make(LOCAL, store=store)
+    for x in stream.X[:10]:
+        engine.report(engine.decide(x, part="A-17").id, True)
+    hashes = store.labelled().hashes
+    assert set(hashes.tolist()) == {part_hash("A-17")} != set(content_hash(stream.X[:10]).tolist())
+    assert len(set(fold_of(hashes, 5).tolist())) == 1
+
+
+def test_a_part_that_comes_often_has_one_vote_and_none_on_itself(stream: Dataset) -> None:
+    engine = make(LOCAL)
+    play(engine, stream, 0, 200)
+    x, rng = stream.X[np.flatnonzero(stream.y == 1)[0]], np.random.default_rng(0)
+    near = lambda: x + rng.normal(0, 0.01, x.shape).astype(np.float32)  # noqa: E731
+    before = engine.decide(near(), part="other")
+    for _ in range(30):
+        engine.report(engine.store.get_decision(_verified(engine, near(), "often")).id, True)
+    engine.retrain()
+    counted = engine.decide(near(), part="other")
+    itself = engine.decide(near(), part="often")
+    assert counted.n_success == itself.n_success + 1
+    assert counted.n_success <= before.n_success + 1 + 8  # what the new embedding moves; not thirty
+
+
+def _verified(engine: DataEngine, x: np.ndarray, part: str) -> str:
+    """The id of a decision that can be reported."""
+    return engine.decide(x, part=part).id
+
+
+@pytest.mark.parametrize("part", ["", 1.5, True, b"7", ["7"]])
+def test_what_is_no_number_of_a_part_is_refused(stream: Dataset, part: object) -> None:
+    engine = make(LOCAL)
+    with pytest.raises(TraceError, match="part's number"):
+        engine.decide(stream.X[0], part=part)
+
+
+def test_a_number_and_its_text_are_one_part(stream: Dataset) -> None:
+    engine = make(LOCAL)
+    assert engine.decide(stream.X[0], part=17).part == engine.decide(stream.X[1], part="17").part == "17"
+
+
+def test_repeats_that_nobody_names_are_noticed_and_named_ones_are_not(make_data) -> None:
+    base, rng = make_data(60, samples=60, seed=4, noise=0.1), np.random.default_rng(0)
+    X = np.repeat(base.X, 5, 0)
+    X = (X + rng.normal(0, 0.01, X.shape)).astype(np.float32)
+    y, part = np.repeat(base.y, 5), np.repeat(np.arange(60).astype(str), 5)
+    order = rng.permutation(300)
+    for parts, said in ((None, True), (part[order], False)):
+        engine = make(Policy(alpha=0.01, lower_bound=0.99))  # that verifies them all
+        cycles = play(engine, Dataset(X[order], y[order], part=parts))
+        last = [c.retrain for c in cycles if c.retrain is not None][-1]
+        assert ("give their numbers" in last.reason) is said
+
+
+# ---------------------------------------------------------------------------------------------- certificate
+
+
+def test_the_certificate_counts_what_really_happened(stream: Dataset) -> None:
+    engine = make(replace(POOLED, stops="all"))
+    cycles = play(engine, stream)
+    bad = sum(c.source is Source.STOP for c in cycles)
+    certificate = engine.certificate()
+    n_accepted = sum(c.decision.action is Action.ACCEPT for c in cycles)
+    assert n_accepted - 1 <= certificate.accepted.n <= n_accepted
+    assert certificate.accepted.n_bad == bad
+    assert bad / n_accepted <= certificate.accepted.upper < 0.1
+    assert certificate.rejected.upper == 1.0  # nobody looked
+
+
+def test_without_stops_or_audits_the_certificate_says_that_it_knows_nothing(stream: Dataset) -> None:
+    engine = make(LOCAL)
+    play(engine, stream)
+    certificate = engine.certificate()
+    assert certificate.accepted.upper == 1.0
+    assert "audit_rate" in certificate.sentence
