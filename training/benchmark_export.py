@@ -3,8 +3,9 @@
     python training/benchmark_export.py --data insertion --reducer conv --cell build/cpp/dengine_cell --out out/
 
 Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
-parity over every trace of the data set and random ones, bad ones and audits among them; damaged files, each of which
-must be refused. Ends with exit code 1 where a decision differs or a damaged file is not refused.
+parity over every trace of the data set and random ones, bad ones and audits among them; parity while both learn from
+labels, stops and silence, under the pooled guarantee; damaged files, each of which must be refused. Ends with exit code 1
+where a decision differs or a damaged file is not refused.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,10 @@ class Finding:
     target: str = ""
 
 
-def train(data: Dataset, recipe: Recipe, retrains: int) -> DataEngine:
+def train(data: Dataset, recipe: Recipe, retrains: int, **policy: Any) -> DataEngine:
     """An engine that has every trace of a data set as a reference, and audits."""
     store = MemoryStore()
-    import_labelled(store, data, recipe.with_policy(audit_rate=AUDIT_RATE))
+    import_labelled(store, data, recipe.with_policy(audit_rate=AUDIT_RATE, **policy))
     engine = DataEngine.open(store)
     train_until_done(engine, retrains)
     return engine
@@ -102,7 +103,12 @@ def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", ""))
 
 def ask_cell(program: Path, file: Path, X: np.ndarray, expected: list[Any]) -> tuple[int, np.ndarray]:
     """Decisions of the C++ program that differ, and the microseconds of each call."""
-    done = subprocess.run([program, file, "--binary"], input=X.tobytes(), capture_output=True, check=True)
+    return ask([program, file, "--binary"], X.tobytes(), expected)
+
+
+def ask(command: list[Any], stdin: bytes, expected: list[Any]) -> tuple[int, np.ndarray]:
+    """`ask_cell`, by any command."""
+    done = subprocess.run(command, input=stdin, capture_output=True, check=True)
     lines = [line.split(",") for line in done.stdout.decode().splitlines()]
     wrong = sum(
         (w[0], w[1], int(w[4]), int(w[5])) != (d.action, d.reason, d.n_success, d.n_failure)
@@ -111,6 +117,41 @@ def ask_cell(program: Path, file: Path, X: np.ndarray, expected: list[Any]) -> t
         for w, d in zip(lines, expected, strict=True)
     )
     return wrong, np.array([float(w[-1]) for w in lines])
+
+
+def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path, cell: Path | None) -> list[Finding]:
+    """Engine and file go on from one retrain on half the data set, through the other half and random traces.
+
+    What was verified is told, an accepted part only where it was bad; a part in four comes again.
+    """
+    half, rng = len(data) // 2, np.random.default_rng(3)
+    first = replace(data, X=data.X[:half], y=data.y[:half], cause=None, part=None)
+    once = recipe.with_settings(retrain_every=1_000_000)  # the file knows nothing of the engine's next retrain
+    engine = train(first, once, retrains, guarantee="pooled", stops="all", alpha=0.1, lower_bound=0.9)
+    file = export_torchscript(engine, folder / "learning.ts")
+    exported = load_exported(file)
+    other = random_traces(data, half, rng)
+    X, y = np.concatenate([as_traces(data.X[half:]), other]), np.concatenate([data.y[half:], rng.integers(2, size=half)])
+    lines, decisions, found = [], [], []
+    for x, success in zip(track(X, description="learning"), y, strict=True):
+        part = f"P{rng.integers(2 * len(X))}"
+        decisions.append(engine.decide(x, part))
+        found.append(exported.decide(x, part))
+        told = decisions[-1].action is Action.VERIFY or (decisions[-1].action is Action.ACCEPT and not success)
+        if told:
+            engine.report(decisions[-1].id, bool(success))
+            exported.learn(x, bool(success), part)
+        lines.append(f"{part},{int(success) if told else ''}," + ",".join(f"{value:.9g}" for value in x.ravel()))
+    rows = [
+        Finding("decisions compared while learning", len(X), ""),
+        Finding("of them accepted", sum(d.action is Action.ACCEPT for d in decisions), ""),
+        Finding("Python differs while learning in", differing(found, decisions), "", "0"),
+    ]
+    if cell is not None:
+        command = [cell, file, "--parts", "--learn", "--journal", folder / "cell.csv"]
+        wrong, _ = ask(command, "\n".join(lines).encode() + b"\n", decisions)
+        rows.append(Finding("C++ differs while learning in", wrong, "", "0"))
+    return rows
 
 
 def damage(content: bytes, rng: np.random.Generator) -> bytes:
@@ -171,8 +212,10 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
         model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
-        rows.append(Finding("onnxruntime differs in", differing(runtime.decide_many(X), model.decide_many(X)), ""))
+        new = X[len(known) :]  # a reference that is asked about itself has a vote in ONNX
+        rows.append(Finding("onnxruntime differs in", differing(runtime.decide_many(new), model.decide_many(new)), ""))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
+    rows += compare_learning(data, Recipe.load(args.reducer), args.retrains, folder, args.cell)
     not_refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
     return [*rows, Finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
 

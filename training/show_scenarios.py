@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import DataEngine, Recipe, SimulatedCell
-from dengine.cells.simulation.parameters import RATE_HZ, CellParameters
-from dengine.cells.simulation.scenarios import SCENARIOS, find_scenario
+from dengine.cells.simulation.parameters import RATE_HZ
+from dengine.cells.simulation.scenarios import SCENARIOS, first_change
 from dengine.experiments.live import RunLog, watch
 from dengine.experiments.look import BAD, GOOD, LIMIT, SMALL, draw_errors, draw_verified, plain, save
 
@@ -43,12 +43,6 @@ def run(scenario: str, cycles: int, recipe: Recipe, seed: int) -> Run:
     engine = DataEngine.from_recipe(recipe, seed=seed, replaying=True)
     log = watch(engine, cell, cycles, on_cycle=lambda cycle: traces.append(cell.last.trace))
     return Run(scenario, np.stack(traces), log)
-
-
-def first_change(scenario: str, cycles: int) -> int | None:
-    """The number, from 1, of the first cycle that is not as at the beginning; None where nothing changes."""
-    as_usual, change = CellParameters(), find_scenario(scenario)
-    return next((i + 1 for i in range(cycles) if change(as_usual, i, cycles) != as_usual), None)
 
 
 def draw_force(axes: Axes, one: Run) -> None:

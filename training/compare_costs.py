@@ -1,0 +1,108 @@
+"""What honesty, novelty, audits, parts and the guarantee each cost: certain decisions of the same shuffled runs.
+
+    python training/compare_costs.py --data insertion --seeds 100:130
+    python training/compare_costs.py --data screw_driving.npz --samples 400 --part workpiece --seeds 100:130
+
+All with conv, and every stop known (`stops="all"`). "Dishonest" trains every head on all labels, its own fold's too: what
+honest counting costs is what that seems to gain. Writes costs.csv to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from joblib import Parallel, delayed
+
+from dengine import Dataset, Policy, Recipe, load_dataset, replay
+from dengine.reducers import ConvReducer
+from dengine.reducers.logistic import CrossFittedScores
+from dengine.reducers.scored import FeatureEmbedding
+
+
+class DishonestScores(CrossFittedScores):
+    """Every head is trained on every fold's labels, which are then counted in it: for comparison only."""
+
+    def _head(self, k: int, g: torch.Tensor, y: torch.Tensor, outside: torch.Tensor, l2: float) -> Any:
+        return super()._head(k, g, y, torch.ones_like(outside), l2)
+
+
+class DishonestReducer(ConvReducer):
+    """conv with such heads."""
+
+    def _build(self, channels: int, samples: int) -> None:
+        features = self.make_features(channels, samples)
+        heads = DishonestScores(len(features.gain), self.folds, self.n_components)
+        self.net_ = FeatureEmbedding(features, heads).eval()
+
+
+def rows(data: Dataset, alpha: float, lower_bound: float) -> dict[str, tuple[Dataset, Recipe]]:
+    """The configurations, by name: what is played, and by which recipe."""
+    plain = replace(data, part=None)
+    paper = Policy(alpha, lower_bound)
+    known = replace(paper, stops="all")
+    pooled = replace(known, guarantee="pooled")
+    bare = replace(Recipe.load("conv"), novelty=0.0)
+    full = Recipe.load("conv")
+    found = {
+        "the paper's rule, stops alone known": (plain, replace(bare, policy=paper)),
+        "silence confirms": (plain, replace(bare, policy=known)),
+        "the same, dishonest": (plain, replace(bare, reducer=DishonestReducer(), policy=known)),
+        "novelty": (plain, replace(full, policy=known)),
+        "novelty, pooled": (plain, replace(full, policy=pooled)),
+        "novelty, pooled, 2 % audits": (plain, replace(full, policy=replace(pooled, audit_rate=0.02))),
+        "novelty, pooled, 10 % audits": (plain, replace(full, policy=replace(pooled, audit_rate=0.1))),
+    }
+    if data.part is not None:
+        found |= {
+            "novelty, parts named": (data, replace(full, policy=known)),
+            "novelty, pooled, parts named": (data, replace(full, policy=pooled)),
+        }
+    return found
+
+
+def play(name: str, data: Dataset, recipe: Recipe, seed: int, cycles: int) -> dict[str, Any]:
+    """One replay as a row."""
+    return replay(data, recipe, seed=seed, cycles=cycles).summary() | {"row": name, "seed": seed}
+
+
+def main() -> None:
+    """Parse, play, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser.add_argument("--part", default="part", help="name of the array of parts' numbers in the file")
+    parser.add_argument("--alpha", type=float, default=0.1)
+    parser.add_argument("--lower-bound", type=float, default=0.9)
+    parser.add_argument("--seeds", default="100:130", help="first:last, the last one left out; a replay each")
+    parser.add_argument("--cycles", type=int, default=1503)
+    parser.add_argument("--n-jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    args = parser.parse_args()
+    data = load_dataset(args.data, args.samples, args.part)
+    cycles = min(args.cycles, len(data))
+    tasks = [
+        (name, played, recipe, seed, cycles)
+        for name, (played, recipe) in rows(data, args.alpha, args.lower_bound).items()
+        for seed in range(*map(int, args.seeds.split(":")))
+    ]
+    table = pd.DataFrame(Parallel(n_jobs=args.n_jobs)(delayed(play)(*task) for task in tasks))
+    args.out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(args.out / "costs.csv", index=False)
+    sums = table.groupby("row", sort=False)[
+        ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel"]
+    ]
+    shown = sums.mean()
+    shown["bad of accepted"] = 100.0 * shown["false_positive"] / shown["accepted"]
+    shown["good of rejected"] = 100.0 * shown["false_negative"] / shown["rejected"]
+    level = f"({args.alpha:g}, {100 * args.lower_bound:g} %)"
+    print(f"{data.name}, {level}, means of {table.seed.nunique()} runs of {cycles} cycles")
+    print(shown.round(1).drop(columns=["false_positive", "false_negative"]).to_string())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""The count-only statistic: are the labels in a ball as many successes as chance says, where the labels are noise?
+
+    >>> mean_square(count_noise(RECIPES["conv"], seed) for seed in range(8))      # honest: about 1
+
+Half of the traces are easy, always failures and far away, so that heads have something to learn and pass their gate. The
+others' labels are noise of rate p. A query among them has n such neighbours, n_s of them successes, hence z = (n_s - n p) /
+sqrt(n p (1 - p)). Where no label had a say in who became whose neighbour, z^2 is 1 on average, whatever the encoder, the
+radius and the rule; an encoder that saw the labels it is counted with gathers like with like, and z^2 grows. No bound, no
+tolerance and no rare event is in it: it sees dishonest counting long before decisions go wrong.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from dengine import ModelPrediction, Recipe
+
+FEWEST = 10  # neighbours: with fewer, z is far from normal
+RETRAINS = (100, 200, 400)  # labelled traces at each
+QUERIES = 100
+
+
+def squared_deviations(n_success: NDArray[np.int64], n: NDArray[np.int64], p: float) -> NDArray[np.float64]:
+    """z^2 of each ball with at least `FEWEST` labels of noise, n_success of n, drawn at rate p."""
+    enough = n >= FEWEST
+    n, n_success = n[enough], n_success[enough]
+    return np.asarray((n_success - n * p) ** 2 / (n * p * (1.0 - p)))
+
+
+@dataclass(frozen=True)
+class Noise:
+    """X (n, T) float32, y (n,), and easy (n,) bool: not noise, always failures, and far from the others."""
+
+    X: NDArray[np.float32]
+    y: NDArray[np.int8]
+    easy: NDArray[np.bool_]
+    p: float
+
+
+def white_noise(n: int, p: float, seed: int, samples: int = 60) -> Noise:
+    """Traces of white noise, so that an encoder has everything to learn by heart."""
+    rng = np.random.default_rng([seed, 7])
+    easy = rng.random(n) < 0.5
+    X = rng.normal(20.0, 3.0, (n, samples))
+    X[easy] -= 40.0
+    return Noise(X.astype(np.float32), np.where(easy, 0, rng.random(n) < p).astype(np.int8), easy, p)
+
+
+def relabelled(X: NDArray[np.float32], n: int, p: float, seed: int) -> Noise:
+    """N of these traces in random order; half of them turned upside down far below, the others with labels of noise."""
+    rng = np.random.default_rng([seed, 8])
+    some = X[rng.permutation(len(X))[:n]].copy()
+    easy = rng.random(n) < 0.5
+    some[easy] = -some[easy] - 3.0 * np.abs(X).max()
+    return Noise(some, np.where(easy, 0, rng.random(n) < p).astype(np.int8), easy, p)
+
+
+def count_noise(recipe: Recipe, noise: Noise, seed: int) -> NDArray[np.float64]:
+    """z^2 of the last `QUERIES` traces' balls after each of `RETRAINS`, each from the one before."""
+    model = ModelPrediction.from_recipe(replace(recipe, novelty=0.0), seed)
+    queries = noise.X[-QUERIES:][~noise.easy[-QUERIES:]]
+    found = []
+    for n in RETRAINS:
+        model = model.successor().train(noise.X[:n], noise.y[:n])
+        n_success, n_failure = model.count(queries)
+        found.append(squared_deviations(n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p))
+    return np.concatenate(found)
+
+
+def _easy(model: ModelPrediction, easy: NDArray[np.bool_], queries: NDArray[np.float32]) -> NDArray[np.int64]:
+    """How many of each query's neighbours are easy: the same balls, counted with other labels."""
+    labels = model.index.ring.labels[1, : len(easy)]
+    kept = labels.clone()
+    labels.copy_(torch.from_numpy(easy.astype(np.float32)))
+    counted, _ = model.count(queries)
+    labels.copy_(kept)
+    return counted
+
+
+def mean_square(runs: Iterable[NDArray[np.float64]]) -> float:
+    """Mean z^2 of all balls; NaN where none was full enough."""
+    squares = np.concatenate(list(runs))
+    return float(squares.mean()) if len(squares) else float("nan")

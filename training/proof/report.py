@@ -1,0 +1,229 @@
+"""The proof's rows as a table a part: proof.csv, proof.md and proof.png."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from .replays import Case, broken
+
+if TYPE_CHECKING:
+    from .pieces import Piece, Row
+
+HEADS = {
+    "planted": (
+        "Planted truths: replays that broke the tolerance",
+        "A replay broke it where the true failure probability of what it accepted (the true success probability of what "
+        "it rejected), on average, exceeds 1 - LB. A guarantee may be broken in a share alpha of replays; the interval "
+        "is Clopper and Pearson's, 95 %, of that share.",
+    ),
+    "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
+    "counts": ("Count-only statistic", "Mean z^2 of the balls' counts under labels of noise; honest counting: 0.8 to 1.3."),
+    "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
+    "garbage": ("Garbage accepted", "Share accepted with the novelty gate, and without it; last, certain of clean parts."),
+    "collapse": (
+        "Collapse at cycle 800, over at 1100",
+        "Bad parts accepted in it; cycles until nothing was; cycles after it until half as much was accepted as before.",
+    ),
+}
+
+
+def clopper_pearson(k: int, n: int) -> tuple[float, float]:
+    """95 % interval of a share."""
+    low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    return low, float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a case: what was claimed of it and what came of it."""
+
+    claimed: bool
+    k: int
+    n: int
+    alpha: float
+
+    @property
+    def verdict(self) -> str:
+        """Of a guarantee: kept, or broken beyond sampling error; of others the same, in brackets: nobody promised it."""
+        low, _ = clopper_pearson(self.k, self.n)
+        word = "kept" if self.k / self.n <= self.alpha else "within error" if low <= self.alpha else "BROKEN"
+        return word if self.claimed else f"({word.lower()})"
+
+
+def replay_row(case: Case, rows: list[Row]) -> Row:
+    """One configuration of replays."""
+    out: Row = {"configuration": case.name, "alpha": case.alpha, "LB": case.lower_bound, "replays": len(rows)}
+    out |= {
+        "cycles": case.cycles,
+        "certain per 1503": 1503 / case.cycles * _mean(r["accepted"] + r["rejected"] for r in rows),
+    }
+    for verb, wrong, claimed in (
+        ("accepted", "accepted_failure", case.claims_accepts),
+        ("rejected", "rejected_success", case.claims_rejects),
+    ):
+        side = Side(claimed, broken(rows, wrong, case.tolerance), len(rows), case.alpha)
+        low, high = clopper_pearson(side.k, side.n)
+        out |= {verb: _mean(r[verb] for r in rows), f"{verb}, mean wrong": _mean(r[wrong] for r in rows)}
+        out |= {f"{verb}, broke": side.k / side.n, f"{verb}, low": low, f"{verb}, high": high}
+        out |= {f"{verb}, guarantee": claimed, f"{verb}, verdict": side.verdict}
+    return out
+
+
+def counts_row(settings: Row, rows: list[Row]) -> Row:
+    """Mean z^2 over all balls."""
+    balls = sum(r["balls"] for r in rows)
+    z2 = sum(r["sum_z2"] for r in rows) / max(1, balls)
+    return {
+        "configuration": f"{settings['reducer']}, {settings['data']}",
+        "runs": len(rows),
+        "balls": balls,
+        "mean z^2": z2,
+    }
+
+
+def certificate_row(settings: Row, rows: list[Row]) -> Row:
+    """Share of streams in which the bound was ever wrong."""
+    n, k = sum(r["streams"] for r in rows), sum(r["wrong"] for r in rows)
+    low, high = clopper_pearson(k, n)
+    name = f"{settings['stream']}, propensity {settings['propensity']:g}"
+    side = Side(True, k, n, settings["alpha"])
+    return {"configuration": name, "streams": n, "ever wrong": k / n, "low": low, "high": high, "verdict": side.verdict}
+
+
+def collapse_row(settings: Row, rows: list[Row]) -> Row:
+    """Means, and in how many runs either never happened."""
+    never = {f"never {key}": sum(np.isnan(r[f"{key}_after"]) for r in rows) for key in ("quiet", "back")}
+    keys = ("usual", "bad_accepts", "quiet_after", "back_after")
+    worst = {"worst bad_accepts": max(r["bad_accepts"] for r in rows)}
+    means = {key: _mean(r[key] for r in rows) for key in keys}
+    return (
+        {"configuration": f"{settings['guarantee']}, stops {settings['stops']}", "runs": len(rows)} | means | worst | never
+    )
+
+
+def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
+    """A row a kind."""
+    kinds = dict.fromkeys(r["kind"] for r in rows)
+    of: Callable[[str, str], float] = lambda kind, key: _mean(r[key] for r in rows if r["kind"] == kind)  # noqa: E731
+    return [
+        {"configuration": f"{settings['reducer']}, {kind}", "with the gate": of(kind, "gated"), "without": of(kind, "open")}
+        for kind in kinds
+    ]
+
+
+def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
+    """Part -> a row a configuration."""
+    gathered: dict[tuple[str, str], tuple[Row, list[Row]]] = {}
+    for piece, rows in done:
+        gathered.setdefault((piece.kind, piece.name), (piece.settings, []))[1].extend(rows)
+    found: dict[str, list[Row]] = {}
+    for (kind, _), (settings, rows) in gathered.items():
+        made: Any
+        if kind in ("planted", "noise"):
+            made = [replay_row(Case(**settings), rows)]
+        else:
+            made = {
+                "counts": counts_row,
+                "certificate": certificate_row,
+                "collapse": collapse_row,
+                "garbage": garbage_rows,
+            }[kind](settings, rows)
+        found.setdefault(kind, []).extend(made if isinstance(made, list) else [made])
+    return {kind: pd.DataFrame(rows) for kind, rows in found.items()}
+
+
+def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
+    """Write the three files; returns what they come to, in a few lines."""
+    docs.mkdir(parents=True, exist_ok=True)
+    found = tables(done)
+    whole = pd.concat([frame.assign(part=kind) for kind, frame in found.items()], ignore_index=True)
+    whole.to_csv(docs / "proof.csv", index=False, float_format="%.6g")
+    (docs / "proof.md").write_text(markdown(found), encoding="utf-8")
+    replays = [found[kind] for kind in ("planted", "noise") if kind in found]
+    if not replays:
+        return f"Written to {docs}."
+    frame = pd.concat(replays, ignore_index=True)
+    picture(frame, docs / "proof.png")
+    return f"{summary(frame)}\nWritten to {docs}."
+
+
+def summary(frame: pd.DataFrame) -> str:
+    """What became of everything that is called a guarantee."""
+    lines = []
+    for verb in ("accepted", "rejected"):
+        claimed = frame[frame[f"{verb}, guarantee"]]
+        bad = claimed[claimed[f"{verb}, verdict"] == "BROKEN"]
+        names = "; ".join(f"{r['configuration']} {r[f'{verb}, broke']:.0%}" for _, r in bad.iterrows()) or "none"
+        lines.append(f"Guarantees on {verb} parts: {len(claimed)}, broken beyond sampling error: {names}.")
+    return "\n".join(lines)
+
+
+def markdown(found: dict[str, pd.DataFrame]) -> str:
+    """The tables, each under its heading."""
+    blocks = ["# The proof", "`make proof` writes this page. Verdicts in brackets are of rows that promise nothing."]
+    for kind in (k for k in HEADS if k in found):
+        title, text = HEADS[kind]
+        blocks += [f"## {title}", text, _table(_short(found[kind]) if kind in ("planted", "noise") else found[kind])]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _short(frame: pd.DataFrame) -> pd.DataFrame:
+    short = frame[["configuration", "alpha", "LB", "replays", "certain per 1503"]].copy()
+    for verb in ("accepted", "rejected"):
+        short[verb] = frame[verb]
+        short[f"{verb}: mean wrong"] = frame[f"{verb}, mean wrong"]
+        limits = zip(frame[f"{verb}, broke"], frame[f"{verb}, low"], frame[f"{verb}, high"], strict=True)
+        short[f"{verb}: broke"] = [f"{b:.1%} ({low:.1%} to {high:.1%})" for b, low, high in limits]
+        short[f"{verb}: verdict"] = frame[f"{verb}, verdict"]
+    return short
+
+
+def _table(frame: pd.DataFrame) -> str:
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return "" if np.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+        return str(value)
+
+    rows = [
+        list(frame.columns),
+        ["---"] * len(frame.columns),
+        *([cell(v) for v in row] for row in frame.to_numpy(dtype=object)),
+    ]
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+
+
+def picture(frame: pd.DataFrame, path: Path) -> None:
+    """The share of replays that broke the tolerance, with its interval; alpha is a tick."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(11, 1.2 + 0.2 * len(frame)), sharey=True, layout="constrained")
+    rows = np.arange(len(frame))
+    for axis, verb in zip(axes, ("accepted", "rejected"), strict=True):
+        share, low, high = (frame[f"{verb}, {key}"].to_numpy(float) for key in ("broke", "low", "high"))
+        for claimed, colour, label in ((True, "tab:blue", "called a guarantee"), (False, "0.6", "promises nothing")):
+            own = frame[f"{verb}, guarantee"].to_numpy(bool) == claimed
+            whiskers = np.clip([share - low, high - share], 0.0, None)[:, own]
+            axis.errorbar(share[own], rows[own], xerr=whiskers, fmt="o", ms=4, color=colour, label=label)
+        axis.plot(frame["alpha"], rows, "|", color="tab:red", ms=9, mew=1.5, label="alpha")
+        axis.set(xlabel=f"share of replays in which the {verb} broke the tolerance", xlim=(-0.02, 1.02))
+        axis.grid(axis="x", alpha=0.3)
+    axes[0].set_yticks(rows, frame["configuration"], fontsize=7)
+    axes[0].invert_yaxis()
+    axes[1].legend(loc="lower right")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def _mean(values: Iterable[float]) -> float:
+    known = [v for v in values if not np.isnan(v)]
+    return float(np.mean(known)) if known else float("nan")

@@ -1,0 +1,80 @@
+"""The proof: does what is called a guarantee hold, where the truth is known? Resumable: finished pieces are kept.
+
+    python training/prove.py --out out/proof --repeats 200
+    python training/prove.py --out out/proof --repeats 4 --only planted,noise --jobs 2 --docs out/proof
+
+Writes proof.csv (a row a configuration), proof.md (the tables) and proof.png into the folder that `--docs` names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+from pathlib import Path
+
+from proof.certificate import PROPENSITIES, STREAMS
+from proof.pieces import Piece, Row, finish
+from proof.replays import Case, noise_cases, planted_cases
+from proof.report import write_report
+
+CHUNK = 10  # seeds a piece
+PARTS = ("counts", "certificate", "planted", "noise", "collapse", "garbage")
+
+
+def seeds_in_pieces(kind: str, settings: Row, repeats: int, chunk: int = CHUNK) -> list[Piece]:
+    """The seeds 0 .. repeats - 1 of one configuration."""
+    return [Piece(kind, settings, tuple(range(a, min(a + chunk, repeats)))) for a in range(0, repeats, chunk)]
+
+
+def _cases(kind: str, cases: list[Case], repeats: int) -> list[Piece]:
+    pieces = []
+    for case in cases:
+        chunk = {"umap": 1, "rocket": 2}.get(case.reducer, CHUNK)
+        pieces += seeds_in_pieces(kind, case.plain(), max(2, round(case.share * repeats)), chunk)
+    return pieces
+
+
+def pieces_of(part: str, repeats: int) -> list[Piece]:
+    """All pieces of one part."""
+    if part == "noise":
+        return _cases(part, noise_cases(), repeats)
+    if part == "planted":
+        return _cases(part, planted_cases(), repeats)
+    pieces: list[Piece] = []
+    if part == "counts":
+        for reducer in ("conv", "pca", "rocket"):
+            for data in ("white noise", "insertion"):
+                pieces += seeds_in_pieces(part, {"reducer": reducer, "data": data, "p": 0.8}, max(2, repeats // 10))
+    if part == "certificate":
+        for stream in STREAMS:
+            for propensity in PROPENSITIES:
+                about = {"stream": stream, "propensity": propensity, "alpha": 0.1}
+                pieces += seeds_in_pieces(part, about, max(2, repeats // 10))
+    if part == "garbage":
+        for reducer in ("conv", "pca", "rocket", "umap"):
+            pieces += seeds_in_pieces(part, {"reducer": reducer}, 1 if reducer == "umap" else max(1, repeats // 40), 1)
+    if part == "collapse":
+        for guarantee in ("local", "pooled"):
+            for stops in ("some", "all"):
+                pieces += seeds_in_pieces(part, {"guarantee": guarantee, "stops": stops}, min(30, max(2, repeats // 4)), 5)
+    return pieces
+
+
+def main() -> None:
+    """Parse, finish every piece, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("out/proof"), help="folder for the finished pieces")
+    parser.add_argument(
+        "--docs", type=Path, help="folder for proof.csv, proof.md, proof.png; by default that of the pieces"
+    )
+    parser.add_argument("--repeats", type=int, default=200, help="replays of a main configuration; others have a share")
+    parser.add_argument("--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    args = parser.parse_args()
+    pieces = [piece for part in args.only.split(",") for piece in pieces_of(part, args.repeats)]
+    done = finish(pieces, args.out, args.jobs, functools.partial(print, flush=True))
+    print(write_report(done, args.docs or args.out))
+
+
+if __name__ == "__main__":
+    main()
