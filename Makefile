@@ -53,7 +53,7 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/mypy
 
 proof: $(VENV)/.dev
-	DENGINE_PROOF_REPEATS=$(REPEATS) $(VENV)/bin/python -m pytest tests/statistical --numprocesses 2
+	OMP_NUM_THREADS=1 $(VENV)/bin/python training/prove.py --out $(OUT)/proof --docs docs --repeats $(REPEATS) --jobs 2
 
 # pip-audit may skip every package and still end well, so what it audited is counted. It gets names and plain versions: one
 # that is installed in editable form, or a build like 2.9.0+cpu, is not on PyPI, and --strict fails at what is not there.

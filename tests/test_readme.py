@@ -31,6 +31,8 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/check_noise.py": "--data screw_driving.npz --samples 100 --seeds 100:101",
     "dengine run --cell simulated": "--cycles 60",
     "python training/show_scenarios.py": "--cycles 12",
+    "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
+    "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv",
     "python training/benchmark_export.py": "--data screw_driving.npz --random 40 --calls 20 --damaged 5",
 }
 RUNS = 80  # of the recordings that stand in for the public ones

@@ -44,7 +44,7 @@ def pieces_of(part: str, repeats: int) -> list[Piece]:
     if part == "counts":
         for reducer in ("conv", "pca", "rocket"):
             for data in ("white noise", "insertion"):
-                pieces += seeds_in_pieces(part, {"reducer": reducer, "data": data, "p": 0.8}, max(2, repeats // 10))
+                pieces += seeds_in_pieces(part, {"reducer": reducer, "data": data, "p": 0.8}, max(2, repeats // 5))
     if part == "certificate":
         for stream in STREAMS:
             for propensity in PROPENSITIES:

@@ -17,6 +17,7 @@ from dengine.recipe import RECIPES
 from .truths import Stream, planted
 
 Row = dict[str, Any]
+MOVING = ("drifting", "jumping")
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,13 @@ class Case:
 
     @property
     def claims_accepts(self) -> bool:
-        """Whether the rows are called a guarantee."""
-        return self.guarantee == "pooled"
+        """Whether the rows are called a guarantee: not where the truth moves, for a level's past then is not its future."""
+        return self.guarantee == "pooled" and self.truth not in MOVING
 
     @property
     def claims_rejects(self) -> bool:
         """Rejected parts tell nothing of themselves: only audits do."""
-        return self.guarantee == "pooled" and self.audit_rate > 0.0
+        return self.claims_accepts and self.audit_rate > 0.0
 
     def recipe(self) -> Recipe:
         """The engine's."""

@@ -51,9 +51,9 @@ class Side:
 
     @property
     def verdict(self) -> str:
-        """Of a guarantee: kept, or broken beyond sampling error; of others the same, in brackets: nobody promised it."""
-        low, _ = clopper_pearson(self.k, self.n)
-        word = "kept" if self.k / self.n <= self.alpha else "within error" if low <= self.alpha else "BROKEN"
+        """Kept or BROKEN by the whole interval, or within error; in brackets where nothing was promised."""
+        low, high = clopper_pearson(self.k, self.n)
+        word = "BROKEN" if low > self.alpha else "kept" if high <= self.alpha else "within error"
         return word if self.claimed else f"({word.lower()})"
 
 

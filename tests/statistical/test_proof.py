@@ -1,0 +1,72 @@
+"""The long proof, `make proof`, in small: planted truths, garbage, a collapse, and going on after an interruption."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from proof.collapse import collapse
+from proof.garbage import garbage
+from proof.pieces import Piece, finish
+from proof.replays import Case, broken, judge
+from proof.report import write_report
+from proof.truths import TRUTHS, planted
+from scipy import stats
+
+SOFT = Case("soft", "soft", alpha=0.2, lower_bound=0.8, cycles=400)
+
+
+@pytest.mark.parametrize("truth", [*TRUTHS, "noise", "parts"])
+def test_planted_labels_come_as_often_as_their_truth_says(truth: str) -> None:
+    streams = [planted(truth, 500, 0.9, seed, rate=0.8) for seed in range(20)]
+    excess = np.array([stream.data.y.mean() - stream.p.mean() for stream in streams])
+    assert abs(excess.mean()) < 4.0 * excess.std() / np.sqrt(len(excess)) + 1e-12
+
+
+def test_a_mirrored_stream_swaps_good_and_bad() -> None:
+    stream = planted("step", 100, 0.9, 0)
+    np.testing.assert_array_equal(stream.mirrored().data.y, 1 - stream.data.y)
+    np.testing.assert_allclose(stream.mirrored().p, 1.0 - stream.p)
+
+
+def test_the_pooled_guarantee_accepts_and_keeps_the_tolerance(proof_repeats: int) -> None:
+    rows = [judge(SOFT, seed) for seed in range(proof_repeats)]
+    assert np.mean([row["accepted"] for row in rows]) > 30
+    k = broken(rows, "accepted_failure", SOFT.tolerance)
+    assert stats.binomtest(k, len(rows), SOFT.alpha, alternative="greater").pvalue > 1e-3
+    assert np.nanmean([row["accepted_failure"] for row in rows]) <= SOFT.tolerance
+
+
+def test_a_collapse_ends_accepting_soon() -> None:
+    row = collapse("pooled", "all", seed=0)
+    assert row["usual"] > 0.3
+    assert row["bad_accepts"] <= 15
+
+
+def test_the_gate_keeps_garbage_out_and_lets_parts_in() -> None:
+    rows = {row["kind"]: row for row in garbage("conv", seed=0)}
+    clean = rows.pop("clean, certain")
+    assert len(rows) >= 12
+    assert clean["open"] - clean["gated"] <= 0.05
+    assert all(row["gated"] <= row["open"] for row in rows.values())
+    for kind in ("white noise", "random walk", "another machine", "sine"):
+        assert rows[kind]["gated"] <= 0.05
+
+
+def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
+    case = Case("short", "moderate", reducer="pca", cycles=80).plain()
+    pieces = [Piece("planted", case, (0,)), Piece("planted", case, (1,))]
+    said: list[str] = []
+    first = finish(pieces[:1], tmp_path, 1, said.append)
+    times = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.json")}
+    both = finish(pieces, tmp_path, 1, said.append)
+    assert [_plain(rows) for _, rows in both[:1]] == [_plain(rows) for _, rows in first]
+    assert said[-2:][0].startswith("1 of 2 pieces are there already")
+    assert all(file.stat().st_mtime_ns == time for file, time in times.items())
+    text = write_report(both, tmp_path / "docs")
+    assert "Guarantees on accepted parts: 1" in text
+    assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md", "proof.png"}
+
+
+def _plain(rows: list[dict[str, Any]]) -> str:
+    return repr(rows)  # NaN is not equal to itself
