@@ -91,7 +91,10 @@ def as_part(part: Any) -> str | None:
         return None
     if isinstance(part, bool | float | np.floating) or not isinstance(part, str | int | np.integer) or part == "":
         raise TraceError(f"Expected a part's number, a text or a whole number, got {part!r}.")
-    return str(part)
+    text = str(part)
+    if "\0" in text or not text.isprintable():
+        raise TraceError(f"Expected a part's number of printable characters, got {text!r}.")
+    return text
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:

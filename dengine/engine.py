@@ -154,7 +154,7 @@ class DataEngine:
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
-        self._collect()
+        self._versions.collect()
         x, number = self._as_trace(trace), as_part(part)
         self._feedback.settle()
         item = self._put(self._maker.decide(x, number, self._versions.answering, self.version))
@@ -173,11 +173,6 @@ class DataEngine:
         self._feedback.decided(item)
         return item
 
-    def _collect(self, wait: bool = False) -> None:
-        if wait or self._versions.trained:  # a version is stored after all that its rule was told of
-            self._feedback.store_waiting()
-        self._versions.collect(wait)
-
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None = None, part: str | int | None = None
     ) -> RetrainReport | None:
@@ -188,7 +183,7 @@ class DataEngine:
         Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or a
         report on a rejected part.
         """
-        self._collect()
+        self._versions.collect()
         known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace, part)
         self._feedback.report(known, bool(success))
         return None if known.quarantined else self._retrain_if_due()
@@ -200,14 +195,10 @@ class DataEngine:
         return stored_decision(self._put(item))
 
     def _retrain_if_due(self) -> RetrainReport | None:
-        if self.new_labels < self.recipe.retrain_every:
-            return None
-        self._feedback.store_waiting()
-        return self._versions.start_retrain()
+        return self._versions.start_retrain() if self.new_labels >= self.recipe.retrain_every else None
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
-        self._feedback.store_waiting()
         return self._versions.retrain()
 
     @property
@@ -281,7 +272,8 @@ class DataEngine:
 
     def close(self) -> None:
         """Finish a retrain under way, write everything, and let the store go."""
-        self._collect(wait=True)
+        self._feedback.store_waiting()
+        self._versions.collect(wait=True)
         self.store.close()
 
     def __enter__(self) -> Self:

@@ -8,6 +8,7 @@ it is counted as silent, which is no success; the watch of the safe mode is told
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from .deciding import source_of
@@ -17,6 +18,7 @@ from .store.base import Store
 from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
 from .versions import ModelVersions, Point
 
+log = logging.getLogger("dengine")
 BATCH = 100  # confirmed parts that wait for a report, before a decision stores them
 
 
@@ -36,6 +38,7 @@ class Feedback:
         self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
         self._silent = 0
         self._mode = ""
+        versions.store_waiting = self.store_waiting
 
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
@@ -58,8 +61,8 @@ class Feedback:
         """The next trace comes: accepted parts of which nothing was heard went on."""
         if not self._went_on:
             return
-        went_on, self._went_on = self._went_on, {}
-        for known in went_on.values():
+        while self._went_on:
+            known = self._went_on.pop(next(iter(self._went_on)))
             if self.stops_all:
                 label, point = self._label(known, True, Source.CONFIRMED)
                 self._learn(known, label, point)
@@ -68,6 +71,7 @@ class Feedback:
                 self._silent += 1
         if len(self._waiting) >= BATCH:
             self.store_waiting()
+        self._announce()
 
     def decided(self, item: DecidedTrace) -> None:
         """A part was decided on."""
@@ -77,12 +81,15 @@ class Feedback:
     def report(self, known: StoredDecision, success: bool) -> None:
         """Take in a report; it is stored before anything else changes."""
         source = source_of(known.id, known.action, known.audit, success)
-        late = self._take_back(known.id)
-        self.store_waiting()
-        if known.action is Action.ACCEPT and known.id not in self._went_on and not self.stops_all:
-            self._silent -= 1  # it was counted among the silent ones
-        label, point = self._label(known, success, source)
-        (seq,) = self.store.put_labels([label])
+        late = [each for each in self._waiting if each[0].id == known.id]  # it was taken for confirmed
+        self._waiting = [each for each in self._waiting if each[0].id != known.id]
+        try:
+            self.store_waiting()
+            label, point = self._label(known, success, source, int(self._was_silent(known)))
+            (seq,) = self.store.put_labels([label])
+        except Exception:
+            self._waiting += late  # nothing was stored: it still waits as it did
+            raise
         self._went_on.pop(known.id, None)
         if known.quarantined:
             return
@@ -91,12 +98,7 @@ class Feedback:
         if late:  # its success stays among the references until the next retrain
             self.versions.new_labels -= 1
             self.versions.tell_anew()
-
-    def _take_back(self, decision_id: str) -> bool:
-        """Whether a part had been taken for confirmed: its stop came late, and the rule must be told anew."""
-        before = len(self._waiting)
-        self._waiting = [each for each in self._waiting if each[0].id != decision_id]
-        return len(self._waiting) < before
+        self._announce()
 
     def store_waiting(self) -> None:
         """Commit the labels of confirmed parts, and give them to the next retrain."""
@@ -107,21 +109,32 @@ class Feedback:
         for (known, _), seq in zip(waiting, seqs, strict=True):
             self.versions.keep(known, True, int(seq))
 
-    def _label(self, known: StoredDecision, success: bool, source: Source) -> tuple[NewLabel, Point | None]:
+    def _was_silent(self, known: StoredDecision) -> bool:
+        """Whether an accepted part was counted among the silent ones before its label came."""
+        return known.action is Action.ACCEPT and known.id not in self._went_on and not self.stops_all
+
+    def _label(self, known: StoredDecision, success: bool, source: Source, less: int = 0) -> tuple[NewLabel, Point | None]:
         point = None if known.quarantined else self.versions.reference_point(known)
         stored = point if self.versions.newest.keeps_references else None
-        silent = 0 if known.quarantined else self._silent
+        silent = 0 if known.quarantined else self._silent - less
         return NewLabel(known.id, success, source, self.versions.version, stored, silent), point
 
     def _learn(self, known: StoredDecision, label: NewLabel, point: Point | None) -> None:
-        self._silent -= label.silent
+        self._silent = 0
         self.versions.learn(known, label.success, point, label.silent)
+
+    def _announce(self) -> None:
+        """Record that safe mode began or ended, and tell; last of all, for either may fail and must cost no label."""
         now = self.safe_mode
-        if now != self._mode:
-            self._mode = now
+        if now == self._mode:
+            return
+        self._mode = now
+        try:
             self.store.put_event("safe mode", now or "ended: fresh evidence keeps the tolerance")
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
+        except Exception:
+            log.exception("safe mode %s, and that could not be told", f"began: {now}" if now else "ended")
 
 
 def unknown_stop(decision_id: str) -> ReportError:

@@ -47,8 +47,9 @@ class Recipe:
     max_steps : optimiser steps that a retrain may take at most; None: as many as the reducer's own settings say. A replay
         stops on steps alone and reads no clock, so that a seed repeats exactly.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
-    novelty : a trace is novel, and verified, where it lies more than so many times further from the principal subspace of
-        the learned traces, or from their middle, than 99.5 % of them; 0: nothing is novel.
+    novelty : a trace is novel, and verified, where its squared distance to the nearest learned one, in level or in
+    texture, is
+        more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
     """
 
     reducer: Any = "conv"
@@ -85,6 +86,8 @@ class Recipe:
         if not isinstance(self.policy, Policy):
             raise SettingError(f"Expected a Policy, got {self.policy!r}.")
         Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
+        if self.reject_fraction is not None and self.policy.guarantee == "pooled":
+            raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
 
     @property
     def name(self) -> str:

@@ -145,11 +145,6 @@ class Retrainer:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
         return self._pending is not None
 
-    @property
-    def done(self) -> bool:
-        """Whether one waits to be swapped in."""
-        return self._pending is not None and self._pending[0].done()
-
     def train(self, current: EngineModel) -> Trained:
         """Train a successor of the current model, in line."""
         begin, data = self.clock(), self.window.snapshot()

@@ -23,6 +23,9 @@ class ModelVersions:
     template : untrained; what the first version is trained from.
     answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
     new_labels : since the last retrain began.
+    store_waiting : stores what the rule was told of and the store not yet; called before any training or swap, since a
+    version
+        is stored after all that its rule was told of.
     """
 
     def __init__(self, template: EngineModel, retrainer: Retrainer, store: Store, clock: Callable[[], float]) -> None:
@@ -32,6 +35,7 @@ class ModelVersions:
         self.clock = clock
         self.answering: EngineModel | None = None
         self.version, self.new_labels = 0, 0
+        self.store_waiting: Callable[[], None] = _nothing_waits
         self._news: RetrainReport | None = None
 
     @property
@@ -70,12 +74,14 @@ class ModelVersions:
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
         self.collect(wait=True)
+        self.store_waiting()
         self.new_labels = 0
         return self._swap(self.retrainer.train(self.newest))
 
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
         self.collect()
+        self.store_waiting()
         if self.retrainer.executor is None:
             return self.retrain()
         if not self.retrainer.busy:
@@ -83,15 +89,11 @@ class ModelVersions:
             self.retrainer.start(self.newest)
         return None
 
-    @property
-    def trained(self) -> bool:
-        """Whether an executor has finished what it was given."""
-        return self.retrainer.done
-
     def collect(self, wait: bool = False) -> None:
         """Swap in what an executor has finished."""
         trained = self.retrainer.collect(wait)
         if trained is not None:
+            self.store_waiting()
             self._swap(trained)
 
     def _swap(self, trained: Trained) -> RetrainReport:
@@ -117,3 +119,7 @@ class ModelVersions:
         """The newest retrain, once."""
         news, self._news = self._news, None
         return news
+
+
+def _nothing_waits() -> None:
+    """No label waits for the store."""

@@ -241,10 +241,10 @@ def test_a_batch_with_one_bad_report_takes_none_of_its_labels(store: Store, last
     assert store.put_labels([label("b"), label("a")]).tolist() == [2, 3]
 
 
-def test_a_negative_silence_is_refused(store: Store) -> None:
+def test_a_silence_below_minus_one_is_refused(store: Store) -> None:
     put(store, "a")
-    with pytest.raises(StoreError, match="0 or more, got -1"):
-        store.put_label("a", True, Source.VERIFICATION, 0, None, silent=-1)
+    with pytest.raises(StoreError, match="-1 or more, got -2"):
+        store.put_label("a", True, Source.VERIFICATION, 0, None, silent=-2)
     assert store.get_decision("a").success is None
 
 

@@ -133,8 +133,8 @@ class WatchedRule(DecisionRule):
         return float(self.open[side].item()) < self.nobody
 
     def ask(self, side: int) -> None:
-        """In safe mode: whether the paper's level was shown to hold since."""
-        if int(self.mode.item()) != 0 and self.shown(self.counts(side, 1)[0]):
+        """After an alarm: whether the paper's level was shown to hold since, by each side for itself."""
+        if not self.holds(side) and self.shown(self.counts(side, 1)[0]):
             self.open[side].fill_(self.accept_at)  # assigned, a scripted float goes through float32
 
     def counts(self, side: int, since: int) -> list[list[int]]:

@@ -28,6 +28,8 @@ REFERENCES = 1000  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
 QUANTILE = 0.995
 TAIL_TRACES = 200  # one of so many lies beyond the quantile
+CAP = 4.0  # times the distance of nine references in ten
+LIKE = 3  # strangers that make a kind
 BEYOND = 1e15  # deviations: the square of a distance would overflow
 QUIET = 0.05  # of a channel's roughness: what is quieter is silent
 
@@ -100,13 +102,14 @@ def fit_novelty(traces: NDArray[np.float32], margin: float) -> NoveltyGate:
     texture = torch.arange(3 * gate.quiet.size(1)).ge(2 * gate.quiet.size(1)).repeat(channels)  # (P,)
     for i, group in enumerate((~texture, texture)):
         points = standard[:, group]
+        limit, reach = _limits(points)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
-        limit = margin * max(1.0, TAIL_TRACES / len(points)) * _usual_distance(points)
+        limit = margin * max(1.0, TAIL_TRACES / len(points)) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()
         gate.norms[i] = float("inf")  # of no reference: never the nearest
-        gate.norms[i, : len(points)] = points.square().sum(1) / limit
+        gate.norms[i, : len(points)] = points.square().sum(1) / limit - (margin * reach / limit - 1.0).clamp(min=0.0)
     gate.asleep = False
     return gate
 
@@ -128,9 +131,23 @@ def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:
     return -mean / (deviation + floor), 1.0 / (deviation + floor)
 
 
-def _usual_distance(points: Tensor) -> float:
-    """QUANTILE of the squared distances from each of points (n, P) to the nearest other one; not zero."""
+def _limits(points: Tensor) -> tuple[float, Tensor]:
+    """The usual squared distance from points (n, P) to the nearest other one, not zero; and each point's own, (n,).
+
+    A few strangers among the references must not be the measure of the others: the QUANTILE is capped by what nine in ten
+    show. A stranger reaches further only among its like: as far as its third nearest stranger, where all others are twice
+    as far.
+    """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)
     squared.fill_diagonal_(float("inf"))
-    return max(1e-3, float(torch.quantile(squared.amin(1), QUANTILE)))
+    nearest = squared.amin(1)
+    nine = float(torch.quantile(nearest, 0.9))
+    usual = max(1e-3, min(float(torch.quantile(nearest, QUANTILE)), CAP * nine))
+    reach = torch.full_like(nearest, usual)
+    strange = nearest > usual
+    if int(strange.sum()) > LIKE:
+        own = squared[strange]
+        alike = own[:, strange].kthvalue(LIKE, 1).values
+        reach[strange] = torch.where(4.0 * alike < own[:, ~strange].amin(1), alike, usual)
+    return usual, reach

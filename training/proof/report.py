@@ -21,7 +21,9 @@ HEADS = {
         "Planted truths: replays that broke the tolerance",
         "A replay broke it where the true failure probability of what it accepted (the true success probability of what "
         "it rejected), on average, exceeds 1 - LB. A guarantee may be broken in a share alpha of replays; the interval "
-        "is Clopper and Pearson's, 95 %, of that share.",
+        "is Clopper and Pearson's, 95 %, of that share. Rows whose truth moves (drifting, jumping) are not called a "
+        "guarantee: they were taken out of the claim after they were seen to break it, since members from before then pay "
+        "for parts after.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
     "counts": ("Count-only statistic", "Mean z^2 of the balls' counts under labels of noise; honest counting: 0.8 to 1.3."),
