@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, Source
-from dengine.errors import ReportError, TraceError
+from dengine.errors import ReportError, StoreError, TraceError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.store import MemoryStore
 
@@ -118,6 +118,54 @@ def test_a_thousand_accepted_parts_lose_no_confirmation(make_data) -> None:
     assert outcomes.stops + outcomes.confirmed == n_accepted - open_now
 
 
+def test_a_late_stop_whose_write_failed_is_counted_once_when_it_is_told_again(stream: Dataset, monkeypatch) -> None:
+    engine = make(replace(POOLED, stops="all"))
+    play(engine, stream, 0, 300)
+    decision, _ = accepted(engine, stream)
+    engine.decide(stream.X[0])  # takes it for confirmed
+    whole = engine.store.put_labels
+
+    def full(labels):
+        if any(label.decision_id == decision.id for label in labels):
+            raise StoreError("the disk is full")
+        return whole(labels)
+
+    monkeypatch.setattr(engine.store, "put_labels", full)
+    with pytest.raises(StoreError):
+        engine.report(decision.id, False)
+    monkeypatch.setattr(engine.store, "put_labels", whole)
+    engine.report(decision.id, False)
+    evidence_ = engine.store.evidence_since(0)
+    members = engine.model.rule.members[0, 0, 0].tolist()  # of LB's own level
+    reached = evidence_.lower >= 0.9
+    assert members == [int(reached.sum()), int((reached & ~evidence_.success).sum())]
+
+
+def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(stream: Dataset) -> None:
+    engine = make(replace(POOLED, stops="all"))
+    play(engine, stream)
+    for x in stream.X[stream.y == 1][:12]:
+        engine.decide(x + np.float32(0.02))
+    engine.start_retrain()
+    known = engine.store.evidence_since(0)
+    assert engine.model.rule.members[0, 0, 0, 0] == (known.lower >= 0.9).sum()
+    assert engine.store.last_version().last_seq == known.seq[-1]
+
+
+def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
+    def angry(reason: str) -> None:
+        raise RuntimeError(reason)
+
+    engine = make(replace(POOLED, stops="all"), on_safe_mode=angry)
+    play(engine, stream)
+    order = np.flatnonzero(stream.y == 1)[:60]
+    play(engine, Dataset(stream.X[order] + np.float32(0.01), np.zeros(60, np.int8)))
+    assert engine.safe_mode
+    status = engine.store.status()
+    outcomes = engine.store.outcomes()
+    assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
+
+
 # ---------------------------------------------------------------------------------------------- going on
 
 
@@ -220,7 +268,7 @@ def _verified(engine: DataEngine, x: np.ndarray, part: str) -> str:
     return engine.decide(x, part=part).id
 
 
-@pytest.mark.parametrize("part", ["", 1.5, True, b"7", ["7"]])
+@pytest.mark.parametrize("part", ["", 1.5, True, b"7", ["7"], "a\0b", "\ud800"])
 def test_what_is_no_number_of_a_part_is_refused(stream: Dataset, part: object) -> None:
     engine = make(LOCAL)
     with pytest.raises(TraceError, match="part's number"):

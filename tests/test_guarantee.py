@@ -202,3 +202,17 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(kind: type[Watched
         assert torch.equal(value, scripted.state_dict()[name]), name
     counts = [(n, k) for n in range(0, 60, 7) for k in range(0, 10, 3)]
     assert [eager(*each) for each in counts] == [scripted(*each) for each in counts]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None:
+    rule = WatchedRule(0.1, 0.9)
+    shown = [lambda n: tell(rule, 0.95, *[True] * n), lambda n: tell(rule, 0.0, *[False] * n, upper=0.02)]
+    tell(rule, 0.95, *[True] * 100, *[False] * 6)
+    assert rule.safe_mode() != 0
+    shown[first](100)
+    assert rule.safe_mode() == 0
+    assert rule.action(*[(0.95, 1.0), (0.0, 0.02)][1 - first]) == VERIFY
+    shown[1 - first](100)
+    assert rule.action(0.95, 1.0) == ACCEPT
+    assert rule.action(0.0, 0.02) == REJECT
