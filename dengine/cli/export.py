@@ -55,8 +55,8 @@ def export(store: str, out: Path, form: str, as_json: bool) -> None:
 def import_labels(journal: Path, store: str, as_json: bool) -> None:
     """Take a cell program's labels back into the store.
 
-    JOURNAL is the CSV file that the program wrote: a line is a label (1
-    success, 0 failure) and the samples of its trace. Each line counts once, however often it is imported.
+    JOURNAL is the CSV file that the program wrote, of this version or an
+    earlier one. Each line counts once, however often it is imported.
     """
     from ..importing import import_journal
 
