@@ -119,6 +119,7 @@ class DataEngine:
     def open(cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, **options: Any) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
+        (Of a part that a stop reached too late, the first engine keeps its success too until its next retrain.)
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
         options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them.
         Raises StoreError where there is nothing to go on with, SettingError where an object is missing.

@@ -34,6 +34,7 @@ TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another 
 def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:
     """Write `path` and `path`.sha256: a `DataEngine`'s decision, or a fitted `ModelPrediction`'s (without audits).
 
+    An accepted part of which nothing is known yet stays with the engine: export when none is under way.
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
     Raises ExportError where nothing was trained yet, or the reducer, the interval or the rule cannot be scripted.
     """
