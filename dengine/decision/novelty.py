@@ -28,7 +28,8 @@ REFERENCES = 1000  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
 QUANTILE = 0.995
 TAIL_TRACES = 200  # one of so many lies beyond the quantile
-CAP = 3.5  # times the distance of nine references in ten
+CAP = 6.0  # times the distance of nine references in ten: no limit is wider
+STRANGE = 3.0  # times that: what is a stranger among the references
 LIKE = 3  # strangers that make a kind
 BEYOND = 1e15  # deviations: the square of a distance would overflow
 QUIET = 0.05  # of a channel's roughness: what is quieter is silent
@@ -145,9 +146,9 @@ def _limits(points: Tensor) -> tuple[float, Tensor]:
     nine = float(torch.quantile(nearest, 0.9))
     usual = max(1e-3, min(float(torch.quantile(nearest, QUANTILE)), CAP * nine))
     reach = torch.full_like(nearest, usual)
-    strange = nearest > usual
-    if int(strange.sum()) > LIKE:
+    strange = nearest > max(1e-3, min(usual, STRANGE * nine))
+    if LIKE < int(strange.sum()) < len(points):
         own = squared[strange]
         alike = own[:, strange].kthvalue(LIKE, 1).values
-        reach[strange] = torch.where(4.0 * alike < own[:, ~strange].amin(1), alike, usual)
+        reach[strange] = torch.where(4.0 * alike < own[:, ~strange].amin(1), alike.clamp(min=usual), usual)
     return usual, reach
