@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .decision.rule import script
 from .errors import ReportError, TraceError
-from .folds import audited, part_hash
+from .folds import audited, own_hash
 from .model.base import NOTHING_KNOWN, EngineModel, Prediction
 from .records import REASONS, Action, Decision, Reason, Source, TraceSpec
 from .store.records import DecidedTrace
@@ -40,7 +40,7 @@ class DecisionMaker:
     def decide(self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int) -> DecidedTrace:
         """(C, T) of a part with this number -> what goes into the store."""
         fault, content = self._gate(torch.from_numpy(x))
-        hash_ = content if part is None else part_hash(part)
+        hash_ = own_hash(content, part)
         prediction = replace(NOTHING_KNOWN, reason=REASONS[fault]) if fault else _predict(x, hash_, model)
         decision = self._record(prediction, part, content, version)
         return DecidedTrace(decision, x, hash_, bool(fault), 0.0, part)
@@ -52,7 +52,7 @@ class DecisionMaker:
         decision = self._record(accept, part, content, version)
         # The part went on unchecked, whatever the audits' coin says.
         went_on = replace(decision, id=decision_id, action=Action.ACCEPT, reason=Reason.CERTAIN, audit=False)
-        return DecidedTrace(went_on, x, content if part is None else part_hash(part), bool(fault), 0.0, part)
+        return DecidedTrace(went_on, x, own_hash(content, part), bool(fault), 0.0, part)
 
     def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
         certain, rate = predicted.action is not Action.VERIFY, self.audit_rate

@@ -8,8 +8,6 @@ arithmetic is 64-bit integers that wrap around, the same in NumPy, TorchScript a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,13 +50,9 @@ def part_hash(part: str) -> int:
     return (h - 2**64 if h >= 2**63 else h) or 1
 
 
-def identity_hash(X: NDArray[np.floating], parts: Sequence[str | None] | None = None) -> FoldArray:
-    """(n,) int64: the hash of each trace's part where its number is known, else of its content."""
-    hashes = content_hash(X)
-    for i, part in enumerate(parts or ()):
-        if part is not None:
-            hashes[i] = part_hash(part)
-    return hashes
+def own_hash(content: int, part: str | None) -> int:
+    """The hash that a trace goes by: of its part's number where that is known, else of its content."""
+    return content if part is None else part_hash(part)
 
 
 def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:

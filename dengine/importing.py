@@ -27,7 +27,7 @@ from .deciding import source_of
 from .decision.policy import Policy
 from .engine import DataEngine
 from .errors import DataError, StoreError, TraceError
-from .folds import content_hash, identity_hash, part_hash
+from .folds import content_hash, own_hash
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .store.base import NewLabel, Store, opening
@@ -210,8 +210,7 @@ def _import_lines(
             line, (fault, hash_), held = lines[i], looks[i], store.get_decision(ids[i])
             if held is None:
                 decision = _decided(ids[i], line, fault, policy.audit_rate)
-                own = hash_ if line.part is None else part_hash(line.part)
-                store.put_decision(decision, line.trace, own, bool(fault), line.part)
+                store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
             elif held.success is not None:
                 counts["known"] += 1
                 continue
@@ -268,17 +267,18 @@ def _import_chunk(
     on_traces: Callable[[int], None] | None,
 ) -> tuple[int, int, int]:
     gate = TraceGate(spec)
+    own = np.array([own_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
     new = [i for i, id_ in enumerate(ids) if store.get_decision(id_) is None]
     faults = {i: gate(torch.from_numpy(traces[i]))[0] for i in new}
     good = [i for i in new if not faults[i]]
     if good:
         decisions = [_verified(ids[i], Reason.NO_MODEL, parts[i]) for i in good]
-        own = identity_hash(traces[good], [parts[i] for i in good])
-        store.put_labelled(decisions, traces[good], own, labels[good], Source.VERIFICATION, [parts[i] for i in good])
+        numbers = [parts[i] for i in good]
+        store.put_labelled(decisions, traces[good], own[good], labels[good], Source.VERIFICATION, numbers)
     bad = [i for i in new if faults[i]]
     for i in bad:  # kept, but never given to training
         decision = _verified(ids[i], REASONS[faults[i]], parts[i])
-        store.put_decision(decision, traces[i], int(hashes[i]), quarantined=True, part=parts[i])
+        store.put_decision(decision, traces[i], int(own[i]), quarantined=True, part=parts[i])
         store.put_label(ids[i], bool(labels[i]), Source.VERIFICATION, 0, None)
     if on_traces is not None:
         on_traces(len(ids))

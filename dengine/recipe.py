@@ -47,9 +47,8 @@ class Recipe:
     max_steps : optimiser steps that a retrain may take at most; None: as many as the reducer's own settings say. A replay
         stops on steps alone and reads no clock, so that a seed repeats exactly.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
-    novelty : a trace is novel, and verified, where its squared distance to the nearest learned one, in level or in
-    texture, is
-        more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
+    novelty : a trace is novel, and verified, where its squared distance to the nearest learned one, in level or in texture,
+        is more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
     """
 
     reducer: Any = "conv"

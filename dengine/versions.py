@@ -24,8 +24,7 @@ class ModelVersions:
     answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
     new_labels : since the last retrain began.
     store_waiting : stores what the rule was told of and the store not yet; called before any training or swap, since a
-    version
-        is stored after all that its rule was told of.
+        version is stored after all that its rule was told of.
     """
 
     def __init__(self, template: EngineModel, retrainer: Retrainer, store: Store, clock: Callable[[], float]) -> None:
@@ -80,11 +79,11 @@ class ModelVersions:
 
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
-        self.collect()
-        self.store_waiting()
         if self.retrainer.executor is None:
             return self.retrain()
+        self.collect()
         if not self.retrainer.busy:
+            self.store_waiting()
             self.new_labels = 0
             self.retrainer.start(self.newest)
         return None

@@ -46,8 +46,9 @@ def label_agreement(
 
 def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]) -> NDArray[np.float64]:
     """(n,) success rate among the nearest points of other parts."""
-    squares = (points.astype(np.float64) ** 2).sum(1)
-    distances = squares[:, None] + squares - 2.0 * points.astype(np.float64) @ points.T.astype(np.float64)
+    from scipy.spatial.distance import cdist
+
+    distances = cdist(points, points, "sqeuclidean")
     distances[part[:, None] == part] = np.inf
     k = min(NEIGHBOURS, len(points) - 1)
     if k < 1:

@@ -31,11 +31,12 @@ NOBODY = 2.0  # a level that no bound reaches
 FALSE_ALARMS = 100.0  # at the tolerance itself, one in 100 / alpha watched parts on average at most
 NOVEL_SHARE = 0.2  # that a stream may have
 WATCH_BET = 0.5  # of the largest
-ACCEPTED, REJECTED, NOVEL = 0, 1, 2  # what is watched; the first two are also the sides of a rule
 
 
 class WatchedRule(DecisionRule):
     """The paper's rule with a safe mode: for cells in which silence after an accept counts as a success.
+
+    Side 0 accepts, side 1 rejects; novelty is watched besides, as 2.
 
     open (2,) float64: the level that a part's score must reach, by side; the score of an accept is the lower bound, of a
     reject 1 - upper.  members (2, 2, L, 2) int64: by side, ever and since the last alarm, of each level, parts of known

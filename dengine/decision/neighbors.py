@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from .agreement import label_agreement
 
+FARTHEST = 1e38  # squared: what is beyond all measure, the query's own part too, is in no ball
 Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
@@ -49,6 +50,7 @@ class ReferenceRing(nn.Module):
         super().__init__()
         self.dim = dim
         self.capacity = capacity
+        self.farthest = FARTHEST
         self.register_buffer("points", torch.zeros(dim, capacity))
         self.register_buffer("labels", torch.ones(2, capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
@@ -118,7 +120,7 @@ class ReferenceRing(nn.Module):
         limit = radius * radius
         if fraction > 0.0:
             limit = float(distances.kthvalue(min(n, int(math_ceil(fraction * n))))[0].item())
-            limit = min(limit, 1e38)  # what is beyond all measure, the query's own part too, is in no ball
+            limit = min(limit, self.farthest)
         if int(self.repeats.item()) > 0:
             return self.votes(distances <= limit)
         inside = distances.clone().le_(limit)  # 1.0 or 0.0, without a mask in between
@@ -210,7 +212,8 @@ class RadiusIndex:
         ring.spaces[slots] = torch.from_numpy(k[keep])
         ring.parts[slots] = torch.from_numpy(own[keep])
         ring.total.fill_(total + len(z))
-        self._gather_parts()
+        if own.any() or int(ring.repeats) > 0:
+            self._gather_parts()
 
     def weigh(self) -> None:
         """Find out how far the labels of one part go together, for all counts until this is asked again."""

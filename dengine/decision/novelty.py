@@ -38,8 +38,8 @@ QUIET = 0.05  # of a channel's roughness: what is quieter is silent
 class NoveltyGate(nn.Module):
     """(C, T) -> novel? All that it learns is in buffers whose shapes `channels` and `samples` fix.
 
-    channels, samples : C and T.  asleep : whether nothing is novel, as it is until `fit_novelty` or a stored state wakes
-    it.
+    channels, samples : C and T.
+    asleep : whether nothing is novel, as it is until `fit_novelty` or a stored state wakes it.
     """
 
     quiet: Tensor

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..records import REASONS, Reason
 from .bounds import INTERVALS, normal_quantile
 from .neighbors import ReferenceRing
 
@@ -65,6 +66,7 @@ Bound = Callable[[int, int, float], tuple[float, float]]
 SCALAR_BOUNDS: dict[str, Bound] = {"wilson": wilson_bound, "binomial": binomial_bound}
 
 
+CERTAIN, UNCERTAIN, SAFE = (REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.SAFE_MODE))
 SAFE_MODE = (  # why everything is verified, by position: the integers of exported files
     "",
     "accepted parts failed more often than the tolerance",
@@ -138,6 +140,14 @@ class RadiusNeighbours(nn.Module):
         self.ring: ReferenceRing = ring
         self.rule: DecisionRule = rule
         self.radius, self.fraction, self.reject_fraction = float(radius), float(fraction), float(reject_fraction)
+        self.certain, self.uncertain, self.safe = CERTAIN, UNCERTAIN, SAFE
+
+    @torch.jit.export
+    def reason(self, action: int) -> int:
+        """Why the action is what it is: the position in `Reason`."""
+        if action != 0:
+            return self.certain
+        return self.uncertain if self.rule.safe_mode() == 0 else self.safe
 
     def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
         """(K, d) float32 scaled embedding -> action (0 verify, 1 accept, 2 reject), lower, upper, n_success, n_failure.

@@ -27,10 +27,12 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from ..decision.rule import DecisionRule
+from ..decision.neighbors import FARTHEST
+from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
-from ..records import ACTIONS, REASONS, Reason, TraceSpec
+from ..model.module import NOVEL
+from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
 from .file import METADATA, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
 from .module import FIELDS
@@ -39,7 +41,6 @@ from .torchscript import TOLERANCE, ExportedDecision
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # where an empty slot waits: no ball reaches it
 OPSET = 18
-CERTAIN, UNCERTAIN, NOVEL = (REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.NOVEL))
 CHECKED = 64  # random traces that the file is held against before it is kept
 BOUND_TOLERANCE = 1e-6
 EDGE = 2  # another runtime adds in another order: a reference on the ball's very surface may fall on either side
@@ -198,8 +199,8 @@ class Twin(nn.Module):
             ball: Tensor = distances <= self.radius * self.radius
             return ball
         k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
-        limit = distances.topk(k, largest=False)[0].max()
-        within: Tensor = (distances <= limit) & (limit < float("inf"))
+        limit = distances.topk(k, largest=False)[0].max().clamp(max=FARTHEST)
+        within: Tensor = distances <= limit
         return within
 
     def bound(self, n_success: Tensor, n_failure: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,9 +21,7 @@ from ..records import REASONS, Reason
 from ..reducers.base import Reducer
 
 Predicted = tuple[int, int, float, float, int, int, Tensor]
-CERTAIN, UNCERTAIN, NOVEL, SAFE = (
-    REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.NOVEL, Reason.SAFE_MODE)
-)
+NOVEL = REASONS.index(Reason.NOVEL)
 
 
 class Predictor(nn.Module):
@@ -42,7 +40,7 @@ class Predictor(nn.Module):
         self.scaled = bool((scale != 1.0).any())
         self.novelty = novelty
         self.neighbours: RadiusNeighbours = neighbours
-        self.certain, self.uncertain, self.novel, self.safe = CERTAIN, UNCERTAIN, NOVEL, SAFE
+        self.novel = NOVEL
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
@@ -80,10 +78,7 @@ class Predictor(nn.Module):
         if self.novelty(x):
             return 0, self.novel, 0.0, 1.0, 0, 0, z
         action, lower, upper, n_success, n_failure = self.neighbours(z, part)
-        reason = self.certain
-        if action == 0:
-            reason = self.uncertain if self.neighbours.rule.safe_mode() == 0 else self.safe
-        return action, reason, lower, upper, n_success, n_failure, z
+        return action, self.neighbours.reason(action), lower, upper, n_success, n_failure, z
 
 
 class PythonPredictor:
@@ -105,8 +100,7 @@ class PythonPredictor:
         if self.novelty(x):
             return 0, NOVEL, 0.0, 1.0, 0, 0, z
         action, *counted = self.neighbours(z, part)
-        unsure = UNCERTAIN if self.neighbours.rule.safe_mode() == 0 else SAFE
-        return (action, CERTAIN if action else unsure, *counted, z)
+        return (action, self.neighbours.reason(action), *counted, z)
 
 
 @dataclass(frozen=True)

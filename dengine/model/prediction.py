@@ -124,8 +124,8 @@ class ModelPrediction(EngineModel):
     def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference.
 
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) of their parts (`folds.identity_hash`), or
-        None: of their content.
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
+        their content.
         Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
         """
         X, y = as_traces(X), np.asarray(y, dtype=np.int64)

@@ -24,14 +24,15 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
         return 0
     n, channels, samples = x.shape
     length = max(1, samples // POINTS)
+    from scipy.spatial.distance import cdist
+
     whole = x[:, :, : samples // length * length].astype(np.float64)
     means = whole.reshape(n, channels, -1, length).mean(3)
     scale = means.std((0, 2), keepdims=True)
     rows = ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
-    squares = (rows**2).sum(1)
-    distances = np.maximum(squares[:, None] + squares - 2.0 * rows @ rows.T, 0.0)
+    distances = cdist(rows, rows)
     distances[own[:, None] == own] = np.inf
-    nearest = np.sqrt(np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]])
+    nearest = np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]]
     with np.errstate(invalid="ignore"):
         return int((nearest[:, 0] < NEAR * nearest[:, 1]).sum())
 
