@@ -1,0 +1,158 @@
+"""What every rival shares: the policy's numbers, one look a trace, and caution where nothing could be learned."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ...decision.policy import Policy
+from ...errors import SettingError
+from ...records import ACTIONS, Action
+
+Floats = NDArray[np.float64]
+Counts = NDArray[np.int64]
+Labels = NDArray[np.bool_]
+Traces = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What a rival says of n traces; (n,) each. action : of `Action`.  The rest : the evidence, as in `Decision`."""
+
+    action: NDArray[Any]
+    lower: Floats
+    upper: Floats
+    n_success: Counts
+    n_failure: Counts
+
+    @classmethod
+    def without_counts(cls, action: NDArray[Any], lower: Floats, upper: Floats) -> Judgement:
+        """Of a method that counts nothing."""
+        nothing = np.zeros(len(lower), dtype=np.int64)
+        return cls(action, lower, upper, nothing, nothing)
+
+    @classmethod
+    def same(cls, n: int, action: Action) -> Judgement:
+        """One action for n traces, without any evidence."""
+        return cls.without_counts(np.array([action] * n, dtype=object), np.zeros(n), np.ones(n))
+
+
+class Rival(ABC):
+    """A method of somebody else's behind the five methods of `Model`.
+
+    alpha, lower_bound : as in `Policy`; they are numbers of the rival here, and it says what it makes of them.
+    seed : of all that it draws; the same seed and the same labels give the same decisions.
+
+    A subclass gives `_learn` and `_judge`, and `_take` where it learns between two trainings. Where a training cannot be
+    done, on labels of one class or on too few, every part is verified until the next one.
+    The engine asks `predict_interval`, `count` and `decide` in turn about the same trace: the first of them does the work,
+    and what it found is kept for the other two, until something is learned or another trace comes.
+    """
+
+    def __init__(self, alpha: float, lower_bound: float, seed: int = 0) -> None:
+        self.policy = Policy(alpha, lower_bound)
+        self.seed = seed
+        self.ready = False
+        self._last: tuple[bytes, Judgement] | None = None
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Train anew on labelled traces X (n, C, T), y (n,) of 1 = success and 0 = failure."""
+        traces, good = as_traces(X), np.asarray(y) == 1
+        self._last = None
+        self.ready = bool(good.any() and not good.all()) and self._learn(traces, good)
+        return self
+
+    def add(self, x: ArrayLike, y: Any) -> Self:
+        """Take in one labelled trace (C, T), where the method learns between two trainings and has been trained."""
+        self._last = None
+        if self.ready:
+            self._take(as_traces(np.asarray(x)[None]), bool(y == 1))
+        return self
+
+    def count(self, X: ArrayLike) -> tuple[Counts, Counts]:
+        """(n_success, n_failure), each (n,), behind each prediction; zeros of a method that counts nothing."""
+        told = self.judge(X)
+        return told.n_success, told.n_failure
+
+    def predict_interval(self, X: ArrayLike) -> tuple[Floats, Floats]:
+        """(lower, upper), each (n,), of the success probability; the same number twice where there is only a point."""
+        told = self.judge(X)
+        return told.lower, told.upper
+
+    def decide(self, X: ArrayLike) -> NDArray[Any]:
+        """(n,) an `Action` for each trace of X (n, C, T)."""
+        return self.judge(X).action
+
+    def judge(self, X: ArrayLike) -> Judgement:
+        """All that it says of the traces X (n, C, T), computed once for the same traces."""
+        traces = as_traces(X)
+        key = traces.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._judge(traces) if self.ready else Judgement.same(len(traces), Action.VERIFY)
+        return self._last[1]
+
+    @abstractmethod
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        """Train on traces (n, C, T) and labels (n,) of both classes; False where they are too few."""
+
+    @abstractmethod
+    def _judge(self, X: Traces) -> Judgement:
+        """What is said of traces (n, C, T), after a training."""
+
+    def _take(self, X: Traces, good: bool) -> None:  # noqa: B027  # a default: the next training learns it
+        """Learn one trace (1, C, T)."""
+
+    def _by_bound(self, lower: Floats, upper: Floats, n_success: Counts, n_failure: Counts) -> Judgement:
+        """A judgement by the paper's rule: accept where lower >= LB, reject where upper <= 1 - LB."""
+        return Judgement(self.policy.actions(lower, upper), lower, upper, n_success, n_failure)
+
+
+class ThresholdRival(Rival):
+    """A rival with one number for each trace, its success probability as it believes: accept from one threshold on, reject
+    up to another. Without a threshold on a side, nothing is decided on that side.
+    """
+
+    def __init__(self, alpha: float, lower_bound: float, seed: int = 0) -> None:
+        super().__init__(alpha, lower_bound, seed)
+        self.accept_at, self.reject_at = np.inf, -np.inf
+
+    @abstractmethod
+    def _probability(self, X: Traces) -> Floats:
+        """(n,) success probabilities of traces (n, C, T), after a training."""
+
+    def _judge(self, X: Traces) -> Judgement:
+        p = self._probability(X)
+        return Judgement.without_counts(chosen(p >= self.accept_at, p <= self.reject_at), p, p)
+
+
+def chosen(accept: Labels, reject: Labels) -> NDArray[Any]:
+    """(n,) of `Action`: from what to accept and what to reject, each (n,); VERIFY for the rest."""
+    position = np.where(accept, ACTIONS.index(Action.ACCEPT), np.where(reject, ACTIONS.index(Action.REJECT), 0))
+    return np.array([ACTIONS[i] for i in position], dtype=object)
+
+
+def as_traces(X: ArrayLike) -> Traces:
+    """X as contiguous float32 (n, C, T); SettingError for another shape."""
+    traces = np.ascontiguousarray(X, dtype=np.float32)
+    if traces.ndim != 3:
+        raise SettingError(f"Expected traces of shape (n, C, T), got {traces.shape}; X[:, None, :] makes one channel.")
+    return traces
+
+
+def positive(name: str, value: Any, *, below: float = np.inf) -> Any:
+    """The value, where it is a number above 0 and below a limit; SettingError else."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < below:
+        limit = "" if below == np.inf else f" and below {below:g}"
+        raise SettingError(f"Expected {name} to be a number above 0{limit}, got {value!r}.")
+    return value
+
+
+def whole(name: str, value: Any, least: int = 1) -> int:
+    """The value, where it is an integer of at least `least`; SettingError else."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
+    return value
