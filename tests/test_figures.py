@@ -33,15 +33,20 @@ def evidence(n: int, seed: int = 0) -> dict[str, Any]:
     return {"lower": np.zeros(n), "upper": np.ones(n), "n_success": zeros, "n_failure": zeros} | {
         "position": position,
         "decide_seconds": took,
-        "novel": never,
+        "reason": np.full(n, "uncertain"),
+        "version": zeros,
         "safe_mode": never,
     }
 
 
-def replay_of(action: list[str], truth: list[int], seed: int = 0, recipe: Recipe = RECIPE) -> Replay:
+def replay_of(
+    action: list[str], truth: list[int], seed: int = 0, recipe: Recipe = RECIPE, name: str | None = None
+) -> Replay:
     return Replay(
+        name=recipe.name if name is None else name,
         recipe=recipe,
         dataset="by hand",
+        index=np.arange(len(action)),
         seed=seed,
         action=np.array(action),
         truth=np.array(truth, dtype=bool),
@@ -77,7 +82,7 @@ def test_the_promise_is_kept_up_to_the_tolerance(bad: int, kept: bool) -> None:
 
 
 def test_names_keep_recipes_of_one_reducer_apart() -> None:
-    rows = pool(frame_of([MANY_RIGHT, ONE_WRONG], ["mine", "yours"]))
+    rows = pool(frame_of([replace(MANY_RIGHT, name="mine"), replace(ONE_WRONG, name="yours")]))
     assert [row["recipe"] for row in rows] == ["mine", "yours"]
 
 
@@ -102,7 +107,7 @@ def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
 def test_the_csv_has_a_row_a_replay(tmp_path) -> None:
     path = write_csv(frame_of([MANY_RIGHT, ONE_WRONG]), tmp_path / "deep" / "replays.csv")
     header, *rows = path.read_text().splitlines()
-    assert header.startswith("recipe,interval,alpha,lower_bound,guarantee,stops,seed")
+    assert header.startswith("recipe,interval,alpha,lower_bound,guarantee,stops,confirm,seed")
     assert len(rows) == 2
 
 
@@ -266,7 +271,7 @@ def test_no_legend_lies_on_the_data(name: str) -> None:
 
 def test_novel_parts_and_cycles_of_safe_mode_are_counted_in_their_stretch() -> None:
     novel, safe = np.arange(100) % 10 == 0, np.arange(100) >= 70
-    log = replace(log_of(None), novel=novel, safe_mode=safe)
+    log = replace(log_of(None), reason=np.where(novel, "novel", "uncertain"), safe_mode=safe)
     assert (log.summary()["novel"], log.summary()["safe_mode"]) == (10, 30)
     assert [part["safe_mode"] for part in log.stretches(4)] == [0, 0, 5, 25]
 

@@ -9,11 +9,12 @@ from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
 from dengine.errors import DataError, SettingError
-from dengine.experiments.grid import name_of, run_replays
+from dengine.experiments.contenders import Contender
+from dengine.experiments.grid import run_replays
 from dengine.experiments.live import RunLog, RunRecorder, watch
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
-TIMES = ("decide_seconds", "retrains")
+TIMES = ("decide_seconds", "retrains", "seconds")
 
 
 def same(one: Replay, other: Replay) -> None:
@@ -240,7 +241,7 @@ def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Datase
     path.write_text(RECIPE.to_toml(), encoding="utf-8")
     asked = ["paper", str(path), path, RECIPE, PCA(2), "sklearn.decomposition:PCA", Recipe(PCA(2))]
     names = ["paper", "mine", "mine", "pca", "PCA", "sklearn.decomposition:PCA", "PCA"]
-    assert [name_of(recipe) for recipe in asked] == names
+    assert [Contender.load(recipe).name for recipe in asked] == names
     assert replay(data, PCA(2), cycles=30).summary()["recipe"] == "PCA"
 
 

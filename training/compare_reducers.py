@@ -1,29 +1,36 @@
-"""Reducers against each other, with as many tries for each: settings chosen on some seeds, reported on others.
+"""Reducers and rival methods against each other, as many tries for each: chosen on some seeds, reported on others.
 
-    python training/compare_reducers.py choose --data insertion --reducers conv,umap,pca,rocket --out out/
-    python training/compare_reducers.py report --data insertion --reducers conv,umap,pca,rocket --out out/
+    python training/compare_reducers.py choose --data insertion --reducers conv,umap,knn,gp --out out/
+    python training/compare_reducers.py report --data insertion --reducers conv,umap,knn,gp --out out/
 
-`choose` replays every try of TRIES on seeds 0 to 9 at alpha 0.1, LB 90 %, and names the one with the most certain
-decisions among those whose pooled precision and NPV meet LB. `report` replays the recipes as they are, on seeds 100 to
-129, at both policies.
-Both write a row a replay to a CSV, appending, so that a long run can be done in parts; of a replay that was done twice the
-newer row counts.
+`choose` replays every try (TRIES for reducers, `RIVALS[name].tries` for rivals, four each) on seeds 0 to 4 at alpha 0.1,
+LB 90 %, and names the one with the most certain decisions among those whose pooled precision and NPV meet LB. `report`
+replays all with the settings they have, on seeds 100 to 129, and writes one table: certain decisions, errors pooled over
+the replays with the interval for other parts of this kind, seconds saved net of stops and good parts done again, retrain
+and decision times.
+
+The rivals play in the same loop, on the same streams, with the same feedback. Those without a bound have a threshold that
+was swept: the column "bound" says so. Finished replays are kept in --keep, so that a long run can be done in parts; every
+run writes the table of all that it asked for.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
-from rich.console import Console
-from rich.table import Table
 
-from dengine import Recipe, load_dataset
-from dengine.cli.output import duration
-from dengine.experiments.grid import run_replays
+from dengine import Replay, load_dataset
+from dengine.experiments.contenders import Contender
+from dengine.experiments.grid import iterate_replays
+from dengine.experiments.kept import Task
+from dengine.experiments.rates import pooled_error
+from dengine.experiments.rivals import RIVALS
+from dengine.experiments.tables import frame_of, pool, write_csv
 
 # The same number of tries for each reducer: its radius, the one setting that every reducer has.
 TRIES: dict[str, tuple[float, ...]] = {
@@ -32,96 +39,136 @@ TRIES: dict[str, tuple[float, ...]] = {
     "pca": (0.1, 0.2, 0.3, 0.4),
     "rocket": (0.03, 0.05, 0.07, 0.1),
 }
+OURS = "Wilson, at one look"
+SWEPT = "none: threshold swept"
+COLUMNS = (
+    "who", "bound", "certain", "accepted", "FP", "rejected", "FN", "bad of accepted (95 %)", "good of rejected (95 %)",
+    "net s", "retrain s, median / worst", "decide µs, median",
+)  # fmt: skip
 
 
-def tries(reducer: str) -> dict[str, Recipe]:
-    """Every try of a reducer, by what was tried."""
-    base = Recipe.load(reducer).with_policy(alpha=0.1, lower_bound=0.9)
-    return {f"radius {r:g}": replace(base, radius=r) for r in TRIES[reducer]}
+def tries(name: str) -> list[Contender]:
+    """Every try of a reducer or a rival, named by what is tried."""
+    base = Contender.load(name)
+    if name in RIVALS:
+        every = [
+            replace(base, params=params) for params in RIVALS[name].tries[: 1 if not any(RIVALS[name].tries) else None]
+        ]
+        return [replace(one, name=f"{name} {_said(one.params)}") for one in every]
+    return [replace(base, name=f"{name} radius={r:g}", recipe=replace(base.recipe, radius=r)) for r in TRIES[name]]
 
 
-def replays(data: object, recipes: dict[str, Recipe], seeds: range, args: argparse.Namespace) -> pd.DataFrame:
-    """A row a replay; `what` says which try or policy."""
-    frames = []
-    for what, recipe in recipes.items():
-        results = run_replays(data, [recipe], seeds, args.cycles, n_jobs=args.n_jobs)
-        frames.append(pd.DataFrame([{"what": what} | r.summary() for r in results]))
-    return pd.concat(frames, ignore_index=True)
+def _said(params: Any) -> str:
+    return " ".join(f"{key}={value}" for key, value in params.items())
 
 
-def pooled(rows: pd.DataFrame) -> pd.DataFrame:
-    """Mean counts a replay, and rates over all replays together; replays of another length stand apart."""
-    rows = rows.drop_duplicates(["recipe", "what", "cycles", "seed"], keep="last")
-    groups = rows.groupby(["recipe", "what", "cycles"], sort=False)
-    table = groups[["certain", "accepted", "rejected", "false_positive", "false_negative"]].mean()
-    table["precision"] = 1.0 - table["false_positive"] / table["accepted"]
-    table["npv"] = 1.0 - table["false_negative"] / table["rejected"]
-    table["retrain_max_s"] = groups["retrain_max_s"].max()
-    table["replays"] = groups.size()
-    return table.reset_index()
+def play(data: Any, who: Sequence[Contender], seeds: range, args: argparse.Namespace) -> dict[str, list[Replay]]:
+    """The replays of each contender, by name."""
+    tasks = [Task(one, seed, args.cycles, True, args.confirm) for one in who for seed in seeds]
+    found: dict[int, Replay] = {}
+    for played in iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep):
+        found[played.position] = played.replay
+        if not played.kept:
+            print(f"{len(found)} of {len(tasks)}: {played.replay.name}, {played.replay.seconds:.1f} s", flush=True)
+    by_name: dict[str, list[Replay]] = {one.name: [] for one in who}
+    for position in range(len(tasks)):
+        by_name[found[position].name].append(found[position])
+    return by_name
 
 
-def chosen(table: pd.DataFrame, lower_bound: float) -> pd.DataFrame:
-    """Of each reducer the try with the most certain decisions among those that keep the promise."""
-    table = table[table["certain"] > 0]
-    kept = table[(table["precision"].fillna(1.0) >= lower_bound) & (table["npv"].fillna(1.0) >= lower_bound)]
-    return kept.loc[kept.groupby("recipe", sort=False)["certain"].idxmax()]
+def row_of(name: str, replays: Sequence[Replay]) -> dict[str, str]:
+    """A row of the table: means a replay ± their deviation, pooled shares with their interval."""
+    (row,) = pool(frame_of(replays))
+    kind = RIVALS.get(name.split(" ")[0])
+    return dict(
+        zip(
+            COLUMNS,
+            (
+                name if kind is None else f"{name}: {kind.title}",
+                OURS if kind is None else kind.bound or (SWEPT if any(kind.tries) else "none"),
+                f"{row['certain']:.0f} ± {np.nan_to_num(row['certain_sd']):.0f}",
+                f"{row['accepted']:.0f}",
+                f"{row['false_positive']:.1f}",
+                f"{row['rejected']:.0f}",
+                f"{row['false_negative']:.1f}",
+                _error(replays, "accepted"),
+                _error(replays, "rejected"),
+                f"{row['net_s']:.0f}",
+                "-" if np.isnan(row["retrain_p50_s"]) else f"{row['retrain_p50_s']:.3f} / {row['retrain_max_s']:.3f}",
+                f"{row['decide_p50_us']:.0f}",
+            ),
+            strict=True,
+        )
+    )
 
 
-def show(table: pd.DataFrame, title: str) -> None:
-    """The table on the screen."""
-    rich = Table(*(HEADINGS.get(name, name) for name in table.columns), title=title)
-    for values in table.itertuples(index=False):
-        rich.add_row(*(written(name, value) for name, value in zip(table.columns, values, strict=True)))
-    Console(width=130).print(rich)
+def _error(replays: Sequence[Replay], side: str) -> str:
+    error = pooled_error(replays, side)
+    return f"{100 * error.rate:.1f} % ({100 * error.lower:.1f} to {100 * error.upper:.1f})" if error.decided else "-"
 
 
-HEADINGS = {"false_positive": "FP", "false_negative": "FN", "npv": "NPV", "retrain_max_s": "worst retrain"}
+def chosen(by_name: dict[str, list[Replay]], lower_bound: float) -> str | None:
+    """The try with the most certain decisions among those that keep to LB on both sides; None where none does."""
+    kept = {}
+    for name, replays in by_name.items():
+        (row,) = pool(frame_of(replays))
+        sides = [share for share in (row["precision"], row["npv"]) if not np.isnan(share)]
+        if row["certain"] and min(sides) >= lower_bound:
+            kept[name] = row["certain"]
+    return max(kept, key=kept.__getitem__) if kept else None
 
 
-def written(name: str, value: object) -> str:
-    """A cell of the table as a person writes it."""
-    if not isinstance(value, float):
-        return str(value)
-    if np.isnan(value):
-        return "-"
-    share = name in ("precision", "npv")
-    return duration(value) if name == "retrain_max_s" else f"{100 * value:.1f} %" if share else f"{value:.4g}"
+def markdown(rows: Sequence[dict[str, str]]) -> str:
+    """Rows as a Markdown table."""
+    head = [f"| {' | '.join(COLUMNS)} |", f"|{' --- |' * len(COLUMNS)}"]
+    return "\n".join([*head, *(f"| {' | '.join(row[name] for name in COLUMNS)} |" for row in rows)])
 
 
 def main() -> None:
     """Parse, replay, show."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("do", choices=["choose", "report"], help="try settings, or report the recipes as they are")
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("do", choices=["choose", "report"], help="try settings, or report all as they are")
+    parser.add_argument("--data", default="insertion", help="a bundled set, a folder of recordings, or a file")
     parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
     parser.add_argument("--cycles", type=int, default=1503, help="cycles of a replay, at most as many as there are traces")
-    parser.add_argument("--reducers", default="conv,umap,pca", help="with commas between; report takes TOML files too")
-    parser.add_argument("--policies", default="0.1:0.9,0.05:0.95", help="alpha:LB with commas between, for report")
-    parser.add_argument("--seeds", help="first:last, the last one left out, instead of 0:10 or 100:130")
-    parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; -1: one a core")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV")
+    parser.add_argument("--reducers", default="conv,umap,pca", help="and rivals and TOML files, with commas between")
+    parser.add_argument("--policies", help="alpha:LB with commas between; 0.1:0.9 to choose, and 0.05:0.95 to report")
+    parser.add_argument("--confirm", action="store_true", help="good accepted parts are confirmed, not stops alone known")
+    parser.add_argument("--seeds", help="first:last, the last one left out, instead of 0:5 or 100:130")
+    parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; -1: one a core; times are honest with 1")
+    parser.add_argument("--keep", type=Path, help="folder of finished replays")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the table")
     args = parser.parse_args()
-    first, last = map(int, (args.seeds or ("0:10" if args.do == "choose" else "100:130")).split(":"))
-    policies = [tuple(map(float, pair.split(":"))) for pair in args.policies.split(",")]
-    unknown = set(args.reducers.split(",")) - set(TRIES)
-    if args.do == "choose" and unknown:
-        parser.error(f"choose has tries of {', '.join(TRIES)}, none of {', '.join(sorted(unknown))}; add them to TRIES")
+    choosing, asked = args.do == "choose", args.reducers.split(",")
+    unknown = [name for name in asked if name not in TRIES and name not in RIVALS]
+    if choosing and unknown:
+        parser.error(f"choose has tries of {', '.join([*TRIES, *RIVALS])}, none of {', '.join(unknown)}; add them to TRIES")
+    seeds = range(*map(int, (args.seeds or ("0:5" if choosing else "100:130")).split(":")))
+    policies = [pair.split(":") for pair in (args.policies or ("0.1:0.9" if choosing else "0.1:0.9,0.05:0.95")).split(",")]
     data = load_dataset(args.data, args.samples)
     args.cycles = min(args.cycles, len(data))
-    args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / f"{args.do}_{data.name}.csv"
-    for reducer in args.reducers.split(","):
-        recipes = tries(reducer) if args.do == "choose" else {
-            f"alpha {a}, LB {b}": Recipe.load(reducer).with_policy(alpha=a, lower_bound=b) for a, b in policies
-        }  # fmt: skip
-        rows = replays(data, recipes, range(first, last), args)
-        rows.to_csv(path, mode="a", header=not path.exists(), index=False)
-    table = pooled(pd.read_csv(path))
-    show(table, f"{args.do}: {data.name}, mean counts a replay, pooled rates")
-    if args.do == "choose":
-        best = chosen(table, 0.9)
-        show(best, "chosen") if len(best) else print("Chosen: none; no try was certain of anything and kept its promise.")
+    who = [one for name in asked for one in (tries(name) if choosing else [Contender.load(name)])]
+    replays, pages = [], []
+    for alpha, bound in ((float(a), float(b)) for a, b in policies):
+        by_name = play(data, [one.with_policy(alpha=alpha, lower_bound=bound) for one in who], seeds, args)
+        title = (
+            f"{args.do}: {data.name}, ({alpha:g}, {100 * bound:g} %), seeds {seeds[0]} to {seeds[-1]}, {args.cycles} cycles"
+        )
+        pages.append(f"{title}\n\n{markdown([row_of(name, some) for name, some in by_name.items()])}\n")
+        print(f"\n{pages[-1]}")
+        replays += [replay for some in by_name.values() for replay in some]
+        if choosing:
+            show_chosen(asked, by_name, bound)
+    path = write_csv(frame_of(replays), args.out / f"{args.do}_{data.name}.csv")
+    path.with_suffix(".md").write_text("\n".join(pages), encoding="utf-8")
+    print(f"Wrote {path} and {path.with_suffix('.md')}")
+
+
+def show_chosen(asked: Sequence[str], by_name: dict[str, list[Replay]], lower_bound: float) -> None:
+    """Which try was the best of each that was asked for."""
+    for name in asked:
+        some = {one: replays for one, replays in by_name.items() if one.split(" ")[0] == name}
+        print(f"Chosen of {name}: {chosen(some, lower_bound) or 'none; no try was certain of anything and kept to LB'}")
 
 
 if __name__ == "__main__":

@@ -92,20 +92,39 @@ def certificate_record(certificate: Certificate) -> dict[str, Any]:
 
 
 @contextmanager
-def progress(label: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that goes when done; the function it gives advances it by so many."""
+def progress(label: str, total: int, quiet: bool, left: Callable[[], str] | None = None) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr that goes when done; the function it gives advances it by so many.
+
+    left : what it says of the time to come, where its own guess, by its speed so far, would be wrong.
+    """
     if quiet:
         yield lambda step: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class Said(ProgressColumn):
+        """What `left` says."""
+
+        def render(self, task: Task) -> Text:
+            return Text("" if left is None else left())
 
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        TimeRemainingColumn() if left is None else Said(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=total)

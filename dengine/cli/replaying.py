@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,28 +24,51 @@ from .options import (
     seed_option,
     short_name,
 )
-from .output import progress, show, write_json
+from .playing import Stream, play
+from .reporting import report
 
 if TYPE_CHECKING:
-    from ..datasets import Dataset
-    from ..experiments.replay import Replay
-    from ..recipe import Recipe
+    from ..experiments.contenders import Contender
 
 
-def stream_options(command: Any) -> Any:
-    """What both verbs ask of a replay."""
+def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What both verbs ask of their replays, handed on as one `Stream`."""
+
+    @wraps(command)
+    def streamed(
+        repeats: int | None,
+        seed: int,
+        cycles: int | None,
+        in_order: bool,
+        n_jobs: int,
+        keep: Path | None,
+        scheduler: str | None,
+        **others: Any,
+    ) -> Any:
+        if in_order and repeats not in (None, 1):
+            raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
+        seeds = range(seed, seed + (1 if in_order else repeats or 30))
+        return command(stream=Stream(seeds, cycles, not in_order, n_jobs, keep, scheduler), **others)
+
+    decorated: Callable[..., Any] = streamed
     for option in (
         json_option,
         out_option,
+        click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
+        click.option(
+            "--keep",
+            type=click.Path(file_okay=False, path_type=Path),
+            metavar="FOLDER",
+            help="Finished replays are kept here, and not played again: an interrupted run goes on.",
+        ),
         n_jobs_option(1, "Replays at a time, each in a process; -1: one a core. Timings are honest with 1 only."),
-        click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards."),
         click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
         click.option("--cycles", type=click.IntRange(1), help="Only so many parts of each stream.  [default: all]"),
         seed_option,
         click.option("--repeats", type=click.IntRange(1), help="Shuffled replays of each recipe.  [default: 30]"),
     ):
-        command = option(command)
-    return command
+        decorated = option(decorated)
+    return decorated
 
 
 @click.command(
@@ -52,13 +76,99 @@ def stream_options(command: Any) -> Any:
 )
 @data_options()
 @recipe_options
+@click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
 @stream_options
-def replay(choice: RecipeChoice, **options: Any) -> None:
+def replay(
+    choice: RecipeChoice, confirm: bool, source: DataChoice, stream: Stream, out: Path | None, as_json: bool
+) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
     Ctrl-C shows the replays that were finished.
     """
-    _replay("replay", {choice.name: choice.load()}, **options)
+    from ..experiments.contenders import Contender
+
+    contender = Contender(choice.name, choice.load())
+    _play("replay", [contender], Grid(confirms=(confirm,)), source, stream, out, as_json)
+
+
+class Listed(click.ParamType[Any]):
+    """Values with commas between, as a tuple; each is what another type says."""
+
+    name = "list"
+
+    def __init__(self, of: click.ParamType[Any]) -> None:
+        self.of = of
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+        """'0.5,0.1' -> (0.5, 0.1); a wrong one among them is a usage error."""
+        if isinstance(value, tuple):
+            return value
+        parts = [part.strip() for part in str(value).split(",") if part.strip()]
+        if not parts:
+            self.fail("expected at least one value, with commas between.", param, ctx)
+        return tuple(self.of.convert(part, param, ctx) for part in parts)
+
+
+class Grid:
+    """The conditions under which every contender plays: lists of settings; None in a list leaves it to the recipe."""
+
+    def __init__(
+        self,
+        alphas: Sequence[float] | None = None,
+        lower_bounds: Sequence[float] | None = None,
+        intervals: Sequence[str] | None = None,
+        guarantees: Sequence[str] | None = None,
+        confirms: Sequence[bool] = (False,),
+    ) -> None:
+        self.alphas = alphas or (None,)
+        self.lower_bounds = lower_bounds or (None,)
+        self.intervals = intervals or (None,)
+        self.guarantees = guarantees or (None,)
+        self.confirms = confirms
+
+
+PROBABILITY = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
+BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
+FEEDBACKS = {"stops": False, "confirmed": True}
+
+
+def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Lists of settings, handed on as one `Grid`; `--paper` stands for the paper's own."""
+
+    @wraps(command)
+    def gridded(paper: bool, feedback: tuple[str, ...], settings: Mapping[str, Any], **others: Any) -> Any:
+        lists = {name: others.pop(name) for name in ("alphas", "lower_bounds", "intervals", "guarantees")}
+        for many, one in (("alphas", "alpha"), ("lower_bounds", "lower_bound"), ("guarantees", "guarantee")):
+            if (lists[many] or (paper and many != "guarantees")) and one in settings:
+                flag = one.replace("_", "-")
+                raise click.UsageError(f"--{flag} names one value; leave it out beside --paper or --{flag}s.")
+        if paper:
+            from ..experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS
+
+            whole = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS, "intervals": INTERVALS}
+            lists = {name: lists[name] or whole.get(name) for name in lists}
+        grid = Grid(**lists, confirms=[FEEDBACKS[name] for name in feedback])
+        return command(grid=grid, settings=settings, **others)
+
+    decorated: Callable[..., Any] = gridded
+    shown = {"feedback": ",".join(FEEDBACKS)}
+    for option in (
+        click.option(
+            "--feedback",
+            type=Listed(click.Choice(list(FEEDBACKS))),
+            default="stops",
+            show_default=True,
+            metavar="LIST",
+            help=f"What is known of accepted parts, of {shown['feedback']}: their stops alone, or of good ones too.",
+        ),
+        click.option("--guarantees", type=Listed(click.Choice(["local", "pooled"])), metavar="LIST", help="local,pooled."),
+        click.option("--intervals", type=Listed(click.STRING), metavar="LIST", help="As in wilson,binomial."),
+        click.option("--lower-bounds", type=Listed(BOUND), metavar="LIST", help="As in 0.8,0.9,0.95."),
+        click.option("--alphas", type=Listed(PROBABILITY), metavar="LIST", help="As in 0.5,0.1,0.05."),
+        click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."),
+    ):
+        decorated = option(decorated)
+    return decorated
 
 
 @click.command(epilog=example("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/"))
@@ -68,12 +178,22 @@ def replay(choice: RecipeChoice, **options: Any) -> None:
     metavar="NAMES",
     default="conv,umap,pca",
     show_default=True,
-    help="With commas between: conv, umap, pca, rocket, TOML files, module:Class of your own.",
+    help="With commas between: conv, umap, pca, rocket, TOML files, module:Class of your own; and rivals: knn, wskde, "
+    "gp, minirocket, mapie, river, always, never.",
 )
 @policy_options
+@grid_options
 @stream_options
-def compare(reducers: str, settings: Mapping[str, Any], **options: Any) -> None:
-    """Replay the same streams through several reducers.
+def compare(
+    reducers: str,
+    settings: Mapping[str, Any],
+    grid: Grid,
+    source: DataChoice,
+    stream: Stream,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Replay the same streams through several reducers and rival methods, under one policy or a grid of them.
 
     UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
     """
@@ -81,125 +201,44 @@ def compare(reducers: str, settings: Mapping[str, Any], **options: Any) -> None:
     if not asked:
         raise click.UsageError("--reducers names none; give at least one, as in conv,pca.")
     choice = RecipeChoice(settings=settings)
-    _replay("compare", {name: choice.load(one) for name, one in _names(asked).items()}, **options)
+    _play("compare", [_contender(name, choice) for name in _distinct(asked)], grid, source, stream, out, as_json)
 
 
-def _names(asked: list[str]) -> dict[str, str]:
-    """What to call each in tables and file names -> what was asked for."""
-    names = {short_name(one): one for one in asked}
-    if len(names) < len(asked):
+def _distinct(asked: list[str]) -> list[str]:
+    if len({short_name(one) for one in asked}) < len(asked):
         raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
-    return names
+    return asked
 
 
-@dataclass(frozen=True)
-class Finished:
-    """The replays that were finished, by recipe, and how many were asked for."""
+def _contender(asked: str, choice: RecipeChoice) -> Contender:
+    """A rival by its name, else a recipe; with the settings that were given."""
+    from ..experiments.contenders import Contender
+    from ..experiments.rivals import RIVALS
 
-    by_recipe: Mapping[str, list[Replay]]
-    asked: int
-
-    def __len__(self) -> int:
-        return sum(len(replays) for replays in self.by_recipe.values())
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether some are missing."""
-        return len(self) < self.asked
+    if asked in RIVALS:
+        return replace(Contender.load(asked), recipe=choice.load())
+    return Contender(short_name(asked), choice.load(asked))
 
 
-def _replay(
+def _play(
     verb: str,
-    recipes: dict[str, Recipe],
+    who: Sequence[Contender],
+    grid: Grid,
     source: DataChoice,
-    repeats: int | None,
-    seed: int,
-    cycles: int | None,
-    in_order: bool,
-    confirm: bool,
-    n_jobs: int,
+    stream: Stream,
     out: Path | None,
     as_json: bool,
 ) -> None:
-    if in_order and repeats not in (None, 1):
-        raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
-    seeds = range(seed, seed + (1 if in_order else repeats or 30))
+    from ..experiments.grid import grid_tasks
+
     dataset = source.load()
-    with progress(f"replaying {dataset.name}", len(seeds) * len(recipes) * (cycles or len(dataset)), as_json) as advance:
-        finished = _run(dataset, recipes, seeds, cycles, n_jobs, advance, not in_order, confirm)
-    if len(finished):
-        _report(verb, finished, dataset.name, in_order, out, as_json)
+    tasks = grid_tasks(
+        who, grid.alphas, grid.lower_bounds, grid.intervals, stream.seeds, grid.guarantees, grid.confirms,
+        stream.cycles, stream.shuffle,
+    )  # fmt: skip
+    finished = play(dataset, tasks, stream, as_json)
+    if finished.replays:
+        report(verb, finished, dataset, stream, out, as_json)
     if finished.interrupted:
-        kept = "the table shows those" if len(finished) else "there is nothing to show"
-        end_interrupted(f"Interrupted: {len(finished)} of {finished.asked} replays were finished; {kept}.")
-
-
-def _run(
-    dataset: Dataset,
-    recipes: dict[str, Recipe],
-    seeds: range,
-    cycles: int | None,
-    n_jobs: int,
-    advance: Any,
-    shuffle: bool,
-    confirm: bool,
-) -> Finished:
-    from ..experiments.grid import iterate_replays
-
-    # Seed by seed: what an interrupted comparison has finished can be compared.
-    tasks = [(name, seed) for seed in seeds for name in recipes]
-    finished: dict[str, list[Replay]] = {name: [] for name in recipes}
-    # A bar cannot travel to other processes: there it moves a replay at a time.
-    ticks: dict[str, Any] = {"on_cycle": lambda done: advance(1)} if n_jobs == 1 else {}
-    pairs = [(recipes[name], seed) for name, seed in tasks]
-    replays = iterate_replays(dataset, pairs, cycles, n_jobs=n_jobs, shuffle=shuffle, confirm=confirm, **ticks)
-    try:
-        for (name, _), one in zip(tasks, replays, strict=True):
-            finished[name].append(one)
-            if not ticks:
-                advance(len(one.action))
-    except KeyboardInterrupt:
-        pass  # what is missing says so
-    return Finished({name: some for name, some in finished.items() if some}, len(tasks))
-
-
-def _report(verb: str, finished: Finished, data: str, in_order: bool, out: Path | None, as_json: bool) -> None:
-    from ..experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, retrain_line
-
-    by_recipe = finished.by_recipe
-    named = [(name, each) for name, replays in by_recipe.items() for each in replays]
-    frame = frame_of([each for _, each in named], [name for name, _ in named])
-    rows = [row | {"promise_kept": promise_kept(row)} for row in pool(frame)]
-    title = _title(data, by_recipe, in_order)
-    files = _save(frame, by_recipe, title, out) if out is not None else []
-    retrains = {name: [r for each in replays for r in each.retrains] for name, replays in by_recipe.items()}
-    if as_json:
-        dropped = {name: sum(not r.accepted for r in reports) for name, reports in retrains.items()}
-        rows = [row | {"retrains_dropped": dropped[row["recipe"]]} for row in rows]
-        about = {"verb": verb, "data": data, "in_order": in_order, "interrupted": finished.interrupted}
-        write_json(about | {"rows": rows, "files": files})
-        return
-    show(pooled_table(rows, title))
-    show(*(promise_line(row) for row in rows))
-    show(*(f"{name}: {retrain_line(reports)}" for name, reports in retrains.items()))
-    show(*(f"Wrote {path}" for path in files))
-
-
-def _title(data: str, by_recipe: Mapping[str, list[Replay]], in_order: bool) -> str:
-    each = sorted({len(replays) for replays in by_recipe.values()})
-    cycles = len(next(iter(by_recipe.values()))[0].action)
-    order = "in recorded order" if in_order else "shuffled"
-    how = f"{order}, {' or '.join(map(str, each))} replay{'s' if each[-1] > 1 else ''} of {cycles} cycles"
-    source = "simulated insertions" if data == "insertion" else data
-    return f"{', '.join(by_recipe)} on {source}, {how}"
-
-
-def _save(frame: Any, by_recipe: Mapping[str, list[Replay]], title: str, out: Path) -> list[Path]:
-    from ..experiments.figures import curves, embedding_map, save
-    from ..experiments.tables import write_csv
-
-    files = [write_csv(frame, out / "replays.csv"), save(curves(by_recipe, title), out / "curves.png")]
-    for name, replays in by_recipe.items():
-        picture = embedding_map(replays[0], title=f"{name}, newest parts of one replay (seed {replays[0].seed})")
-        files.append(save(picture, out / f"map_{name}.png"))
-    return files
+        kept = "the table shows those" if finished.replays else "there is nothing to show"
+        end_interrupted(f"Interrupted: {len(finished.replays)} of {len(tasks)} replays were finished; {kept}.")

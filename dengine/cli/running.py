@@ -247,13 +247,7 @@ def _cells(row: dict[str, Any], timed: bool) -> list[str]:
 
 
 def _save(log: RunLog, title: str, out: Path) -> list[Path]:
-    import pandas as pd
-
     from ..experiments.figures import run_picture, save
     from ..experiments.tables import write_csv
 
-    columns: dict[str, Any] = {"action": log.action, "truth": log.truth, "stopped": log.stopped}
-    columns |= {"novel": log.novel, "safe_mode": log.safe_mode}
-    frame = pd.DataFrame(columns | ({} if log.clock_s is None else {"clock_s": log.clock_s}))
-    frame.insert(0, "cycle", range(1, len(log) + 1))
-    return [write_csv(frame, out / "run.csv"), save(run_picture(log, title), out / "run.png")]
+    return [write_csv(log.to_frame().reset_index(), out / "run.csv"), save(run_picture(log, title), out / "run.png")]

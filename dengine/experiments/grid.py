@@ -1,6 +1,9 @@
-"""Repeated replays over recipes, alphas, lower bounds and intervals: the paper's grid.
+"""Repeated replays over recipes, intervals, alphas and lower bounds, on two cores or on a cluster: the paper's grid.
 
->>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=30)
+>>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=30, keep="out/kept")
+
+joblib runs the replays, with the backend that the caller picked: `joblib.parallel_config(backend="dask")` sends the same
+replays to a cluster, and the same decisions come back.
 """
 
 from __future__ import annotations
@@ -8,31 +11,56 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..datasets import load_dataset
-from ..recipe import RECIPES, Recipe
+from ..datasets import Dataset, load_dataset
+from .contenders import Contender, contenders
+from .kept import KeptReplays, Task
 from .replay import Replay, replay
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Folder = str | os.PathLike[str]
+OnDone = Callable[[Replay], None] | None
+
+
+class Played(NamedTuple):
+    """A finished replay. position : of its task.  kept : whether it was there from an earlier run."""
+
+    position: int
+    replay: Replay
+    kept: bool
+
 
 def iterate_replays(
-    dataset: Any, tasks: Iterable[tuple[Any, int]], cycles: int | None = None, *, n_jobs: int = 1, **options: Any
-) -> Iterator[Replay]:
-    """The replay of each (recipe, seed), in that order, each as soon as it is done: what was finished can be kept.
+    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None, on_cycle: Any = None
+) -> Iterator[Played]:
+    """Each task's replay as soon as it is done.
 
-    options : as in `replay`. joblib runs them, with the backend that the caller picked (`joblib.parallel_config`).
+    Played seed by seed, so that what an interrupted run has finished can be compared; they end in no certain order.
+
+    n_jobs : replays at a time, as joblib counts; times are honest with 1 alone.
+    keep : folder of finished replays: those that are there are not played again, the others are kept as they end.
+    on_cycle : as in `replay`, where n_jobs is 1: a callback does not travel.
     """
     from joblib import Parallel, delayed
 
     data = load_dataset(dataset)
-    replays: Iterator[Replay] = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(replay)(data, Recipe.load(recipe), seed, cycles, **options) for recipe, seed in tasks
-    )
-    yield from replays
+    kept = None if keep is None else KeptReplays(keep, data)
+    found = {i: one for i, task in enumerate(tasks) if kept and (one := kept.get(task)) is not None}
+    yield from (Played(i, one, True) for i, one in found.items())
+    left = sorted(((i, task) for i, task in enumerate(tasks) if i not in found), key=lambda each: each[1].seed)
+    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
+    for i, one in parallel(delayed(_play)(data, i, task, on_cycle if n_jobs == 1 else None) for i, task in left):
+        if kept is not None:
+            kept.put(tasks[i], one)
+        yield Played(i, one, False)
+
+
+def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
+    options: dict[str, Any] = {"shuffle": task.shuffle, "confirm": task.confirm, "on_cycle": on_cycle}
+    return i, replay(data, task.contender, task.seed, task.cycles, **options)
 
 
 def run_replays(
@@ -41,18 +69,15 @@ def run_replays(
     seeds: Iterable[int],
     cycles: int | None = None,
     *,
+    shuffle: bool = True,
+    confirm: bool = False,
     n_jobs: int = 1,
-    on_done: Callable[[Replay], None] | None = None,
-    **options: Any,
+    keep: Folder | None = None,
+    on_done: OnDone = None,
 ) -> list[Replay]:
-    """Every recipe under every seed, in parallel; a list in that order. n_jobs, options : as in `iterate_replays`."""
-    tasks = list(itertools.product([Recipe.load(r) for r in recipes], seeds))
-    results = []
-    for result in iterate_replays(dataset, tasks, cycles, n_jobs=n_jobs, **options):
-        results.append(result)
-        if on_done is not None:
-            on_done(result)
-    return results
+    """Every recipe under every seed, in parallel; a list in that order. The rest as in `replay` and `iterate_replays`."""
+    pairs = itertools.product([Contender.load(r) for r in recipes], seeds)
+    return _played(dataset, [Task(who, seed, cycles, shuffle, confirm) for who, seed in pairs], n_jobs, keep, on_done)
 
 
 def run_grid(
@@ -64,31 +89,58 @@ def run_grid(
     repeats: int = 30,
     n_jobs: int = -1,
     *,
+    guarantees: Sequence[str | None] = (None,),
+    confirms: Sequence[bool] = (False,),
     first_seed: int = 0,
     cycles: int | None = None,
-    on_done: Callable[[Replay], None] | None = None,
+    keep: Folder | None = None,
+    on_done: OnDone = None,
 ) -> pd.DataFrame:
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds.
 
-    The column `recipe` is a recipe's name as it was asked for, so that two of one reducer stay apart.
+    recipes : anything `replay` takes, rivals too. The column `recipe` names each; two of one reducer keep apart.
+    guarantees : "local", "pooled", or None for the recipe's own.
+    confirms : whether accepted good parts are confirmed; False is the paper's feedback, stops alone.
+    keep : folder of finished replays, by which an interrupted grid goes on.
 
     Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
     """
     import pandas as pd
 
-    conditions = list(itertools.product(recipes, intervals, alphas, lower_bounds))
-    variants = [
-        Recipe.load(recipe).with_policy(interval=interval, alpha=alpha, lower_bound=bound)
-        for recipe, interval, alpha, bound in conditions
+    tasks = grid_tasks(
+        recipes, alphas, lower_bounds, intervals, range(first_seed, first_seed + repeats), guarantees, confirms, cycles
+    )
+    return pd.DataFrame([one.summary() for one in _played(dataset, tasks, n_jobs, keep, on_done)])
+
+
+def grid_tasks(
+    recipes: Sequence[Any],
+    alphas: Sequence[float | None],
+    lower_bounds: Sequence[float | None],
+    intervals: Sequence[str | None],
+    seeds: Iterable[int],
+    guarantees: Sequence[str | None] = (None,),
+    confirms: Sequence[bool] = (False,),
+    cycles: int | None = None,
+    shuffle: bool = True,
+) -> list[Task]:
+    """Every combination as a task; None leaves a setting to the recipe."""
+    conditions = itertools.product(contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms)
+    return [
+        Task(_under(who, interval, alpha, bound, guarantee), seed, cycles, shuffle, confirm)
+        for (who, interval, alpha, bound, guarantee, confirm), seed in itertools.product(conditions, list(seeds))
     ]
-    seeds = range(first_seed, first_seed + repeats)
-    replays = run_replays(dataset, variants, seeds, cycles, n_jobs=n_jobs, on_done=on_done)
-    names = [name_of(recipe) for recipe, *_ in conditions for _ in seeds]
-    return pd.DataFrame([r.summary() | {"recipe": name} for r, name in zip(replays, names, strict=True)])
 
 
-def name_of(recipe: Any) -> str:
-    """What to call a recipe in a table: the name or the file that was asked for, else its reducer."""
-    if isinstance(recipe, str | os.PathLike) and (str(recipe) in RECIPES or Path(recipe).is_file()):
-        return Path(recipe).stem
-    return Recipe.load(recipe).name
+def _under(who: Contender, interval: Any, alpha: Any, bound: Any, guarantee: Any) -> Contender:
+    asked = {"interval": interval, "alpha": alpha, "lower_bound": bound, "guarantee": guarantee}
+    return who.with_policy(**{name: value for name, value in asked.items() if value is not None})
+
+
+def _played(dataset: Any, tasks: Sequence[Task], n_jobs: int, keep: Folder | None, on_done: OnDone) -> list[Replay]:
+    found: dict[int, Replay] = {}
+    for played in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep):
+        found[played.position] = played.replay
+        if on_done is not None:
+            on_done(played.replay)
+    return [found[i] for i in range(len(tasks))]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,13 @@ from numpy.typing import NDArray
 from ..cells.base import Cell
 from ..engine import DataEngine
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = (  # of a run as a frame
+    "action", "reason", "truth", "lower", "upper", "n_success", "n_failure", "stopped", "safe_mode", "version"
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +34,8 @@ class RunLog:
     truth : (n,) 1 good, 0 bad, NaN where the cell does not tell: real ones tell only what was verified.
     lower, upper, n_success, n_failure : (n,) the evidence.
     position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
-    novel : (n,) bool, verified as unlike all that was learned from.
+    reason : (n,) str, why each decision is what it is, as in `Reason`.
+    version : (n,) of the model that answered; 0 before the first retrain.
     safe_mode : (n,) bool, every part is verified after this cycle, whatever the model says.
     decide_seconds : (n,) wall time of each decision.
     clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
@@ -43,7 +51,8 @@ class RunLog:
     position: NDArray[np.float64]
     decide_seconds: NDArray[np.float64]
     stopped: NDArray[np.bool_]
-    novel: NDArray[np.bool_]
+    reason: NDArray[np.str_]
+    version: NDArray[np.int64]
     safe_mode: NDArray[np.bool_]
     clock_s: NDArray[np.float64] | None = None
     retrains: tuple[RetrainReport, ...] = ()
@@ -77,6 +86,16 @@ class RunLog:
         return np.asarray(self.rejected & (self.truth == 1.0))
 
     @property
+    def novel(self) -> NDArray[np.bool_]:
+        """(n,) verified as unlike all that was learned from."""
+        return np.asarray(self.reason == Reason.NOVEL)
+
+    @property
+    def embedded(self) -> bool:
+        """Whether any trace was embedded; rivals embed none."""
+        return bool(np.isfinite(self.position).any())
+
+    @property
     def finished(self) -> NDArray[np.bool_]:
         """(n,) a good part was passed on, as far as the truth is known."""
         return np.asarray(~self.rejected & (self.truth == 1.0))
@@ -85,6 +104,16 @@ class RunLog:
     def retrain_seconds(self) -> NDArray[np.float64]:
         """Wall time of each retrain."""
         return np.array([each.seconds for each in self.retrains], dtype=np.float64)
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row a cycle, numbered from 1: what was decided, why, on what evidence, and what was true."""
+        import pandas as pd
+
+        told = {name: getattr(self, name) for name in COLUMNS}
+        axes = {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
+        clock = {} if self.clock_s is None else {"clock_s": self.clock_s}
+        index = pd.RangeIndex(1, len(self) + 1, name="cycle")
+        return pd.DataFrame(told | {"decide_us": 1e6 * self.decide_seconds} | axes | clock, index=index)
 
     def summary(self) -> dict[str, Any]:
         """Counts over all cycles; parts an hour where there is a clock."""
@@ -171,7 +200,8 @@ class RunRecorder:
             position=_positions(decisions),
             decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
             stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
-            novel=np.array([d.reason is Reason.NOVEL for d in decisions], dtype=np.bool_),
+            reason=np.array([str(d.reason) for d in decisions], dtype=np.str_),
+            version=np.array([d.model_version for d in decisions], dtype=np.int64),
             safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
             clock_s=self._clock(),
             retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),

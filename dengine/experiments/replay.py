@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,44 +18,57 @@ from ..datasets import Dataset, load_dataset
 from ..engine import DataEngine
 from ..errors import SettingError
 from ..recipe import Recipe
+from .contenders import Contender
 from .live import RunLog, watch
-
-VERIFY_SECONDS = 5.0  # what a height check costs a cycle, in the paper's cell
+from .rates import decided_rates, net_seconds, saved_seconds
 
 
 @dataclass(frozen=True, kw_only=True)
 class Replay(RunLog):
     """What happened in one replay, cycle by cycle, as in `RunLog`; the truth is known of every part, as bool.
 
-    recipe : of the engine.  dataset : its name.  seed : of the shuffle and of the engine.
+    index : (n,) position in the data set of the trace that each cycle played.
+    name : of who played, in tables.  recipe : of the engine.  dataset : its name.
+    seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
+    seconds : wall time of the whole replay.
     """
 
     truth: NDArray[np.bool_]
+    index: NDArray[np.int64]
+    name: str
     recipe: Recipe
     dataset: str
     seed: int
+    confirm: bool = False
+    seconds: float = float("nan")
+
+    @property
+    def first_certain(self) -> float:
+        """Number of the first cycle that was decided without a check, from 1; NaN where none was."""
+        certain = np.flatnonzero(~self.verified)
+        return float(certain[0] + 1) if len(certain) else float("nan")
 
     def summary(self) -> dict[str, Any]:
         """One row of a table: counts over the whole stream; precision and NPV are NaN where nothing was decided."""
         counts, policy = self.stretch(slice(None)), self.recipe.policy
-        accepted, rejected = counts["accepted"], counts["rejected"]
-        false_positive, false_negative = counts["false_positive"], counts["false_negative"]
+        certain = counts["accepted"] + counts["rejected"]
+        wrong = {name: counts[name] for name in ("false_positive", "false_negative")}
         return {
-            "recipe": self.recipe.name,
+            "recipe": self.name,
             "interval": policy.interval,
             "alpha": policy.alpha,
             "lower_bound": policy.lower_bound,
             "guarantee": policy.guarantee,
             "stops": policy.stops,
+            "confirm": self.confirm,
             "seed": self.seed,
             "cycles": len(self),
-            "certain": accepted + rejected,
-            "accepted": accepted,
-            "rejected": rejected,
-            "false_positive": false_positive,
-            "false_negative": false_negative,
-            "precision": 1.0 - false_positive / accepted if accepted else float("nan"),
-            "npv": 1.0 - false_negative / rejected if rejected else float("nan"),
+            "certain": certain,
+            "first_certain": self.first_certain,
+            "accepted": counts["accepted"],
+            "rejected": counts["rejected"],
+            **wrong,
+            **decided_rates(self.accepted, self.rejected, self.truth),
             "novel": counts["novel"],
             "safe_mode": counts["safe_mode"],
             "retrains": len(self.retrains),
@@ -62,7 +76,9 @@ class Replay(RunLog):
             "retrain_max_s": _quantile(self.retrain_seconds, 1.0),
             "decide_p50_us": 1e6 * _quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * _quantile(self.decide_seconds, 0.99),
-            "saved_s": VERIFY_SECONDS * (accepted + rejected),
+            "saved_s": saved_seconds(certain),
+            "net_s": net_seconds(certain, **wrong),
+            "seconds": self.seconds,
         }
 
 
@@ -78,29 +94,37 @@ def replay(
 ) -> Replay:
     """Play a data set through a fresh engine in memory: one shuffled pass, or its first `cycles`.
 
-    dataset : anything `load_dataset` takes.  recipe : anything `Recipe.load` takes.
+    dataset : anything `load_dataset` takes.
+    recipe : anything `Recipe.load` takes, the name of a rival method (`experiments.rivals.RIVALS`), or a `Contender`.
     seed : of the shuffle and of the engine; the same seed gives the same decisions.
     shuffle : False plays the stream as it was recorded, drift and all.
     confirm : whether accepted good parts are confirmed by the cell; by default only stops are seen. With
         `Policy(stops="all")` the engine takes the silence after them for as much.
     on_cycle : called with the number of cycles done, for a progress bar.
     """
-    data, recipe = load_dataset(dataset), Recipe.load(recipe)
-    cell = ReplayCell(data, _order(data, seed, cycles, shuffle), confirm)
-    engine = DataEngine.from_recipe(recipe, seed=seed, replaying=True)
-    return collect(engine, cell, data, seed, on_cycle)
+    data, contender = load_dataset(dataset), Contender.load(recipe)
+    cell = ReplayCell(data, order_of(data, seed, cycles, shuffle), confirm)
+    return collect(contender.engine(seed), cell, data, seed, on_cycle, contender.name)
 
 
 def collect(
-    engine: DataEngine, cell: ReplayCell, data: Dataset, seed: int, on_cycle: Callable[[int], None] | None = None
+    engine: DataEngine,
+    cell: ReplayCell,
+    data: Dataset,
+    seed: int,
+    on_cycle: Callable[[int], None] | None = None,
+    name: str | None = None,
 ) -> Replay:
-    """Drive any engine over a replay cell and gather its cycles; a rival model comes in through the engine."""
+    """Drive any engine over a replay cell and gather its cycles; a model of your own comes in through the engine."""
+    begin = time.perf_counter()
     log = watch(engine, cell, len(cell.order), on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
-    told = vars(log) | {"truth": log.truth.astype(np.bool_)}
-    return Replay(**told, recipe=engine.recipe, dataset=data.name, seed=seed)
+    told = vars(log) | {"truth": log.truth.astype(np.bool_), "index": cell.order, "confirm": cell.confirm}
+    about: dict[str, Any] = {"name": name or engine.recipe.name, "recipe": engine.recipe, "seed": seed}
+    return Replay(**told, **about, dataset=data.name, seconds=time.perf_counter() - begin)
 
 
-def _order(data: Dataset, seed: int, cycles: int | None, shuffle: bool) -> NDArray[np.int64]:
+def order_of(data: Dataset, seed: int, cycles: int | None = None, shuffle: bool = True) -> NDArray[np.int64]:
+    """(cycles,) positions in the data set, in the order in which a replay plays them. SettingError for too many."""
     n = len(data) if cycles is None else cycles
     if not 1 <= n <= len(data):
         raise SettingError(f"Expected 1 to {len(data)} cycles from {data.name}, got {n}.")

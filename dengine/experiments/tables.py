@@ -1,7 +1,7 @@
 """Replays as tables: a row a replay in the CSV, a pooled row a recipe on the screen.
 
     frame = frame_of(replays)
-    Console().print(pooled_table(pool(frame)))   # and promise_line(row) for each
+    Console().print(pooled_table(pool(frame, replays)))   # and promise_line(row) for each
 
 Which promise is shown: the one about all parts together. Among all parts accepted in all replays the share of bad ones
 should be at most 1 - LB, and likewise the share of good ones among the rejected. Each row names its guarantee: under
@@ -16,51 +16,64 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..records import RetrainReport
+from .rates import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
 from .replay import Replay
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops"]
+CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops", "confirm"]
 COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode"]
+ERROR = ("error_lower", "error_upper")
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
 PROMISE = (
-    "certain: cycles decided without a check, and their share of all cycles. accept, reject: such decisions; below them "
+    "certain: cycles decided without a check, a mean a replay with its standard deviation over the replays, and their "
+    "share of all cycles. accept, reject: such decisions; below them "
     "the wrong ones, FP (bad parts accepted) and FN (good parts rejected). precision: the share of accepted parts that "
     "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
-    "99th percentile. saved: checks left out, at 5 s each, before what stops and wrong rejects cost. Counts and saved "
+    "99th percentile. saved: seconds of checks left out, at {check:g} s each; net: less {stop:g} s for every bad part "
+    "accepted, which stops the system, and {again:g} s for every good part rejected. Counts and seconds "
     "are means a replay; shares are pooled, that is, counted over the parts of all replays together. The pooled "
-    "precision is compared with LB. {} Rejected parts get no feedback but audits."
+    "precision is compared with LB. {guarantees} Rejected parts get no feedback but audits."
 )
 SHOWN = {  # by guarantee
     "local": "Guarantee local: the rule speaks of the ball around each part; the pooled precision is only measured.",
     "pooled": "Guarantee pooled: the rule itself keeps all accepted parts together to LB, at level alpha.",
 }
-KNOWN = {  # by what is known of stops
+KNOWN = {  # by what is known of accepted parts
     "some": "Beside it, some: of accepted parts only stops are known.",
     "all": "Beside it, all: an accepted part that no stop follows counts as good, and is learned from.",
+    "confirmed": "Beside it, confirmed: the cell tells of every accepted part whether it was good.",
 }
 
 
-def frame_of(replays: Sequence[Replay], names: Sequence[str] | None = None) -> pd.DataFrame:
-    """A row a replay, as in `Replay.summary`; `names` tells recipes of one reducer apart."""
+def frame_of(replays: Sequence[Replay]) -> pd.DataFrame:
+    """A row a replay, as in `Replay.summary`."""
     import pandas as pd
 
-    rows = [replay.summary() for replay in replays]
-    if names is not None:
-        rows = [row | {"recipe": name} for row, name in zip(rows, names, strict=True)]
-    return pd.DataFrame(rows)
+    return pd.DataFrame([replay.summary() for replay in replays])
 
 
-def pool(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """A row for each recipe, interval, alpha and LB, in the frame's order.
+def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
+    """A row for each recipe, interval, alpha, LB, guarantee and feedback, in the frame's order.
+
+    replays : of the frame's rows; with them a row has the interval of the pooled error, as `rates.pooled_error` has it.
 
     precision, npv : over the sums of all replays, not the mean of their ratios, which would weigh a replay that accepted
-        three parts as much as one that accepted 300.  COUNTS, saved_s : means a replay; `total_*` are the sums.
+        three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
+        `certain_sd` and `false_positive_sd` the standard deviations over the replays (NaN of one).
+    error_lower, error_upper : 95 % interval of the share of bad ones among the accepted parts; NaN without replays.
     retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, decide_p99_us : the worst replay's.
     """
-    return [_pooled(dict(zip(CONDITION, key, strict=True)), part) for key, part in frame.groupby(CONDITION, sort=False)]
+    groups = frame.reset_index(drop=True).groupby(CONDITION, sort=False)
+    of = {key: [replays[i] for i in part.index] if replays else [] for key, part in groups}
+    return [_pooled(dict(zip(CONDITION, key, strict=True)), part) | _error_of(of[key]) for key, part in groups]
+
+
+def _error_of(replays: Sequence[Replay]) -> dict[str, float]:
+    error = pooled_error(replays)
+    return {"error_lower": error.lower, "error_upper": error.upper} if error.decided else dict.fromkeys(ERROR, math.nan)
 
 
 def _pooled(condition: dict[str, Any], part: pd.DataFrame) -> dict[str, Any]:
@@ -70,6 +83,7 @@ def _pooled(condition: dict[str, Any], part: pd.DataFrame) -> dict[str, Any]:
         | {"replays": len(part), "cycles": int(part["cycles"].sum())}
         | {name: float(part[name].mean()) for name in COUNTS}
         | {f"total_{name}": n for name, n in total.items()}
+        | {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
         | {
             "precision": _share_right(total["false_positive"], total["accepted"]),
             "npv": _share_right(total["false_negative"], total["rejected"]),
@@ -77,7 +91,9 @@ def _pooled(condition: dict[str, Any], part: pd.DataFrame) -> dict[str, Any]:
             "retrain_max_s": float(part["retrain_max_s"].max()),
             "decide_p50_us": float(part["decide_p50_us"].median()),
             "decide_p99_us": float(part["decide_p99_us"].max()),
+            "first_certain": float(part["first_certain"].mean()),
             "saved_s": float(part["saved_s"].mean()),
+            "net_s": float(part["net_s"].mean()),
         }
     )
 
@@ -102,13 +118,15 @@ def promise_line(row: Mapping[str, Any]) -> str:
     ]
     good, bound = _percent(row["precision"]), 100 * row["lower_bound"]
     who = f"{row['recipe']} ({row['guarantee']})"
-    return f"{who}: {good} of {row['total_accepted']} accepted parts were good, LB {bound:g} %: {verdict}."
+    bad = f"; bad: {100 * row['error_lower']:.1f} to {_percent(row['error_upper'])} at 95 %"
+    bad = "" if math.isnan(row.get("error_lower", math.nan)) else bad
+    return f"{who}: {good} of {row['total_accepted']} accepted parts were good{bad}, LB {bound:g} %: {verdict}."
 
 
 def guarantee_line(rows: Sequence[Mapping[str, Any]]) -> str:
     """What the rows' guarantees say, and what is known of stops; one that a user wrote is not explained."""
     asked = dict.fromkeys(str(row["guarantee"]) for row in rows)
-    known = dict.fromkeys(str(row["stops"]) for row in rows)
+    known = dict.fromkeys("confirmed" if row["confirm"] else str(row["stops"]) for row in rows)
     return " ".join([*(SHOWN[name] for name in asked if name in SHOWN), *(KNOWN[name] for name in known)])
 
 
@@ -118,14 +136,16 @@ def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> T
     from rich.table import Table
 
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
+    said = PROMISE.format(check=VERIFY_SECONDS, stop=STOP_SECONDS, again=CYCLE_SECONDS, guarantees=guarantee_line(rows))
     look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
-    table = Table(title=f"\n{title}\n", caption=f"\n{PROMISE.format(guarantee_line(rows))}\n", **look)
+    table = Table(title=f"\n{title}\n", caption=f"\n{said}\n", **look)
     # The one that gives way: 80 columns are enough for every number.
     table.add_column("recipe\nguarantee", overflow="fold")
     for name in _CELLS_OF:
         table.add_column(name, justify="right", no_wrap=True)
     for row in rows:
-        table.add_row(f"{row['recipe']}\n{row['guarantee']}, {row['stops']}", *(show(row) for show in _CELLS_OF.values()))
+        known = "confirmed" if row["confirm"] else row["stops"]
+        table.add_row(f"{row['recipe']}\n{row['guarantee']}, {known}", *(show(row) for show in _CELLS_OF.values()))
     return table
 
 
@@ -137,15 +157,20 @@ def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
 
+def _with_sd(row: Mapping[str, Any], name: str) -> str:
+    deviation = row[f"{name}_sd"]
+    return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.1f} ± {deviation:.0f}"
+
+
 _CELLS_OF: dict[str, Any] = {
     "alpha\nLB": lambda r: f"{r['alpha']:g}\n{100 * r['lower_bound']:g} %",
-    "certain\n ": lambda r: f"{r['certain']:.1f}\n{_percent(r['total_certain'] / r['cycles'])}",
+    "certain\n± sd, share": lambda r: f"{_with_sd(r, 'certain')}\n{_percent(r['total_certain'] / r['cycles'])}",
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",
     "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
     "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
-    "saved\ns": lambda r: f"{r['saved_s']:.0f}\n",
+    "saved\nnet, s": lambda r: f"{r['saved_s']:.0f}\n{r['net_s']:.0f}",
 }
 
 

@@ -163,7 +163,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, values, allow_pickle=False)
+                np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 
 

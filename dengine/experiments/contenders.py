@@ -1,0 +1,92 @@
+"""Who is played in a replay: dengine by a recipe, or a rival method in the same loop.
+
+>>> Contender.load("conv")                        # a recipe's name, a TOML file, module:Class, a transformer, a Recipe
+>>> Contender.load("knn")                         # a name in `rivals.RIVALS`
+>>> contenders(["conv", Recipe("conv", radius=0.07)])     # two recipes of one reducer, each with a name of its own
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..engine import DataEngine
+from ..errors import SettingError
+from ..recipe import RECIPES, Recipe, described
+from .rivals import RIVALS, make_rival
+
+TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
+
+
+@dataclass(frozen=True)
+class Contender:
+    """What plays a stream.
+
+    name : in tables, pictures and file names.
+    recipe : every setting of the engine; of a rival's, those of the loop and the policy that the rival is made with.
+    rival : a name in `RIVALS` that decides in place of reducer and neighbours, with the settings that were chosen for it
+        where it is loaded by name; None: the recipe's reducer does.
+    params : the rival's own settings.
+    """
+
+    name: str
+    recipe: Recipe
+    rival: str | None = None
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, asked: Any) -> Contender:
+        """From a contender, the name of a rival, or anything that `Recipe.load` takes. SettingError for all else."""
+        if isinstance(asked, Contender):
+            return asked
+        if isinstance(asked, str) and asked in RIVALS:
+            return cls(asked, Recipe(), asked, RIVALS[asked].chosen)
+        recipe = Recipe.load(asked)
+        by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
+        return cls(Path(asked).stem if by_name else recipe.name, recipe)
+
+    def with_policy(self, **changes: Any) -> Contender:
+        """The same with another alpha, lower_bound, interval, guarantee or stops."""
+        return replace(self, recipe=self.recipe.with_policy(**changes))
+
+    def engine(self, seed: int) -> DataEngine:
+        """A fresh engine in memory that repeats exactly under a seed."""
+        rival = None if self.rival is None else make_rival(self.rival, self.recipe.policy, seed, **self.params)
+        return DataEngine(recipe=self.recipe, model=rival, seed=seed, replaying=True)
+
+    @property
+    def description(self) -> str:
+        """All that its decisions depend on, beside data and seed, as text that is the same at every start."""
+        own = self.recipe.reducer
+        handed_in = "" if isinstance(own, str) else f"\n{described(own)}"
+        return f"{self.recipe.to_toml()}{handed_in}\n{self.rival} {sorted(self.params.items())}"
+
+
+def contenders(asked: Sequence[Any]) -> list[Contender]:
+    """Each as it was asked for, under a name of its own: equal names are followed by the settings in which they differ.
+
+    Recipes that differ in `TOLD_APART` alone keep one name. SettingError where two do not differ at all.
+    """
+    loaded = [Contender.load(one) for one in asked]
+    names = [one.name for one in loaded]
+    return [one if names.count(one.name) == 1 else _apart(one, loaded) for one in loaded]
+
+
+def _apart(one: Contender, among: Sequence[Contender]) -> Contender:
+    rivals = [other for other in among if other.name == one.name and other is not one]
+    if any(one == other for other in rivals):
+        raise SettingError(f"Expected each to be asked for once, got {one.name} twice with the same settings.")
+    own, others = _flat(one), [_flat(other) for other in rivals]
+    differing = [key for key in own if any(other.get(key) != own[key] for other in others)]
+    return replace(one, name=" ".join([one.name, *(f"{key}={own[key]}" for key in differing)]))
+
+
+def _flat(one: Contender) -> dict[str, Any]:
+    """Every setting by its name, without those that have columns of their own."""
+    plain = {f.name: getattr(one.recipe, f.name) for f in fields(Recipe) if f.name not in ("policy", "params")}
+    plain["reducer"] = plain["reducer"] if isinstance(plain["reducer"], str) else described(plain["reducer"])
+    policy = {key: value for key, value in asdict(one.recipe.policy).items() if key not in TOLD_APART}
+    return {**plain, **policy, **one.recipe.params, **one.params}

@@ -1,0 +1,88 @@
+"""The paper's tables and findings, from frames made by hand."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from dengine.experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS, PUBLISHED, Finding, findings, grid_lines, paper_table
+
+
+def frame(interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, **cells) -> pd.DataFrame:
+    """Two replays a cell: those of the paper, one a little above and one below; or what `cells` says of all."""
+    rows = []
+    for alpha in ALPHAS:
+        for bound in LOWER_BOUNDS:
+            false_positive, certain = PUBLISHED[interval, alpha, bound]
+            for sign in (-1, 1):
+                row = {"recipe": recipe, "interval": interval, "alpha": alpha, "lower_bound": bound}
+                row |= {"guarantee": "local", "stops": "some", "confirm": False}
+                row |= {"certain": certain + sign, "false_positive": false_positive + sign}
+                row |= {"first_certain": 10.0 / alpha, "retrain_p50_s": retrain, "retrain_max_s": retrain}
+                rows.append(row | cells)
+    return pd.DataFrame(rows)
+
+
+def by_claim(found: list[Finding], claim: str) -> list[bool]:
+    return [each.holds for each in found if claim in each.claim]
+
+
+def test_the_published_figures_are_the_papers(repo: Path) -> None:
+    paper = repo.parent / "shared" / "paper.tex"
+    if not paper.is_file():
+        pytest.skip("the paper's source is not beside this checkout")
+    text = paper.read_text(encoding="utf-8")
+    assert len(PUBLISHED) == 18
+    for interval, label in (("wilson", "tab:wsFalsePositiveCount"), ("binomial", "tab:biFalsePositiveCount")):
+        table = text[: text.index(label)].rsplit("tabular", 2)[-2]
+        for alpha in ALPHAS:
+            said = " & ".join("{}/{}".format(*PUBLISHED[interval, alpha, bound]) for bound in LOWER_BOUNDS)
+            assert f"{alpha} & {said}" in table
+
+
+def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
+    head, _, *rows = paper_table(frame(), "conv", "wilson").splitlines()
+    assert head == "| alpha / LB | 80 % | 90 % | 95 % |"
+    assert [row.split(" | ")[0] for row in rows] == ["| 0.5", "| 0.1", "| 0.05"]
+    assert "36.9 ± 1.4 / 1019.8 ± 1.4 [36.9 / 1019.8]" in rows[1]
+
+
+def test_a_cell_that_was_not_played_is_empty_and_one_that_was_not_published_stands_alone() -> None:
+    some = frame().query("alpha == 0.1 or lower_bound == 0.8").replace({"alpha": {0.5: 0.4}})
+    table = paper_table(some, "conv", "wilson")
+    assert "| 0.05 | 39.6 ± 1.4 / 1151.4 ± 1.4 [39.6 / 1151.4] | - | - |" in table
+    assert "| 0.4 | 36.1 ± 1.4 / 1317.1 ± 1.4 | - | - |" in table
+
+
+def test_the_papers_own_figures_bear_its_findings_out() -> None:
+    found = findings(pd.concat([frame(), frame("binomial")]))
+    assert by_claim(found, "Wilson answers") == [True]
+    assert by_claim(found, "Binomial does not answer") == [True]
+    assert by_claim(found, "share of false positives") == [True] * 18
+    assert by_claim(found, "delays the first") == [True] * 3  # of Wilson alone
+    assert by_claim(found, "a retrain of conv") == [True]
+
+
+def test_a_finding_that_does_not_hold_says_so() -> None:
+    found = findings(pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)]))
+    assert by_claim(found, "Wilson answers") == [False]
+    assert by_claim(found, "share of false positives").count(False) == 6  # 12 % at LB 90 and 95 %
+    assert by_claim(findings(frame(first_certain=50.0)), "delays the first") == [False] * 3
+    assert by_claim(findings(frame(retrain=2.4)), "a retrain of conv") == [False]
+    assert any(each.sentence.startswith("does NOT hold: Wilson answers") for each in found)
+
+
+def test_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> None:
+    found = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
+    assert by_claim(found, "share of false positives") == [True] * 9
+    assert by_claim(found, "delays the first") == []
+
+
+@pytest.mark.parametrize("confirm", [False, True])
+def test_the_page_has_a_part_for_each_feedback(confirm: bool) -> None:
+    other = frame("binomial", confirm=not confirm)
+    page = "\n".join(grid_lines(pd.concat([frame(confirm=confirm), other])))
+    assert page.count("## Guarantee local") == 2
+    assert "good accepted parts confirmed" in page
+    assert page.count("false positives / certain") == 2
+    assert all(f"**conv, {interval}**" in page for interval in INTERVALS)

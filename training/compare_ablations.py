@@ -1,0 +1,232 @@
+"""What each choice is worth: one setting is changed at a time, on the same shuffled streams.
+
+    python training/compare_ablations.py --data insertion --seeds 100:110 --out out/ablations
+    python training/compare_ablations.py --data screw_driving.npz --samples 400 --only radius,folds,length
+
+Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), length (a part is decided on
+the beginning of its trace: 0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
+Writes ablations.csv, a row a replay, and ablations.png. Finished replays are kept in --keep, so that an interrupted run
+goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from torch import Tensor
+
+from dengine import ConvReducer, Dataset, Recipe, Replay, load_dataset
+from dengine.experiments.contenders import Contender
+from dengine.experiments.figures import save
+from dengine.experiments.grid import iterate_replays
+from dengine.experiments.kept import Task
+from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
+from dengine.reducers.features import ConvFeatures
+
+STATISTICS = 4  # mean, deviation, minimum, maximum: so many features a segment
+
+
+class PartFeatures(ConvFeatures):
+    """conv's features without some of them: those left out are nought everywhere, and no head learns of them."""
+
+    def keep_only(self, part: slice) -> PartFeatures:
+        """The same, with those of `part` alone."""
+        self.left_out = np.ones(len(self.gain), dtype=bool)
+        self.left_out[part] = False
+        return self
+
+    def standardise(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As every kind of features, but for those that are left out."""
+        z, ratio, shift = super().standardise(raw)
+        for each, value in ((self.gain, 0.0), (self.offset, 0.0), (ratio, 1.0), (shift, 0.0)):
+            each[self.left_out] = value
+        z[:, self.left_out] = 0.0
+        return z, ratio, shift
+
+
+class PartReducer(ConvReducer):
+    """conv with a part of its features; a kind says which, as a slice of them."""
+
+    def part(self, of_segments: int) -> slice:
+        """Which features are kept, where so many are segment statistics."""
+        raise NotImplementedError
+
+    def make_features(self, channels: int, samples: int) -> PartFeatures:
+        """Conv's features, without the others."""
+        features = PartFeatures(channels, samples, self.segments, self.filters, self.regions)
+        return features.keep_only(self.part(STATISTICS * channels * features.segments))
+
+
+class StatisticsReducer(PartReducer):
+    """Segment statistics alone."""
+
+    def part(self, of_segments: int) -> slice:
+        """The first ones."""
+        return slice(0, of_segments)
+
+
+class FiltersReducer(PartReducer):
+    """Learned filters alone."""
+
+    def part(self, of_segments: int) -> slice:
+        """The last ones."""
+        return slice(of_segments, None)
+
+
+class MeansReducer(PartReducer):
+    """The segments' means alone."""
+
+    def part(self, of_segments: int) -> slice:
+        """A quarter of the statistics."""
+        return slice(0, of_segments // STATISTICS)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One try: what is played, by which recipe, under which feedback."""
+
+    data: Dataset
+    recipe: Recipe
+    confirm: bool = False
+
+
+Variants = dict[str, Variant]
+
+
+def setting(name: str, values: tuple[Any, ...]) -> Callable[[Dataset, Recipe], Variants]:
+    """An axis that changes one setting of the recipe."""
+    return lambda data, base: {f"{value:g}": Variant(data, replace(base, **{name: value})) for value in values}
+
+
+def features(data: Dataset, base: Recipe) -> Variants:
+    """Conv's features, parts of them, and those of rocket, under the same heads and radius."""
+    kinds = {"statistics": StatisticsReducer(), "filters": FiltersReducer(), "means": MeansReducer(), "rocket": "rocket"}
+    whole = {"all of conv's": Variant(data, base)}
+    return whole | {name: Variant(data, replace(base, reducer=kind)) for name, kind in kinds.items()}
+
+
+def length(data: Dataset, base: Recipe) -> Variants:
+    """The beginning of each trace: decided earlier, on less."""
+    whole = data.X.shape[-1]
+    cuts = [max(2, round(share * whole)) for share in (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)]
+    return {f"{n / data.rate_hz:.3g} s": Variant(data.cut(n), base) for n in cuts}
+
+
+def channels(data: Dataset, base: Recipe) -> Variants:
+    """Each channel alone, and all; nothing where there is but one."""
+    if data.X.ndim == 2 or data.X.shape[1] == 1:
+        return {}
+    names = getattr(data, "channels", ()) or [f"channel {c}" for c in range(data.X.shape[1])]
+    alone = {str(name): Variant(replace(data, X=data.X[:, c], channels=()), base) for c, name in enumerate(names)}
+    return alone | {"all": Variant(data, base)}
+
+
+def feedback(data: Dataset, base: Recipe) -> Variants:
+    """What is known of accepted parts."""
+    return {
+        "stops alone": Variant(data, base),
+        "good ones confirmed": Variant(data, base, confirm=True),
+        "silence confirms": Variant(data, base.with_policy(stops="all")),
+    }
+
+
+def policy(name: str, values: tuple[str, ...], **others: Any) -> Callable[[Dataset, Recipe], Variants]:
+    """An axis that changes the policy."""
+    return lambda data, base: {value: Variant(data, base.with_policy(**{name: value}, **others)) for value in values}
+
+
+AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
+    "radius": setting("radius", (0.02, 0.03, 0.05, 0.07, 0.1, 0.2)),
+    "retrain": setting("retrain_every", (25, 50, 100, 200, 400)),
+    "folds": setting("folds", (2, 3, 5, 10)),
+    "features": features,
+    "length": length,
+    "channels": channels,
+    "feedback": feedback,
+    "interval": policy("interval", ("wilson", "clopper_pearson", "jeffreys", "binomial")),
+    "guarantee": policy("guarantee", ("local", "pooled"), stops="all"),
+}
+
+
+def play(axis: str, data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:
+    """The replays of every variant of an axis, named by it."""
+    replays: dict[tuple[int, int], Replay] = {}
+    variants = AXES[axis](data, base)
+    for v, (name, one) in enumerate(variants.items()):
+        who = Contender(f"{axis} {name}", one.recipe)
+        tasks = [Task(who, seed, min(args.cycles, len(one.data)), True, one.confirm) for seed in args.seeds]
+        for played in iterate_replays(one.data, tasks, n_jobs=args.n_jobs, keep=args.keep):
+            replays[v, played.position] = played.replay
+    return [replays[key] for key in sorted(replays)]
+
+
+def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
+    """Certain decisions of each variant with their deviation over the shuffles, a panel an axis."""
+    axes_of: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        axes_of.setdefault(row["recipe"].split(" ")[0], []).append(row)
+    figure = Figure(figsize=(9.0, 1.0 + 0.34 * (len(rows) + 2 * len(axes_of))), layout="constrained")
+    panels = figure.subplots(
+        len(axes_of), 1, sharex=True, height_ratios=[len(r) + 1 for r in axes_of.values()], squeeze=False
+    )
+    for axes, (axis, some) in zip(panels.flat, axes_of.items(), strict=True):
+        names = [row["recipe"].removeprefix(f"{axis} ") for row in some]
+        deviation = np.nan_to_num([row["certain_sd"] for row in some])
+        axes.barh(names, [row["certain"] for row in some], xerr=deviation, color="#009E73", alpha=0.7, height=0.7)
+        axes.axvline(as_it_is, color="black", linestyle=":", linewidth=1.2)
+        axes.invert_yaxis()
+        axes.set_ylabel(axis)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels.flat[-1].set_xlabel("certain decisions a replay; dotted: the recipe as it is")
+    figure.suptitle(title)
+    return figure
+
+
+def main() -> None:
+    """Parse, play, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser.add_argument("--recipe", default="conv", help="the recipe that is changed; features are conv's")
+    parser.add_argument("--alpha", type=float, default=0.1, help="error level of the interval")
+    parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
+    parser.add_argument("--only", default=",".join(AXES), help="axes, with commas between")
+    parser.add_argument("--seeds", default="100:110", help="first:last, the last one left out; a replay each")
+    parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most as many as there are traces")
+    parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; times are honest with 1 only")
+    parser.add_argument("--keep", type=Path, help="folder of finished replays")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
+    args = parser.parse_args()
+    unknown = set(args.only.split(",")) - set(AXES)
+    if unknown:
+        parser.error(f"expected axes among {', '.join(AXES)}, got {', '.join(sorted(unknown))}")
+    args.seeds = range(*map(int, args.seeds.split(":")))
+    data = load_dataset(args.data, args.samples)
+    base = Recipe.load(args.recipe).with_policy(alpha=args.alpha, lower_bound=args.lower_bound)
+    played = {axis: play(axis, data, base, args) for axis in args.only.split(",")}
+    for axis in (axis for axis, some in played.items() if not some):
+        print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
+    as_it_is, replays = baseline(data, base, args), [replay for some in played.values() for replay in some]
+    rows = pool(frame_of(as_it_is + replays), as_it_is + replays)
+    title = f"{args.recipe} on {data.name}, ({args.alpha:g}, {100 * args.lower_bound:g} %), seeds {args.seeds[0]} to {args.seeds[-1]}"
+    Console(width=100).print(pooled_table(rows, title))
+    print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv')}")
+    if replays:
+        print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png')}")
+
+
+def baseline(data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:
+    """The recipe as it is, on the same streams."""
+    tasks = [Task(Contender("as it is", base), seed, min(args.cycles, len(data))) for seed in args.seeds]
+    return [played.replay for played in iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep)]
+
+
+if __name__ == "__main__":
+    main()
