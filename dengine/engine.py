@@ -150,8 +150,9 @@ class DataEngine:
             return engine
 
     def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
-        """Decide on one trace, (T,) or (channels, T). TraceError for a wrong shape; whatever else fails becomes VERIFY.
+        """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
+        TraceError for a wrong shape; whatever else fails becomes VERIFY.
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
@@ -166,7 +167,7 @@ class DataEngine:
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_trace(trace, self.trace)
         if self.trace is None:
-            self.agree_on(spec_of(x))
+            self.agree_on(spec_of(x, trace))
         return x
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:

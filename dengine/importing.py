@@ -11,6 +11,7 @@ the same file twice counts no label twice. Traces that a cell recorded itself ha
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -31,10 +32,11 @@ from .folds import content_hash, own_hash
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .store.base import NewLabel, Store, opening
-from .traces import TraceGate, as_traces
+from .traces import TraceGate, as_trace, as_traces
 
 CHUNK = 500  # traces committed together
 LABELS = {"1": True, "0": False}
+RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +64,14 @@ def import_labelled(
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
     data = load_dataset(dataset)
-    spec = TraceSpec(data.X.shape[-1], data.rate_hz, 1 if data.X.ndim == 2 else data.X.shape[1], data.unit)
+    spec = data.spec
     engine = DataEngine.open_or_create(store, seed, recipe=recipe)
     try:
         agreed = engine.agree_on(spec)
-        if agreed.rate_hz != spec.rate_hz:
+        if not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
             raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
+        if data.channels and agreed.columns and data.channels != agreed.columns:
+            raise TraceError(f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}.")
         traces = as_traces(data.X, agreed)
         counts = [_import_chunk(engine.store, *part, agreed, on_traces) for part in _chunks(traces, data)]
     finally:
@@ -156,15 +160,16 @@ def _read_first_form(words: list[str], spec: TraceSpec, where: str) -> JournalLi
 
 def _read_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
     expected = spec.channels * spec.samples
-    if len(words) != expected:
+    if len(words) != expected and (spec.fit == "strict" or len(words) % spec.channels):
         raise DataError(
             f"Expected {expected} samples in {where}, got {len(words)}; a last line that was cut can be removed."
         )
     try:
         with np.errstate(over="ignore"):
-            return np.array([float(word) for word in words]).astype(np.float32).reshape(spec.channels, spec.samples)
+            values = np.array([float(word) for word in words]).astype(np.float32)
     except ValueError as error:
         raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
+    return as_trace(values.reshape(spec.channels, -1), spec)
 
 
 def import_journal(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from .errors import SettingError
+
 
 class Action(StrEnum):
     """What the cell does next. In exported files the position here is the integer, so zero is the safe one."""
@@ -49,15 +51,22 @@ class Outcome(StrEnum):
     UNKNOWN = "unknown"  # silence is not a success
 
 
+FITS = ("strict", "cut", "pad", "resample")  # in exported files the position here is the integer
+
+
 @dataclass(frozen=True, slots=True)
 class TraceSpec:
-    """The contract of a trace.
+    """The contract of a trace. SettingError for values that no trace can keep to.
 
     samples : samples per channel.
     rate_hz : sampling rate in hertz.
     channels : number of channels; a one-channel trace may come as `(samples,)`.
     unit : of the samples, for people only.
     limit : the sensor's range in `unit`; a sample at or beyond ±limit is saturated. None: not checked.
+    fit : what becomes of a trace of another length (`traces.fitted`). strict: TraceError. cut: a longer one loses its end.
+        pad: that, and a shorter one repeats its last sample. resample: linear interpolation over the whole. What cannot
+        honestly be fitted becomes a trace that is not finite: the part is verified, and the cell goes on.
+    columns : the channels' names, by which the columns of a DataFrame are picked; empty: they have none.
     """
 
     samples: int
@@ -65,6 +74,22 @@ class TraceSpec:
     channels: int = 1
     unit: str = "N"
     limit: float | None = None
+    fit: str = "strict"
+    columns: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "columns", (self.columns,) if isinstance(self.columns, str) else tuple(self.columns))
+        if not (self.samples >= 1 and self.channels >= 1 and self.rate_hz > 0):
+            raise SettingError(
+                f"Expected a trace of at least 1 sample and 1 channel at a rate above 0, got {self.samples} samples, "
+                f"{self.channels} channels, {self.rate_hz} Hz."
+            )
+        if self.fit not in FITS:
+            raise SettingError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
+        if self.columns and len(set(self.columns)) != self.channels:
+            raise SettingError(
+                f"Expected {self.channels} different columns, a name a channel, got {', '.join(self.columns)}."
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,10 @@
 """Where a trace enters: its shape is checked, its type cast, its faults and its hash found.
 
 A wrong shape is a caller's bug and raises. A NaN, a dead sensor or a saturated one is the world's fault: it gets a
-reason, the part is verified, and the cell goes on.
+reason, the part is verified, and the cell goes on. So is a wrong length, where `TraceSpec.fit` says what to do with it.
 """
 
+import re
 from typing import Any
 
 import numpy as np
@@ -13,37 +14,122 @@ from torch import Tensor, nn
 
 from .errors import TraceError
 from .folds import CLAMP, QUANTUM, hash_weights
-from .records import REASONS, Reason, TraceSpec
+from .records import FITS, REASONS, Reason, TraceSpec
 
+TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit)([ _\-.(\[].*)?", re.IGNORECASE)  # names of no channel
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
 
 
-def as_trace(trace: ArrayLike, spec: TraceSpec | None) -> NDArray[np.float32]:
-    """One trace, (T,) or (channels, T) of any real dtype, as (C, T) float32; TraceError where it breaks the contract."""
-    x = _as_real(trace)
+def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
+    """One trace, (T,) or (channels, T) of any real dtype, as (C, T) float32; TraceError where it breaks the contract.
+
+    A DataFrame is (T, channels), rows are samples: the contract's `columns`, or all but those of time. A Series is one
+    channel. A length other than the contract's is dealt with as its `fit` says.
+    """
+    x = _as_real(trace if isinstance(trace, np.ndarray) else _without_frame(trace, spec))
     x = x[None, :] if x.ndim == 1 else x
     if x.ndim != 2 or x.size == 0:
         raise TraceError(f"Expected one trace, (samples,) or (channels, samples), got shape {np.shape(trace)}.")
     if spec is not None:
-        _check(x.shape, spec)
+        x = _as_agreed(x, spec)
+    elif len(x) > x.shape[1] and not _is_frame(trace):
+        raise TraceError(
+            f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which looks transposed; "
+            f"pass trace.T, or agree on TraceSpec({x.shape[1]}, channels={len(x)}) first if it is meant."
+        )
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of what it could write to, a memory-mapped array for one
 
 
 def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32]:
-    """Many traces, (n, T) or (n, channels, T), as (n, C, T) float32; TraceError where they break the contract."""
+    """Many traces, (n, T) or (n, channels, T), as (n, C, T) float32; TraceError where they break the contract.
+
+    A length other than the contract's is dealt with as its `fit` says.
+    """
     x = _as_real(X)
     x = x[:, None, :] if x.ndim == 2 else x
     if x.ndim != 3 or 0 in x.shape[1:]:
         raise TraceError(f"Expected traces (n, samples) or (n, channels, samples), got shape {np.shape(X)}.")
     if spec is not None:
-        _check(x.shape[1:], spec)
+        x = _as_agreed(x, spec)
     return np.ascontiguousarray(x)
 
 
-def spec_of(x: NDArray[np.float32]) -> TraceSpec:
-    """The contract that a first trace (C, T) sets."""
-    return TraceSpec(samples=x.shape[1], channels=x.shape[0])
+def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:
+    """The contract that a first trace (C, T) sets; as it came, a DataFrame gives the channels their names."""
+    columns = tuple(map(str, _channels(trace))) if _is_frame(trace) else ()
+    return TraceSpec(samples=x.shape[1], channels=x.shape[0], columns=columns)
+
+
+def fitted(x: Tensor, samples: int, fit: int) -> Tensor:
+    """Traces (..., T) float32 of another length as (..., samples); `fit` is the position in `FITS`, not that of strict.
+
+    Cut and pad keep the samples' times from the start, resample stretches the whole. A trace that is too short to be cut,
+    or that has under half or over twice the samples wanted, is not made up: it keeps its first samples, and the missing
+    ones, at least the last, are NaN, which `TraceGate` finds. Compiled into an exported decision as it stands here.
+    """
+    have = x.size(-1)
+    last = have - 1
+    honest = fits(have, samples, fit)
+    if fit != 3 or not honest:
+        taken = x.index_select(-1, torch.arange(samples).clamp(max=last))
+        if not honest:
+            taken[..., min(have, samples - 1) :].fill_(float("nan"))
+        return taken
+    at = torch.arange(samples, dtype=torch.float64) * (last / max(samples - 1, 1))
+    left = at.floor().to(torch.int64).clamp(max=last)
+    low = x.index_select(-1, left).to(torch.float64)
+    high = x.index_select(-1, (left + 1).clamp(max=last)).to(torch.float64)
+    return (low + (high - low) * (at - left)).to(torch.float32)
+
+
+def fits(have: int, samples: int, fit: int) -> bool:
+    """Whether a trace of so many samples can honestly be brought to others; `fit` is the position in `FITS`."""
+    if fit == 0:
+        return have == samples
+    if fit == 1:
+        return have >= samples
+    return 2 * have >= samples and have <= 2 * samples
+
+
+def is_time(name: str) -> bool:
+    """Whether a column of this name says when, and is no channel."""
+    return TIME.fullmatch(name.strip()) is not None
+
+
+def _is_frame(trace: Any) -> bool:
+    return hasattr(trace, "columns") and hasattr(trace, "to_numpy")
+
+
+def _without_frame(trace: Any, spec: TraceSpec | None) -> Any:
+    """A DataFrame's channels as (C, T), whatever package it is of; everything else as it is."""
+    if not _is_frame(trace):
+        return trace
+    have = list(trace.columns)
+    if spec is not None and spec.columns:
+        missing = [name for name in spec.columns if name not in have]
+        if missing:
+            raise TraceError(f"Expected the columns {', '.join(spec.columns)}, got {_listed(have)}.")
+        return trace[list(spec.columns)].to_numpy().T
+    names = _channels(trace)
+    if not names or (spec is not None and len(names) != spec.channels):
+        wanted = "at least one channel" if spec is None else f"{spec.channels} channel(s)"
+        raise TraceError(
+            f"Expected a DataFrame with {wanted}, a column each, got the columns {_listed(have)}; "
+            "pass the right ones, or name them in TraceSpec(columns=...)."
+        )
+    return trace[names].to_numpy().T
+
+
+def _channels(frame: Any) -> list[Any]:
+    """The columns of a DataFrame that are not of time."""
+    dated = {name for name in frame.columns if str(frame[name].dtype).lower().startswith(("date", "time"))}
+    return [name for name in frame.columns if name not in dated and not is_time(str(name))]
+
+
+def _listed(names: list[Any]) -> str:
+    few = ", ".join(map(str, names[:8]))
+    return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
 
 
 def _as_real(values: ArrayLike) -> NDArray[np.float32]:
@@ -56,17 +142,25 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
         return array.astype(np.float32, copy=False)
 
 
-def _check(shape: tuple[int, ...], spec: TraceSpec) -> None:
-    channels, samples = shape
+def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
+    """(..., C, T) with the contract's channels and samples."""
+    channels, samples = x.shape[-2:]
     if channels != spec.channels:
+        turned = "; it looks transposed: pass trace.T" if (samples, channels) == (spec.channels, spec.samples) else ""
         raise TraceError(
-            f"Expected {spec.channels} channel(s), got {channels}; pass (channels, samples), all channels of the contract."
+            f"Expected {spec.channels} channel(s), got {channels}; pass (channels, samples), all channels of the "
+            f"contract{turned}."
         )
-    if samples != spec.samples:
+    if samples == spec.samples:
+        return x
+    if spec.fit == "strict":
         seconds = spec.samples / spec.rate_hz
         raise TraceError(
             f"Expected {spec.samples} samples, got {samples}; resample the trace to {spec.rate_hz:g} Hz x {seconds:g} s."
         )
+    whole = torch.from_numpy(np.array(x, order="C"))
+    values: NDArray[np.float32] = fitted(whole, spec.samples, FITS.index(spec.fit)).numpy()
+    return values
 
 
 class TraceGate(nn.Module):

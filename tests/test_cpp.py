@@ -140,6 +140,35 @@ def test_several_channels_come_one_after_the_other(
     assert_equal(lines, load_exported(path).decide_many(data.X), 2)
 
 
+@pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
+def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_the_journal(
+    programs: Path, make_data: Callable[..., Dataset], tmp_path: Path, fit: str
+) -> None:
+    data, store, journal = make_data(200, SAMPLES), tmp_path / "engine.db", tmp_path / "cell.csv"
+    recipe = Recipe(reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.1)
+    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, fit=fit)) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        path = export_torchscript(engine, tmp_path / "model.ts")
+    lengths = [98, 100, 103, 60, 150, 30, 230, 1] * 5
+    grown = make_data(40, 240, seed=4).X
+    traces = [np.ascontiguousarray(x[:n]) for x, n in zip(grown, lengths, strict=True)]
+    exported, expected = load_exported(path), []
+    for x in traces:
+        expected.append(exported.decide(x))
+        if expected[-1].action is Action.VERIFY:
+            exported.learn(x, True)
+    stdin = b"".join(csv(x[None], [1]) for x in traces)
+    for part in (stdin[: stdin.index(b"\n") + 1], stdin[stdin.index(b"\n") + 1 :]):  # the second run reads the journal
+        lines, _ = cell(programs, path, "--learn", "--journal", journal, stdin=part)
+        assert_equal(lines, expected[: len(lines)], 2)
+        expected = expected[len(lines) :]
+    assert expected == []
+    report = import_journal(store, journal)
+    assert report.quarantined == 5 * {"cut": 4, "pad": 3, "resample": 3}[fit]
+
+
 class Live(NamedTuple):
     """What comes in at a cell, and what the exported file in Python makes of it, told as the program tells it."""
 
@@ -212,6 +241,10 @@ def test_the_cell_learns_stops_and_silence_as_python_does(
     assert {d.reason for d in expected.decisions} >= reasons | ({Reason.SAFE_MODE} if stops_all else set())
 
 
+BOTH = pytest.mark.parametrize("learning", ["local-some", "pooled-all"], indirect=True)  # both of either setting
+
+
+@BOTH
 def test_a_killed_cell_goes_on_as_if_nothing_had_happened(
     programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
@@ -220,7 +253,7 @@ def test_a_killed_cell_goes_on_as_if_nothing_had_happened(
     waiting = next(i for i in range(150, 350) if not labels[i] and expected.decisions[i].action is Action.ACCEPT)
     command = [programs / "dengine_cell", learning[1], "--parts", "--learn", "--journal", journal]
     found: list[list[str]] = []
-    for end in (1, 90, waiting + 1, 400, 499):
+    for end in (1, waiting + 1, 499):
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
             assert process.stdin is not None
             assert process.stdout is not None
@@ -264,6 +297,7 @@ def test_a_journal_is_worth_what_the_engine_would_have_seen_itself(
     assert found[0] == found[1]
 
 
+@BOTH
 def test_without_labels_silence_counts_for_nothing(
     programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset]
 ) -> None:
@@ -294,13 +328,19 @@ def test_a_journal_of_another_export_is_not_counted_again(programs: Path, file: 
         assert "belongs to another export, or to an older program; take it in with dengine import-labels" in said
 
 
+@pytest.fixture(scope="module")
+def written(programs: Path, file: Path, many: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A journal of two parts."""
+    journal = tmp_path_factory.mktemp("written") / "cell.csv"
+    cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:2], [1, 0]))
+    return journal.read_text()
+
+
 @pytest.mark.parametrize("kind", ["cut", "shorter", "no label", "another action", "another reason"])
 def test_a_journal_line_that_cannot_be_read_is_named(
-    programs: Path, file: Path, many: np.ndarray, tmp_path: Path, kind: str
+    programs: Path, file: Path, written: str, tmp_path: Path, kind: str
 ) -> None:
-    journal = tmp_path / "cell.csv"
-    cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:2], [1, 0]))
-    text = journal.read_text()
+    journal, text = tmp_path / "cell.csv", written
     line = text.splitlines()[-1]
     wrong = {
         "cut": text[:-1],

@@ -15,6 +15,7 @@ import click
 
 from .. import __version__
 from ..errors import DengineError
+from .data import data
 from .export import export, import_labels
 from .interrupting import end_interrupted
 from .options import example
@@ -62,5 +63,5 @@ def main() -> None:
     """
 
 
-for verb in (replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
     main.add_command(verb)

@@ -57,17 +57,33 @@ class RecipeChoice:
 
 @dataclass(frozen=True)
 class DataChoice:
-    """Which data set was asked for: a name or file, how many samples, and the name of its array of parts' numbers."""
+    """Which data set was asked for, and how: as `load_dataset` takes it."""
 
     data: str
     samples: int | None = None
     part: str = "part"
+    channel: str | None = None
+    label: str | None = None
+    labels: str | None = None
+    fit: str | None = None
+    rate_hz: float | None = None
 
-    def load(self) -> Dataset:
-        """The data set; DataError for what cannot be read."""
+    def load(self, quiet: bool = False) -> Dataset:
+        """The data set; what was left out of it is said on stderr, or not. DataError for what cannot be read."""
         from ..datasets import load_dataset
 
-        return load_dataset(self.data, self.samples, self.part)
+        how = {name: getattr(self, name) for name in ("channel", "label", "labels", "fit", "rate_hz")}
+        data = load_dataset(self.data, self.samples, self.part, **how)
+        if data.faults and not quiet:
+            click.echo(left_out(data), err=True)
+        return data
+
+
+def left_out(data: Dataset, most: int = 3) -> str:
+    """What could not be read, a line each for the first few."""
+    n, faults = len(data.faults), data.faults[:most]
+    of = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
+    return "\n".join([of, *(f"  {fault}" for fault in faults), *([f"  and {n - most} more"] if n > most else [])])
 
 
 def short_name(name: str) -> str:
@@ -142,39 +158,68 @@ def recipe_options(command: Command) -> Command:
     return with_reducer(with_recipe(policy_options(chosen)))
 
 
+DATA = {  # how a data set is read: what `load_dataset` calls them
+    "samples": click.option(
+        "--samples",
+        type=click.IntRange(1),
+        help="Use only the first so many samples of each trace: decides earlier, on less.  [default: all]",
+    ),
+    "channel": click.option(
+        "--channel", metavar="NAMES", help="FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
+    ),
+    "label": click.option(
+        "--label",
+        metavar="PATTERN",
+        help="In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column.  "
+        "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]",
+    ),
+    "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
+    "fit": click.option(
+        "--fit",
+        type=click.Choice(["strict", "cut", "pad", "resample"]),
+        help="What becomes of traces of another length.  [default: strict where all are alike, else pad]",
+    ),
+    "rate_hz": click.option(
+        "--rate",
+        "rate_hz",
+        type=click.FloatRange(0.0, min_open=True),
+        metavar="HZ",
+        help="Instead of what timestamps tell.",
+    ),
+    "part": click.option(
+        "--part",
+        metavar="KEY",
+        default="part",
+        show_default=True,
+        help="The array or column of parts' numbers, if any: a part that comes again has one vote.",
+    ),
+}
+
+
+def reading_options(command: Command) -> Command:
+    """The options of DATA and `data`, given before, handed on as one `DataChoice`, `source`."""
+
+    @wraps(command)
+    def sourced(data: str, **others: Any) -> Any:
+        how = {name: others.pop(name) for name in DATA}
+        return command(source=DataChoice(data, **how), **others)
+
+    for option in reversed(DATA.values()):
+        sourced = option(sourced)
+    return sourced
+
+
 def data_options(default: str | None = "insertion") -> Callable[[Command], Command]:
-    """`--data`, `--samples` and `--part`, handed on as one `DataChoice`, `source`."""
-
-    def decorate(command: Command) -> Command:
-        @wraps(command)
-        def sourced(data: str, samples: int | None, part: str, **others: Any) -> Any:
-            return command(source=DataChoice(data, samples, part), **others)
-
-        shown: dict[str, Any] = {"required": True} if default is None else {"default": default, "show_default": True}
-        for option in (
-            click.option(
-                "--part",
-                metavar="KEY",
-                default="part",
-                show_default=True,
-                help="The file's array of parts' numbers, if any: a part that comes again has one vote.",
-            ),
-            click.option(
-                "--samples",
-                type=click.IntRange(1),
-                help="Use only the first so many samples of each trace: decides earlier, on less.  [default: all]",
-            ),
-            click.option(
-                "--data",
-                metavar="NAME|FILE",
-                help="The bundled set, insertion, or an .npz file: X (traces, samples) and y (1 success, 0 failure).",
-                **shown,
-            ),
-        ):
-            sourced = option(sourced)
-        return sourced
-
-    return decorate
+    """`--data` and how it is read, handed on as one `DataChoice`, `source`."""
+    shown: dict[str, Any] = {"required": True} if default is None else {"default": default, "show_default": True}
+    option = click.option(
+        "--data",
+        metavar="NAME|FILE|FOLDER",
+        help="The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv "
+        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure).",
+        **shown,
+    )
+    return lambda command: option(reading_options(command))
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:

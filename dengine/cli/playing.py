@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..errors import SettingError
 from .output import duration, progress
@@ -96,7 +96,8 @@ def _cluster(stream: Stream, dataset: Dataset) -> Iterator[tuple[int, int]]:
         return
     if find_spec("distributed") is None:
         raise SettingError('Expected dask for --scheduler, it is not installed: pip install "dengine[dask]".')
-    import distributed
+    from distributed import Client
 
-    with distributed.Client(stream.scheduler) as client, parallel_config("dask", client=client, scatter=[dataset]):
+    connect: Any = Client  # untyped
+    with connect(stream.scheduler) as client, parallel_config("dask", client=client, scatter=[dataset]):
         yield -1, max(1, sum(client.nthreads().values()))

@@ -193,9 +193,9 @@ def compare(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Replay the same streams through several reducers and rival methods, under one policy or a grid of them.
+    """Replay the same streams through several methods.
 
-    UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
+    Reducers and rivals, under one policy or a grid of them. UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
     """
     asked = [name.strip() for name in reducers.split(",") if name.strip()]
     if not asked:
@@ -231,7 +231,7 @@ def _play(
 ) -> None:
     from ..experiments.grid import grid_tasks
 
-    dataset = source.load()
+    dataset = source.load(quiet=as_json)
     tasks = grid_tasks(
         who, grid.alphas, grid.lower_bounds, grid.intervals, stream.seeds, grid.guarantees, grid.confirms,
         stream.cycles, stream.shuffle,

@@ -36,6 +36,7 @@ def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out:
         dropped = {name: sum(not r.accepted for r in reports) for name, reports in retrains.items()}
         rows = [row | {"retrains_dropped": dropped[row["recipe"]]} for row in rows]
         about = {"verb": verb, "data": dataset.name, "in_order": not stream.shuffle, "interrupted": finished.interrupted}
+        about |= {"faults": dataset.faults}
         costs = _costs(finished) | {"found": finished.found}
         write_json(about | {"rows": rows, "findings": found, "costs": costs, "files": files})
         return

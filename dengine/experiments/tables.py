@@ -28,7 +28,7 @@ COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative",
 ERROR = ("error_lower", "error_upper")
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
 PROMISE = (
-    "certain: cycles decided without a check, a mean a replay with its standard deviation over the replays, and their "
+    "certain: cycles decided without a check, a mean a replay ± its standard deviation over the replays, and their "
     "share of all cycles. accept, reject: such decisions; below them "
     "the wrong ones, FP (bad parts accepted) and FN (good parts rejected). precision: the share of accepted parts that "
     "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
@@ -159,12 +159,12 @@ def _number(value: float, digits: int) -> str:
 
 def _with_sd(row: Mapping[str, Any], name: str) -> str:
     deviation = row[f"{name}_sd"]
-    return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.1f} ± {deviation:.0f}"
+    return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"
 
 
 _CELLS_OF: dict[str, Any] = {
     "alpha\nLB": lambda r: f"{r['alpha']:g}\n{100 * r['lower_bound']:g} %",
-    "certain\n± sd, share": lambda r: f"{_with_sd(r, 'certain')}\n{_percent(r['total_certain'] / r['cycles'])}",
+    "certain\nshare": lambda r: f"{_with_sd(r, 'certain')}\n{_percent(r['total_certain'] / r['cycles'])}",
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",

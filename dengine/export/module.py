@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from ..folds import COIN_BITS, MIX, audit_salt
 from ..model.module import NOVEL, Predictor
-from ..records import REASONS, Reason, TraceSpec
-from ..traces import TraceGate
+from ..records import FITS, REASONS, Reason, TraceSpec
+from ..traces import TraceGate, fitted
 
 One = tuple[int, int, float, float, int, int, Tensor]
 Many = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -52,6 +52,7 @@ class DecisionModule(nn.Module):
         self.predictor = predictor
         self.channels = spec.channels
         self.samples = spec.samples
+        self.fit = FITS.index(spec.fit)
         self.n_spaces = n_spaces
         self.dim = dim
         self.audit_below = int(audit_rate * 2**COIN_BITS)
@@ -195,11 +196,13 @@ class DecisionModule(nn.Module):
         self.silent = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
-        """(C, T) float32; raises for another shape, which is a caller's bug."""
+        """(C, T) float32 of the contract's length; raises for another shape, which is a caller's bug."""
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
-        if x.dim() != 2 or x.size(0) != self.channels or x.size(1) != self.samples:
+        length = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)
+        if x.dim() != 2 or x.size(0) != self.channels or not length:
             raise ValueError(f"Expected one trace of {self.channels} x {self.samples} samples, got shape {trace.size()}.")
-        return x.to(torch.float32).contiguous()
+        x = x.to(torch.float32).contiguous()
+        return x if x.size(1) == self.samples else fitted(x, self.samples, self.fit)
 
     def toss(self, content: int) -> int:
         """`folds.toss` of one hash: 64-bit integers that wrap around."""

@@ -67,7 +67,6 @@ static int run(const Options& options) {
     at::set_num_threads(1);  // steadier by far at these sizes
     Model model(options.model);
     const c10::InferenceMode guard;
-    const auto size = static_cast<std::size_t>(model.channels * model.samples);
 
     std::optional<Journal> journal;
     if (!options.journal.empty()) journal.emplace(options.journal, model);
@@ -76,7 +75,7 @@ static int run(const Options& options) {
     Input input;
     const Columns columns{options.parts, options.learn};
     const auto next = [&] {
-        return options.binary ? next_block(std::cin, size, input) : next_line(std::cin, columns, size, input);
+        return options.binary ? next_block(std::cin, model.shape.size(), input) : next_line(std::cin, columns, model.shape, input);
     };
     for (long long number = 1; next(); ++number) {
         if (!input.fault.empty()) {
@@ -86,14 +85,14 @@ static int run(const Options& options) {
             continue;
         }
         const auto begin = std::chrono::steady_clock::now();
-        const Decision decision = model.decide(input.samples.data(), input.part);
+        const Decision decision = model.decide(input.samples, input.part);
         const std::chrono::duration<double, std::micro> elapsed = std::chrono::steady_clock::now() - begin;
         print(model.actions.at(decision.action), model.reasons.at(decision.reason), decision, elapsed.count());
         if (!options.learn) {
             model.drop();
         } else if (decision.action == ACCEPT || (decision.action == VERIFY && input.success)) {
             if (journal) journal->append(input, decision);  // written before it is counted
-            if (input.success) model.tell(input.samples.data(), input.part, decision.action, *input.success);
+            if (input.success) model.tell(input.samples, input.part, decision.action, *input.success);
         }
     }
     return malformed > 0 ? 1 : 0;

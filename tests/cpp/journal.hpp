@@ -72,12 +72,12 @@ class Journal {
         const std::string label = word(), part = word(), action = word(), predicted = word(), reason = word();
         const std::string lower = word(), upper = word(), n_success = word(), n_failure = word();
         Input input;
-        parse_line(line, {}, static_cast<std::size_t>(model_.channels * model_.samples), input);
+        parse_line(line, {}, model_.shape, input);
         const auto did = position(model_.actions, action), why = position(model_.reasons, reason);
         if (!more || !input.fault.empty() || did < 0 || why < 0 || label.size() > 1) return false;
-        model_.restore(input.samples.data(), part, did, why, std::strtod(lower.c_str(), nullptr),
+        model_.restore(input.samples, part, did, why, std::strtod(lower.c_str(), nullptr),
                        std::strtod(upper.c_str(), nullptr));
-        if (label != "") model_.tell(input.samples.data(), part, did, label == "1");
+        if (label != "") model_.tell(input.samples, part, did, label == "1");
         return true;
     }
 

@@ -47,13 +47,22 @@ inline bool parse(std::string_view word, float& out) {
     return error == std::errc() && end == word.data() + word.size();
 }
 
+// How many samples a trace has: so many, or where the model fits other lengths, any number in each channel.
+struct Shape {
+    std::size_t channels = 1, samples = 0;
+    bool any_length = false;
+
+    std::size_t size() const { return channels * samples; }
+    bool takes(std::size_t n) const { return n == size() || (any_length && n > 0 && n % channels == 0); }
+};
+
 // What a line begins with, in this order.
 struct Columns {
     bool part = false, label = false;
 };
 
 // `[part,][label,]sample,sample,...`; a label is 1 (success), 0 (failure) or empty (unknown).
-inline void parse_line(std::string_view line, Columns columns, std::size_t expected, Input& input) {
+inline void parse_line(std::string_view line, Columns columns, const Shape& shape, Input& input) {
     input = {};
     bool more = true;
     if (columns.part) input.part = take_word(line, more);
@@ -75,16 +84,16 @@ inline void parse_line(std::string_view line, Columns columns, std::size_t expec
             input.fault = "expected a number in column " + column + ", got " + quoted(word);
         }
     }
-    if (input.fault.empty() && input.samples.size() != expected) {
-        input.fault = "expected " + std::to_string(expected) + " samples, got " + std::to_string(input.samples.size());
+    if (input.fault.empty() && !shape.takes(input.samples.size())) {
+        input.fault = "expected " + std::to_string(shape.size()) + " samples, got " + std::to_string(input.samples.size());
     }
 }
 
 // The next line that is not empty; false at the end.
-inline bool next_line(std::istream& in, Columns columns, std::size_t expected, Input& input) {
+inline bool next_line(std::istream& in, Columns columns, const Shape& shape, Input& input) {
     for (std::string line; std::getline(in, line);) {
         if (trimmed(line).empty()) continue;
-        parse_line(line, columns, expected, input);
+        parse_line(line, columns, shape, input);
         return true;
     }
     return false;

@@ -24,6 +24,11 @@ class Metadata {
         return found->second;
     }
 
+    // The same, or what an earlier version meant, which did not say it.
+    std::string text(const std::string& key, const std::string& otherwise) const {
+        return scalars_.count(key) ? text(key) : otherwise;
+    }
+
     double number(const std::string& key) const {
         const auto& word = text(key);
         char* end = nullptr;

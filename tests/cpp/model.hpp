@@ -13,6 +13,7 @@
 #include <string_view>
 #include <vector>
 
+#include "lines.hpp"
 #include "metadata.hpp"
 #include "sha256.hpp"
 
@@ -65,20 +66,21 @@ class Model {
                 ? "it was written by a newer dengine, " + version + "; build a newer cell program"
                 : "it was written by an older dengine, " + version + "; export it anew");
         }
-        channels = static_cast<std::int64_t>(metadata_.number("trace.channels"));
-        samples = static_cast<std::int64_t>(metadata_.number("trace.samples"));
+        shape.channels = static_cast<std::size_t>(metadata_.number("trace.channels"));
+        shape.samples = static_cast<std::size_t>(metadata_.number("trace.samples"));
+        shape.any_length = metadata_.text("trace.fit", "strict") != "strict";
         actions = metadata_.list("actions");
         reasons = metadata_.list("reasons");
         width = static_cast<std::size_t>(metadata_.number("spaces") * metadata_.number("dim"));
         check_golden();
     }
 
-    // x: channels * samples floats, channel by channel; read, not kept. Tells the model also that the next part has come:
+    // x: channels * samples floats, channel by channel; read, not kept. Another length is fitted by the model. Tells the model also that the next part has come:
     // an accepted one before it, of which nothing was heard, went on.
-    Decision decide(float* x, const std::string& part) { return decide(decide_, x, part); }
+    Decision decide(std::vector<float>& x, const std::string& part) { return decide(decide_, x, part); }
 
     // What became of the part that was decided last.
-    void tell(float* x, const std::string& part, std::int64_t action, bool success) {
+    void tell(std::vector<float>& x, const std::string& part, std::int64_t action, bool success) {
         if (action == ACCEPT && !success) {
             module_.run_method("stop", tensor(x), part_hash(part));
         } else {
@@ -93,17 +95,17 @@ class Model {
     std::int64_t predicted() { return module_.run_method("predicted").toInt(); }
 
     // A decision of an earlier run, in the place of `decide`.
-    void restore(float* x, const std::string& part, std::int64_t action, std::int64_t reason, double lower, double upper) {
+    void restore(std::vector<float>& x, const std::string& part, std::int64_t action, std::int64_t reason, double lower, double upper) {
         module_.run_method("restore", tensor(x), part_hash(part), action, reason, lower, upper);
     }
 
-    std::int64_t channels, samples;
+    Shape shape;
     std::vector<std::string> actions, reasons;
     std::size_t width;  // numbers in an embedding
     std::string sum;
 
   private:
-    Decision decide(torch::jit::Method& method, float* x, const std::string& part) const {
+    Decision decide(torch::jit::Method& method, std::vector<float>& x, const std::string& part) const {
         const auto result = method({tensor(x), part_hash(part)});
         const auto& field = result.toTupleRef().elements();
         const at::Tensor z = field[6].toTensor().contiguous();
@@ -130,22 +132,25 @@ class Model {
         return Metadata(json);
     }
 
-    at::Tensor tensor(float* x) const { return torch::from_blob(x, {channels, samples}, torch::kFloat32); }
+    at::Tensor tensor(std::vector<float>& x) const {
+        const auto channels = static_cast<std::int64_t>(shape.channels);
+        return torch::from_blob(x.data(), {channels, static_cast<std::int64_t>(x.size()) / channels}, torch::kFloat32);
+    }
 
     void check_golden() {
         std::vector<float> trace;
         for (const auto& word : metadata_.list("golden.trace")) trace.push_back(std::strtof(word.c_str(), nullptr));
         const auto expected = metadata_.list("golden.embedding");
-        if (trace.size() != static_cast<std::size_t>(channels * samples) || expected.size() != width) {
+        if (trace.size() != shape.size() || expected.size() != width) {
             throw std::runtime_error("its golden trace does not fit its own contract");
         }
         // A copy runs the same compiled code, and this module must not learn of the golden trace.
         torch::jit::Module copy = module_.deepcopy();
         torch::jit::Method method = copy.get_method("decide");
         for (int i = 0; i < WARM_UP; ++i) {
-            const auto found = decide(method, trace.data(), "").embedding;
-            copy.run_method("learn", tensor(trace.data()), true, 0);
-            copy.run_method("stop", tensor(trace.data()), 0);
+            const auto found = decide(method, trace, "").embedding;
+            copy.run_method("learn", tensor(trace), true, 0);
+            copy.run_method("stop", tensor(trace), 0);
             for (std::size_t j = 0; j < width; ++j) {
                 const double want = std::strtod(expected[j].c_str(), nullptr);
                 if (!(std::abs(found.at(j) - want) <= TOLERANCE * (1.0 + std::abs(want)))) {

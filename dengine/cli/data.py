@@ -1,0 +1,131 @@
+"""`dengine data`: what a data set is, before anything is learned from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .options import DataChoice, example, json_option, out_option, reading_options
+from .output import duration, show, write_json
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..experiments.survey import Drift, Survey
+
+MOST = 10  # faults that are named
+CLEAR = 0.01  # p-values below it are called drift
+FITTED = {
+    "cut": "longer ones lose their end",
+    "pad": "longer ones lose their end, shorter ones repeat their last sample",
+    "resample": "the whole of each on so many points",
+}
+
+
+@click.command(epilog=example("dengine data insertion --out out/"))
+@click.argument("data", metavar="NAME|FILE|FOLDER")
+@reading_options
+@out_option
+@json_option
+def data(source: DataChoice, out: Path | None, as_json: bool) -> None:
+    """Say what a data set is, and what is wrong with it.
+
+    A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz or .h5
+    with X (traces, samples) and y (1 success, 0 failure); or the bundled set, insertion.
+    """
+    from ..experiments.survey import survey
+
+    dataset = source.load(quiet=True)
+    found = survey(dataset)
+    files = []
+    if out is not None:
+        from ..experiments.look import save
+        from ..experiments.survey_picture import data_picture
+
+        files = [save(data_picture(dataset, found.name), out / "data.png")]
+    if as_json:
+        write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
+        return
+    show(_table(found))
+    show(*_faults(found), *(f"Wrote {path}" for path in files))
+
+
+def _table(found: Survey) -> Table:
+    from rich.table import Table
+
+    table = Table(title=found.name, show_header=False, title_justify="left")
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, text in (*_form(found), *_state(found), *_order(found)):
+        table.add_row(name, text)
+    return table
+
+
+def _form(found: Survey) -> Iterator[tuple[str, str]]:
+    yield "traces", f"{found.traces}, {len(found.faults)} left out" if found.faults else str(found.traces)
+    named = f" ({', '.join(found.names)})" if found.names else ""
+    several = f"{found.channels} channel{'s' if found.channels > 1 else ''}{named}"
+    yield "form", f"{several} of {found.samples} samples, {duration(found.seconds)}, in {found.unit}"
+    if found.lengths is not None:
+        low, median, high = (f"{x:g}" for x in (found.lengths.low, found.lengths.median, found.lengths.high))
+        yield "lengths", f"all {low}" if low == high else f"{low} to {high} samples, median {median}"
+    if found.fit != "strict":
+        yield "fit", f"{found.fit}, to {found.samples} samples: {FITTED[found.fit]}"
+    yield "rate", _rate(found)
+
+
+def _rate(found: Survey) -> str:
+    if found.rates is None:
+        return f"{found.rate_hz:g} Hz, as stated: there are no timestamps that say so"
+    low, high = f"{found.rates.low:g}", f"{found.rates.high:g}"
+    each = f"{low} Hz each" if low == high else f"{low} to {high} Hz, median {found.rates.median:g}"
+    stated = (
+        "" if math.isclose(found.rate_hz, found.rates.median, rel_tol=1e-3) else f"; of the traces {found.rate_hz:g} Hz"
+    )
+    return f"{each}, by the timestamps{stated}"
+
+
+def _state(found: Survey) -> Iterator[tuple[str, str]]:
+    from ..model.repeats import SUSPICIOUS
+
+    yield "labels", f"{found.good} good, {found.bad} bad: {100 * found.good / found.traces:.1f} % good"
+    if found.parts is not None:
+        yield "parts", f"{found.parts}, {found.traces - found.parts} traces are of a part that came before"
+    bad = [f"{n} {what}" for n, what in ((found.not_finite, "not finite"), (found.constant, "constant")) if n]
+    yield "bad traces", f"{', '.join(bad)}: verified, never learned from" if bad else "none"
+    again = f", {found.contradicting} of them with another label" if found.contradicting else ""
+    yield "duplicates", f"{found.duplicates} equal an earlier trace{again}" if found.duplicates else "none"
+    many = found.near_repeats > SUSPICIOUS * found.looked_at
+    advice = ": if parts come twice, give their numbers (--part)" if many else ", no more than different parts do"
+    near = f"{found.near_repeats} of the newest {found.looked_at} nearly repeat another part's{advice}"
+    yield "near repeats", near if found.near_repeats else "none"
+
+
+def _order(found: Survey) -> Iterator[tuple[str, str]]:
+    for each in found.drift:
+        yield f"{each.name} by tenths", f"{_tenths(each)}\n{_trend(each)}"
+
+
+def _tenths(each: Drift) -> str:
+    if each.name == "good":
+        return " ".join(f"{100 * x:.0f}" for x in each.tenths) + " %"
+    return " ".join("-" if math.isnan(x) else f"{x:.3g}" for x in each.tenths)
+
+
+def _trend(each: Drift) -> str:
+    if math.isnan(each.rho):
+        return "never changes"
+    said = "no drift is seen" if each.p >= CLEAR else "rises with the order" if each.rho > 0 else "falls with the order"
+    return f"{said} (Spearman's rho {each.rho:+.2f}, p {each.p:.2g})"
+
+
+def _faults(found: Survey) -> list[Any]:
+    if not found.faults:
+        return []
+    n = len(found.faults)
+    rest = [f"and {n - MOST} more."] if n > MOST else []
+    return [f"Left out, {n}:", *(f"- {fault}" for fault in found.faults[:MOST]), *rest]

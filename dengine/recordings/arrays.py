@@ -1,0 +1,114 @@
+"""Arrays: archives of NumPy (.npz), HDF5 files, pairs (X, y) in memory, lists of traces of any length."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError, TraceError
+from ..traces import as_trace, spec_of
+from .asked import Asked
+from .dataset import Dataset, Fault, UnreadableError, make_dataset
+from .labels import label_of
+from .lengths import Collected, as_dataset, refit
+
+LARGEST = 8 * 2**30  # bytes of an archive's arrays, unpacked
+USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")
+
+
+def read_npz(path: Path, name: str, asked: Asked) -> Dataset:
+    """`X`, `y`, and what is known beside them: `scale`, `rate_hz`, `unit`, `cause`, `channels`, and the parts' numbers."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(each.file_size for each in archive.infolist())
+        if size > LARGEST:
+            raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
+        with np.load(path, allow_pickle=False) as file:
+            found = {key: file[key] for key in file.files if key in (*USED, asked.part)}
+            return _from_arrays(found, file.files, path, name, asked)
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        if isinstance(error, DataError):
+            raise
+        said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
+        raise DataError(f"Cannot read {path} as an .npz file of plain arrays: {said}.") from error
+
+
+def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
+    """The same as data sets of an HDF5 file, by h5py."""
+    if find_spec("h5py") is None:
+        raise DataError('Expected h5py for HDF5 files, it is not installed: pip install "dengine[files]".')
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            have = [key for key in file if isinstance(file[key], h5py.Dataset)]
+            found = {key: _plain(file[key]) for key in have if key in (*USED, asked.part)}
+            return _from_arrays(found, have, path, name, asked)
+    except OSError as error:
+        raise DataError(f"Cannot read {path} as an HDF5 file: {error}.") from error
+
+
+def _plain(dataset: Any) -> Any:
+    texts = dataset.dtype.kind == "O"
+    return np.asarray(dataset.asstr()[()] if texts else dataset[()]).astype(np.str_ if texts else dataset.dtype)
+
+
+def _from_arrays(found: Mapping[str, Any], have: Sequence[str], path: Path, name: str, asked: Asked) -> Dataset:
+    listed = ", ".join(have) or "none"
+    if not {"X", "y"} <= set(found):
+        raise DataError(f"Expected arrays X and y in {path}, found {listed}.")
+    if asked.part != "part" and asked.part not in found:
+        raise DataError(f"Expected an array {asked.part} in {path}, found {listed}.")
+    X = found["X"].astype(np.float32)
+    X *= np.float32(found.get("scale", 1.0))
+    about = {key: found[key] for key in ("cause",) if key in found}
+    rate, unit = float(found.get("rate_hz", 500.0)), str(found.get("unit", "N"))
+    channels = tuple(map(str, np.atleast_1d(found["channels"]))) if "channels" in found else ()
+    part = found.get(asked.part)
+    return refit(
+        make_dataset(X, found["y"], name=name, rate_hz=rate, unit=unit, part=part, channels=channels, **about), asked
+    )
+
+
+def from_pair(X: Any, y: Any, asked: Asked) -> Dataset:
+    """Traces in memory and their labels: one array, or a list of arrays, Series or DataFrames of any length."""
+    if isinstance(X, list | tuple) or (isinstance(X, np.ndarray) and X.dtype.kind == "O"):
+        traces = list(X)
+        if traces and not all(np.isscalar(each) for each in traces):
+            return _from_list(traces, list(y), asked)
+    return refit(make_dataset(X, y), asked)
+
+
+def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
+    if len(traces) != len(labels):
+        raise DataError(f"Expected a label for each trace, got {len(traces)} traces and {len(labels)} labels.")
+    found = Collected("data", asked.channels, [])
+    for number, (trace, word) in enumerate(zip(traces, labels, strict=True), start=1):
+        try:
+            picked = _picked(trace, found.channels)
+            x, label = as_trace(picked, None), label_of(word)
+            if found.traces and len(x) != len(found.traces[0]):
+                raise UnreadableError(f"Expected {len(found.traces[0])} channel(s), as the first one has, got {len(x)}")
+        except (TraceError, UnreadableError) as error:
+            found.faults.append(Fault("data", number, str(error).rstrip(".")))
+            continue
+        found.channels = found.channels or spec_of(x, picked).columns
+        found.add(x, label, f"trace {number}", None, None)
+    if found.traces and len(found.channels) not in (0, len(found.traces[0])):
+        raise DataError(f"Expected a name for each of {len(found.traces[0])} channels, got {', '.join(found.channels)}.")
+    return as_dataset(found, asked)
+
+
+def _picked(trace: Any, channels: tuple[str, ...]) -> Any:
+    """The named columns of a DataFrame; everything else as it is."""
+    if not channels or not hasattr(trace, "columns"):
+        return trace
+    missing = [name for name in channels if name not in trace.columns]
+    if missing:
+        raise UnreadableError(f"Expected a column {missing[0]}, got {', '.join(map(str, trace.columns))[:100]}")
+    return trace[list(channels)]

@@ -1,0 +1,94 @@
+"""One door for all that holds labelled traces: `load_dataset`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+from ..errors import DataError
+from .arrays import from_pair, read_hdf5, read_npz
+from .asked import Asked, names_of
+from .dataset import Dataset
+from .folder import read_folder
+from .lengths import refit
+from .tables import from_frame, read_csv, read_parquet
+
+BUNDLED = {"insertion": "insertion.npz"}
+Reader = Callable[[Path, str, Asked], Dataset]
+READERS: dict[str, Reader] = {  # by suffix; any other is read as .npz
+    ".csv": read_csv,
+    ".parquet": read_parquet,
+    ".pq": read_parquet,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+}
+TABLES = (".csv", ".parquet", ".pq")
+
+
+def load_dataset(
+    source: Any = "insertion",
+    samples: int | None = None,
+    part: str = "part",
+    *,
+    channel: str | Sequence[str] | None = None,
+    label: str | None = None,
+    labels: str | os.PathLike[str] | None = None,
+    fit: str | None = None,
+    rate_hz: float | None = None,
+) -> Dataset:
+    """A data set from recordings as people have them.
+
+    source : the name of a bundled set; a folder of CSV files, one an insertion; a wide table, a row an insertion, as .csv,
+        .parquet or a DataFrame; an .npz or HDF5 file with X (n, T) or (n, C, T), times the number `scale` where one is
+        stored, and y (n,); a `Dataset`; a pair (X, y), where X may be a list of traces of any length.
+    samples : of each trace, the first so many; with `fit="resample"` the points that the whole is put on.
+    part : the name of the array, or column, of parts' numbers, texts or whole numbers; for a folder a column of `labels`.
+        Where there is no `part`, every trace is a part of its own.
+    channel : "FZ_Base", or several, "FZ_Base,FX_Base", which give (n, C, T). Not given: FZ_Base, or the only one there is.
+    label : for a folder, a regular expression with one group that finds the label in a file's path; not given: True/False,
+        OK/NOK, pass/fail, good/bad, success/failure or 1/0 at the end of its name, or as its folder's. For a table, the
+        name of the column.
+    labels : for a folder, a CSV file with a column of file names and one of labels.
+    fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
+        are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
+    rate_hz : instead of what the timestamps tell, which are then not looked at.
+
+    A recording that cannot be read, or not honestly be fitted, becomes a `Fault` in `faults`, and the others are kept. A
+    number that is missing is a NaN, which the engine finds. `spec` is the contract for live traces of the same form.
+    Raises DataError where nothing can be read, or the options do not fit what is there.
+    """
+    asked = Asked(samples, part, names_of(channel), label, labels, fit, rate_hz)
+    if isinstance(source, Dataset):
+        asked.refuse("a Dataset", "label", "labels")
+        return refit(source, asked)
+    if isinstance(source, tuple):
+        asked.refuse("a pair (X, y)", "label", "labels")
+        return from_pair(*source, asked) if len(source) == 2 else _refuse(source)
+    if hasattr(source, "columns"):
+        asked.refuse("a DataFrame", "labels")
+        return from_frame(source, asked)
+    if str(source) in BUNDLED:
+        asked.refuse("a bundled set", "label", "labels")
+        with as_file(files("dengine") / "data" / BUNDLED[str(source)]) as path:
+            return read_npz(path, str(source), asked)
+    return _read(Path(source), asked) if isinstance(source, str | os.PathLike) else _refuse(source)
+
+
+def _read(path: Path, asked: Asked) -> Dataset:
+    if path.is_dir():
+        return read_folder(path, asked)
+    if not path.is_file():
+        raise DataError(
+            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5) or a folder of CSV files; "
+            f"{path} is neither."
+        )
+    suffix = path.suffix.lower()
+    asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
+    return READERS.get(suffix, read_npz)(path, path.stem, asked)
+
+
+def _refuse(source: Any) -> Dataset:
+    raise DataError(f"Expected a name, a path, a Dataset, a DataFrame or a pair (X, y), got {type(source).__name__}.")

@@ -1,0 +1,107 @@
+"""One recording in one CSV file: its channels, and the rate that its timestamps tell."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..traces import is_time
+from .dataset import UnreadableError
+from .text import decimal_of, delimiter_of, find_fault, read_text, split_line
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+GAP = 5.0  # median steps: a pause that a late message does not explain
+EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # a time of day as a number: above this, in units of so many seconds
+UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """values : (C, T) float32.  rate_hz : from its timestamps; None where it has none, or they were not asked for."""
+
+    values: NDArray[np.float32]
+    rate_hz: float | None
+
+
+def read_recording(path: Path, channels: Sequence[str], timed: bool) -> Recording:
+    """The channels of one file; UnreadableError names the line that cannot be read, for pandas alone would not.
+
+    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
+    """
+    text = read_text(path)
+    head = text[: text.find("\n")] if "\n" in text else text
+    delimiter = delimiter_of(head)
+    header = split_line(head, delimiter)
+    missing = [name for name in channels if name not in header]
+    if missing:
+        raise UnreadableError(f"Expected a column {missing[0]}, got {', '.join(header)[:100]}", 1)
+    places = [header.index(name) for name in channels]
+    clock = next((i for i, name in enumerate(header) if is_time(name)), None) if timed else None
+    frame = _parse(text, header, places, clock, delimiter)
+    if frame.empty:
+        raise UnreadableError("Expected samples below the header, found none", 1)
+    values = frame[places].to_numpy(dtype=np.float32).T
+    rate = None if clock is None else rate_of(_seconds(frame[clock], header[clock]))
+    return Recording(np.ascontiguousarray(values), rate)
+
+
+def _parse(text: str, header: Sequence[str], places: list[int], clock: int | None, delimiter: str) -> pd.DataFrame:
+    import pandas as pd
+
+    decimal = decimal_of(text, delimiter)
+    body = text.rstrip("\r\n")
+    even = body.count(delimiter) == (body.count("\n") + 1) * (len(header) - 1)
+    if not even:  # pandas takes a short row for one with empty cells
+        find_fault(text, header, places, delimiter, decimal)
+    used = sorted({*places, *([] if clock is None else [clock])})
+    how: dict[str, Any] = {"header": None, "skiprows": 1, "usecols": used, "sep": delimiter, "decimal": decimal}
+    try:
+        return pd.read_csv(io.StringIO(text), dtype=dict.fromkeys(places, np.float64), float_precision="round_trip", **how)
+    except pd.errors.EmptyDataError:
+        raise UnreadableError("Expected samples below the header, found none", 1) from None
+    except (ValueError, pd.errors.ParserError) as error:
+        find_fault(text, header, places, delimiter, decimal)
+        raise UnreadableError(f"It cannot be read as CSV: {' '.join(str(error).split())}") from error
+
+
+def _seconds(column: Any, name: str) -> NDArray[np.float64]:
+    """Timestamps as seconds from the first: numbers, in the unit that name or size tell, or times of day as text."""
+    import pandas as pd
+
+    if pd.api.types.is_numeric_dtype(column):
+        times = column.to_numpy(dtype=np.float64)
+        ending = re.search(r"[_ \[(](ms|us|µs|ns)[\])]?$", name.lower())
+        unit = UNITS[ending[1]] if ending else 0.0
+        first: float = np.nan_to_num(times[0])
+        unit = unit or next((seconds for above, seconds in EPOCHS if first > above), 1.0)
+        return np.asarray((times - times[0]) * unit)
+    stamps = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
+    bad = np.flatnonzero(stamps.isna())
+    if len(bad):
+        raise UnreadableError(f"Expected a time in column {name}, got {str(column.iloc[bad[0]])[:30]!r}", int(bad[0]) + 2)
+    return np.asarray((stamps - stamps.iloc[0]).dt.total_seconds(), dtype=np.float64)
+
+
+def rate_of(seconds: NDArray[np.float64]) -> float | None:
+    """Samples a second, to four digits, by the median step; UnreadableError where time is missing, turns back or jumps."""
+    steps = np.diff(seconds)
+    if not len(steps):
+        return None
+    wrong = np.flatnonzero(~(steps > 0))
+    if len(wrong):
+        raise UnreadableError("Expected a later time than that of the row before", int(wrong[0]) + 3)
+    step = float(np.median(steps))
+    jumps = np.flatnonzero(steps > GAP * step)
+    if len(jumps):
+        where = int(jumps[0])
+        raise UnreadableError(f"Expected a step of {step:.3g} s in time, got a gap of {steps[where]:.3g} s", where + 3)
+    return float(f"{1.0 / step:.4g}")

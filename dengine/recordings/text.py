@@ -1,0 +1,82 @@
+"""Text files of separated values: their delimiter, their header, their lines; and the line that cannot be read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from .dataset import UnreadableError
+
+LARGEST = 256 * 2**20  # bytes of one text file
+NOTHING = {"", "nan", "na", "n/a", "null", "none", "-nan"}  # a cell without a number: kept as NaN
+Lines = list[tuple[int, str]]
+
+
+def read_text(path: Path) -> str:
+    """A file's text; UnreadableError for one that is empty, too large, or not UTF-8."""
+    size = path.stat().st_size
+    if size > LARGEST:
+        raise UnreadableError(f"Expected at most {LARGEST // 2**20} MB, got {size // 2**20} MB; split it, or write Parquet")
+    raw = path.read_bytes()
+    if not raw.strip():
+        raise UnreadableError("Expected a header and rows, it is empty")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise UnreadableError(
+            f"Expected UTF-8 text, got the byte 0x{raw[error.start]:02x}; save it as UTF-8", line
+        ) from error
+
+
+def read_lines(path: Path) -> tuple[list[str], Lines, str]:
+    """A file's header, its other lines with their numbers, without blank ones, and its delimiter."""
+    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
+    delimiter = delimiter_of(lines[0][1])
+    return split_line(lines[0][1], delimiter), lines[1:], delimiter
+
+
+def read_header(path: Path) -> list[str]:
+    """The names in a file's first line; none where it has no such line."""
+    with path.open("rb") as file:
+        line = file.readline(2**20).decode("utf-8-sig", errors="replace")
+    return split_line(line, delimiter_of(line)) if line.strip() else []
+
+
+def delimiter_of(line: str) -> str:
+    """The one of comma, semicolon and tab that a header has most of."""
+    return max(",;\t", key=line.count)
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Its words, without blanks and quotes around them."""
+    return [word.strip().strip('"') for word in line.rstrip("\r\n").split(delimiter)]
+
+
+def decimal_of(text: str, delimiter: str) -> str:
+    """A comma where the columns are separated otherwise and numbers are written with one, as a German Excel does."""
+    return "," if delimiter != "," and "," in text[text.find("\n") :] else "."
+
+
+def find_fault(text: str, header: Sequence[str], wanted: Sequence[int], delimiter: str, decimal: str) -> None:
+    """UnreadableError that names the first line with too few or too many columns, or no number where one is wanted."""
+    for number, line in enumerate(text.splitlines()[1:], start=2):
+        if not line.strip():
+            continue
+        words = split_line(line, delimiter)
+        if len(words) != len(header):
+            raise UnreadableError(f"Expected {len(header)} columns, got {len(words)}", number)
+        for place in wanted:
+            if not is_number(words[place].replace(decimal, ".")):
+                raise UnreadableError(f"Expected a number in column {header[place]}, got {words[place][:20]!r}", number)
+
+
+def is_number(word: str) -> bool:
+    """Whether a cell holds a number, or says that it holds none."""
+    if word.lower() in NOTHING:
+        return True
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
