@@ -25,7 +25,7 @@ endef
 export COUNT_AUDITED
 REPEATS ?= 200
 
-.PHONY: setup demo test lint proof audit clean
+.PHONY: setup demo test lint docs proof audit clean
 
 setup: $(VENV)/.dev
 
@@ -45,12 +45,16 @@ demo: $(VENV)/.demo
 	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cell replay --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
 
 test: $(VENV)/.dev
-	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadgroup --no-loadscope-reorder
 
 lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+# Into site/, warnings are errors. Read it with `python -m http.server --directory site`.
+docs: $(VENV)/.dev
+	$(VENV)/bin/python -m mkdocs build --strict
 
 proof: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python training/prove.py --out $(OUT)/proof --docs docs --repeats $(REPEATS) --jobs 2
@@ -64,4 +68,4 @@ audit: $(VENV)/.dev
 	@$(VENV)/bin/python -c "$$COUNT_AUDITED" $(AUDIT).json $(AUDITED)
 
 clean:
-	rm -rf $(VENV) $(OUT) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(OUT) build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

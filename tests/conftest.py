@@ -17,12 +17,17 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
-LONG = ("test_readme", "test_notebooks", "test_golden", "test_training", "test_cli", "test_estimators", "test_reducers")
+LONG = ("test_docs", "test_notebooks", "test_golden", "test_training", "test_cli", "test_estimators", "test_reducers")
+# Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
+UMAP = ("test_golden", "test_estimators", "test_reducers")
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; a file's own order stays as it is."""
+    """Long files first; a file's own order stays as it is, and so does the worker that it is run by."""
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("umap" if item.path.stem in UMAP else item.path.stem))
 
 
 def insertion_like(
