@@ -97,6 +97,12 @@ def test_version_is_the_packages() -> None:
 
 
 VERBS = sorted(main.commands)
+LESS = {  # so that an example takes seconds; its own options are all read
+    "compare": ["--repeats", 1, "--cycles", 150],
+    "replay": ["--repeats", 1, "--cycles", 150],
+    "run": ["--cycles", 10],
+    "simulate": ["--n", 4],
+}
 
 
 def example_of(verb: str) -> list[str]:
@@ -128,7 +134,7 @@ def test_every_help_ends_in_a_command_that_works(
     monkeypatch.chdir(tmp_path)
     program, named, *words = example_of(verb)
     assert (program, named) == ("dengine", verb)
-    succeed(named, *words)
+    succeed(named, *words, *LESS.get(verb, []))
 
 
 def test_the_programs_own_example_parses() -> None:
@@ -471,12 +477,17 @@ def test_a_reducer_of_this_folder_is_found_and_named_safely(data: Path, tmp_path
     assert (tmp_path / "out" / "map_FirstAndLast.png").is_file()
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(OWN_REDUCER)
-    done = in_folder(tmp_path, "train", "--data", data, "--store", "e.db", "--reducer", "mine:FirstAndLast")
-    assert done.returncode == 0, done.stderr
-    assert "FirstAndLast answers" in done.stdout
-    assert "mine:FirstAndLast" in in_folder(tmp_path, "status", "e.db").stdout
+def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "his.py").write_text(OWN_REDUCER)
+    monkeypatch.chdir(tmp_path)
+    for words in (["--reducer", "his:FirstAndLast"], ["--retrains", 1]):  # made, and opened again
+        monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(tmp_path)])
+        monkeypatch.delitem(sys.modules, "his", raising=False)
+        out = succeed("train", "--data", data, "--store", "e.db", *words)
+        assert "his" in sys.modules
+        assert "FirstAndLast answers" in out or "Nothing new" in out
+    assert "his:FirstAndLast" in succeed("status", "e.db")
+    monkeypatch.delitem(sys.modules, "his")
 
 
 def test_a_module_of_this_folder_shadows_nothing(tmp_path: Path) -> None:
@@ -739,7 +750,7 @@ class Slow(PCA):
 def test_an_interrupted_replay_reports_what_was_finished(data: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(SIGNALLING_REDUCER)
     words = ["--reducer", "mine:Slow", *POLICY, "--cycles", 120, "--repeats", 5000, "--out", "out"]
-    code, out, err = interrupted(tmp_path, "fit_9", "replay", "--data", data, *words)
+    code, out, err = interrupted(tmp_path, "fit_4", "replay", "--data", data, *words)
     assert code == INTERRUPTED
     finished = int(re.search(r"Interrupted: (\d+) of 5000 replays were finished; the table shows those\.", err)[1])
     assert finished >= 1
@@ -751,24 +762,24 @@ def test_an_interrupted_replay_reports_what_was_finished(data: Path, tmp_path: P
 def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, tmp_path: Path) -> None:
     long = tmp_path / "long.npz"
     with np.load(data) as file:
-        noise = np.random.default_rng(0).normal(0, 0.1, (200 * len(file["y"]), file["X"].shape[1]))
-        np.savez(long, X=np.tile(file["X"], (200, 1)) + noise, y=np.tile(file["y"], 200))
+        noise = np.random.default_rng(0).normal(0, 0.1, (50 * len(file["y"]), file["X"].shape[1]))
+        np.savez(long, X=np.tile(file["X"], (50, 1)) + noise, y=np.tile(file["y"], 50))
     (tmp_path / "mine.py").write_text(SIGNALLING_REDUCER)
-    words = ["--data", long, "--cycles", 30000, "--store", "e.db", "--reducer", "mine:Slow", "--lower-bound", "0.99"]
+    words = ["--data", long, "--cycles", 8000, "--store", "e.db", "--reducer", "mine:Slow", "--lower-bound", "0.99"]
     code, out, err = interrupted(tmp_path, "fit_1", "run", "--cell", "replay", *words)
     assert code == INTERRUPTED
-    done = int(re.search(r"Interrupted: (\d+) of 30000 cycles were done", err)[1])
-    assert f"Everything up to cycle {done} is in e.db; the same command with --cycles {30000 - done}" in err
+    done = int(re.search(r"Interrupted: (\d+) of 8000 cycles were done", err)[1])
+    assert f"Everything up to cycle {done} is in e.db; the same command with --cycles {8000 - done}" in err
     assert f"1 to {done}" in out
     assert document("status", tmp_path / "e.db")["decisions"] == done > 0
 
 
 def test_an_interrupted_import_says_how_far_it_came(data: Path, tmp_path: Path) -> None:
-    X = np.random.default_rng(0).normal(size=(60_000, 40)).astype(np.float32)
+    X = np.random.default_rng(0).normal(size=(20_000, 40)).astype(np.float32)
     np.savez(tmp_path / "many.npz", X=X, y=np.arange(len(X)) % 2)
     code, _, err = interrupted(tmp_path, "e.db", "train", "--data", "many.npz", "--store", "e.db", "--reducer", "pca")
     assert code == INTERRUPTED
-    done = int(re.search(r"Interrupted: (\d+) of 60000 traces are in e\.db; the same command goes on", err)[1])
+    done = int(re.search(r"Interrupted: (\d+) of 20000 traces are in e\.db; the same command goes on", err)[1])
     assert document("status", tmp_path / "e.db")["labels"] == done
 
 

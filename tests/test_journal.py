@@ -1,5 +1,6 @@
 """A cell's journal comes back into the store once, bad traces into quarantine."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -141,8 +142,9 @@ def test_a_journal_that_grew_adds_what_is_new(
     data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path, stops: Any
 ) -> None:
     X, found = make_data(7, seed=4).X, {}
+    new = new_store(data, tmp_path / "new.db", stops=stops, audit_rate=0.1)
     for cuts in ([7], [2, 3, 7], range(1, 8)):
-        path = new_store(data, tmp_path / f"{len(cuts)}.db", stops=stops, audit_rate=0.1)
+        path = shutil.copy(new, str(tmp_path / f"{len(cuts)}.db"))
         for n in cuts:
             import_journal(path, write_cell(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:

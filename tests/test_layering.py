@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -22,6 +23,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "traces": 1,
     "decision": 2,
     "datasets": 3,
+    "recordings": 3,
     "recipe": 3,  # holds a policy
     "reducers": 4,
     "model": 5,
@@ -72,6 +74,11 @@ def nodes(tree: ast.AST, functions: bool = True) -> Iterator[ast.AST]:
         yield from nodes(node, functions)
 
 
+@cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
 def resolve(name: str) -> str:
     """The module that a dotted name under dengine means: `cells.replay.ReplayCell` -> `cells.replay`."""
     while name and name not in MODULES:
@@ -79,12 +86,12 @@ def resolve(name: str) -> str:
     return name or "dengine"
 
 
+@cache
 def imports(module: str) -> set[str]:
     """Modules of dengine that a module imports, at its top or within its functions."""
-    path = MODULES[module]
-    package = path.relative_to(ROOT).parts[:-1]
+    package = MODULES[module].relative_to(ROOT).parts[:-1]
     found = set()
-    for node in nodes(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(tree(module)):
         if isinstance(node, ast.ImportFrom):
             base = (*package[: len(package) - node.level + 1], node.module or "") if node.level else (node.module or "",)
             if node.level or base[0].split(".")[0] == "dengine":
@@ -127,8 +134,8 @@ def test_the_parser_sees_the_imports_that_are_there() -> None:
 @pytest.mark.parametrize("heavy", HEAVY)
 def test_what_is_heavy_is_imported_where_it_is_used(heavy: str) -> None:
     at_the_top = set()
-    for module, path in MODULES.items():
-        for node in nodes(ast.parse(path.read_text(encoding="utf-8")), functions=False):
+    for module in MODULES:
+        for node in nodes(tree(module), functions=False):
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             names += [a.name for a in node.names] if isinstance(node, ast.Import) else []
             if heavy in {name.split(".")[0] for name in names}:
@@ -164,7 +171,7 @@ def test_no_layer_outlives_its_module() -> None:
 def test_what_drives_a_model_asks_its_contract_and_never_its_class(module: str) -> None:
     asked = [
         ast.unparse(node)
-        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8")))
+        for node in ast.walk(tree(module))
         if isinstance(node, ast.Call) and ast.unparse(node.func) in ("isinstance", "hasattr", "getattr")
     ]
     assert [call for call in asked if "model" in call.lower()] == []

@@ -23,8 +23,7 @@ from dengine.records import Action, Reason  # noqa: E402
 SPEC = TraceSpec(100, limit=500.0)
 BALLS: list[dict[str, Any]] = [
     {},
-    {"interval": "binomial"},
-    {"fraction": 0.3},
+    {"interval": "binomial", "fraction": 0.3},
     {"fraction": 0.3, "reject_fraction": 0.08},
 ]
 

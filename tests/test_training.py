@@ -101,15 +101,27 @@ def test_a_comparison_of_60_cycles_has_a_table_and_a_csv(run: Run, tiny: Path, t
     assert len((tmp_path / "report_tiny.csv").read_text().splitlines()) == 1 + 2 * 2
 
 
-def test_a_replay_that_was_compared_twice_counts_once(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ["report", "--data", tiny, "--reducers", "pca", "--seeds", "0:2", "--policies", "0.1:0.9", "--n-jobs", 1]
-    first, second = (run("compare_reducers", *words, "--out", tmp_path).splitlines() for _ in range(2))
-    assert first[-2].split()[-2] == second[-2].split()[-2] == "2"  # the column of replays
+def test_a_comparison_plays_nothing_twice_that_it_kept(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["report", "--data", tiny, "--reducers", "pca,never", "--seeds", "0:2", "--policies", "0.1:0.9", "--n-jobs", 1]
+    first, second = (run("compare_reducers", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2))
+    assert "4 of 4" in first
+    assert "of 4" not in second
+    assert first[first.index("report:") :] == second[second.index("report:") :]  # times and all
+
+
+def test_a_rival_without_a_bound_says_so_in_its_row(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ["report", "--data", tiny, "--reducers", "pca,never,always,river", "--seeds", "0:1", "--policies", "0.1:0.9"]
+    table = (line for line in run("compare_reducers", *words, "--n-jobs", 1, "--out", tmp_path).splitlines() if "|" in line)
+    bounds = {line.split("|")[1].strip().split(":")[0]: line.split("|")[2].strip() for line in table}
+    assert bounds["never"] == "none"
+    assert bounds["river"] == "none: threshold swept"
+    assert bounds["pca"] == "Wilson, at one look"
+    assert bounds["always"].startswith("no error")
 
 
 def test_choosing_among_tries_that_are_never_certain_says_so(run: Run, tiny: Path, tmp_path: Path) -> None:
     words = ["choose", "--data", tiny, "--cycles", 10, "--reducers", "pca", "--seeds", "0:1", "--n-jobs", 1]
-    assert "Chosen: none" in run("compare_reducers", *words, "--out", tmp_path)
+    assert "Chosen of pca: none" in run("compare_reducers", *words, "--out", tmp_path)
 
 
 def test_the_noise_check_takes_sets_of_fewer_than_1503_traces(run: Run, tiny: Path) -> None:
