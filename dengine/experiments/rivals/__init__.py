@@ -56,7 +56,7 @@ RIVALS: dict[str, RivalKind] = {
         source="Duan et al. (2025), the authors' predecessor",
         bound="",
         tries=({"k": 5}, {"k": 10}, {"k": 20}, {"k": 40}),
-        chosen={"k": 10},
+        chosen={"k": 5},
     ),
     "wskde": RivalKind(
         "kernel:WilsonKernelDensity",
@@ -77,7 +77,7 @@ RIVALS: dict[str, RivalKind] = {
             {"n_components": 5, "amplitude": 3.0},
             {"n_components": 2, "amplitude": 10.0},
         ),
-        chosen={"n_components": 2, "amplitude": 3.0},
+        chosen={"n_components": 5, "amplitude": 3.0},
     ),
     "minirocket": RivalKind(
         "rocket:RocketSelective",
@@ -90,7 +90,7 @@ RIVALS: dict[str, RivalKind] = {
             {"C": 0.001, "holdout": 0.3},
             {"C": 0.01, "holdout": 0.3},
         ),
-        chosen={"C": 0.001, "holdout": 0.5},
+        chosen={"C": 0.01, "holdout": 0.5},
         needs="aeon",
     ),
     "mapie": RivalKind(
@@ -104,7 +104,7 @@ RIVALS: dict[str, RivalKind] = {
             {"thresholds": 5, "fwer": "fixed_sequence"},
             {"thresholds": 20, "fwer": "fixed_sequence"},
         ),
-        chosen={"thresholds": 5, "fwer": "bonferroni_holm"},
+        chosen={"thresholds": 20, "fwer": "fixed_sequence"},
         needs="mapie",
     ),
     "river": RivalKind(
@@ -113,7 +113,7 @@ RIVALS: dict[str, RivalKind] = {
         source="Gomes et al. (2017), river",
         bound="",
         tries=({"threshold": 0.8}, {"threshold": 0.9}, {"threshold": 0.95}, {"threshold": 0.99}),
-        chosen={"threshold": 0.95},
+        chosen={"threshold": 0.8},
         needs="river",
     ),
     "always": RivalKind(
