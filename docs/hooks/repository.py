@@ -72,6 +72,8 @@ def notebook_files(notebook: Path) -> dict[str, Any]:
                 name = f"{notebook.stem}_{number}_{k}.png"
                 pictures[name] = base64.b64decode("".join(data["image/png"]))
                 page.append(f"![]({name})")
+            elif "text/markdown" in data:
+                page.append("".join(data["text/markdown"]))
             else:
                 text = "".join(output.get("text", data.get("text/plain", "")))
                 page.append(f"```text\n{text[:SHOWN]}\n```")
