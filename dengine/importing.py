@@ -11,7 +11,6 @@ the same file twice counts no label twice. Traces that a cell recorded itself ha
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -27,8 +26,9 @@ from .datasets import Dataset, load_dataset
 from .deciding import source_of
 from .decision.policy import Policy
 from .engine import DataEngine
-from .errors import DataError, StoreError, TraceError
+from .errors import DataError, StoreError
 from .folds import content_hash, own_hash
+from .forms import form_in, must_agree
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .store.base import NewLabel, Store, opening
@@ -36,7 +36,6 @@ from .traces import TraceGate, as_trace, as_traces
 
 CHUNK = 500  # traces committed together
 LABELS = {"1": True, "0": False}
-RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +62,12 @@ def import_labelled(
     on_traces : called with the number of traces that were just dealt with.
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
-    data = load_dataset(dataset)
+    data = load_dataset(dataset, **form_in(store, dataset))
     spec = data.spec
     engine = DataEngine.open_or_create(store, seed, recipe=recipe)
     try:
         agreed = engine.agree_on(spec)
-        if not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
-            raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
-        if data.channels and agreed.columns and data.channels != agreed.columns:
-            raise TraceError(f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}.")
+        must_agree(data, agreed)
         traces = as_traces(data.X, agreed)
         counts = [_import_chunk(engine.store, *part, agreed, on_traces) for part in _chunks(traces, data)]
     finally:

@@ -32,7 +32,12 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
         raise TraceError(f"Expected one trace, (samples,) or (channels, samples), got shape {np.shape(trace)}.")
     if spec is not None:
         x = _as_agreed(x, spec)
-    elif len(x) > x.shape[1] and not _is_frame(trace):
+    elif len(x) > x.shape[1] and _is_frame(trace):
+        raise TraceError(
+            f"Expected a DataFrame of one trace, a row a sample, a column a channel, got {x.shape[1]} rows of {len(x)} "
+            "columns; pass one row, as a Series, if each is a trace."
+        )
+    elif len(x) > x.shape[1]:
         raise TraceError(
             f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which looks transposed; "
             f"pass trace.T, or agree on TraceSpec({x.shape[1]}, channels={len(x)}) first if it is meant."

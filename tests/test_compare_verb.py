@@ -70,6 +70,35 @@ def test_the_costs_name_what_many_cores_would_take(folder: Path) -> None:
     assert 0 < costs["on_1000_cores_s"] <= costs["core_seconds"] <= 3 * costs["on_1000_cores_s"] + 1e-9
 
 
+def test_every_row_of_a_grid_can_be_told_from_the_others(folder: Path) -> None:
+    shown = done("--reducers never --repeats 1 --alphas 0.1,0.5 --intervals wilson,binomial --feedback stops,confirmed")
+    lines = " ".join(shown.split())
+    for interval in ("wilson", "binomial"):
+        for alpha in ("0.1", "0.5"):
+            for known in ("stops alone", "good ones confirmed"):
+                assert f"never (local, {interval}, alpha {alpha}, {known}): " in lines
+    table = shown[: shown.index("certain: cycles")]
+    assert (table.count("wilson"), table.count("binomial")) == (4, 4)
+
+
+def test_the_retrains_that_were_dropped_are_counted_row_by_row(folder: Path) -> None:
+    text = (
+        "from sklearn.decomposition import PCA\n\nclass Late(PCA):\n    def fit(self, X, y=None):\n"
+        "        if len(X) < 59:\n            raise ValueError('too few')\n        return super().fit(X)\n"
+    )
+    (folder / "late_of_test_compare.py").write_text(text, encoding="utf-8")
+    rows = json.loads(done("--reducers late_of_test_compare:Late --repeats 2 --alphas 0.1,0.5 --json"))["rows"]
+    assert [row["retrains_dropped"] for row in rows] == [2, 2]
+
+
+@pytest.mark.parametrize("address", ["nonsense", "foo://host:1"])
+def test_an_address_that_is_none_of_a_scheduler_says_what_is_expected(folder: Path, address: str) -> None:
+    pytest.importorskip("distributed")
+    result = compare(f"--reducers pca --repeats 1 --scheduler {address}")
+    assert result.exit_code == 1
+    assert "Expected --scheduler to be the address of a running dask scheduler" in result.output
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -175,3 +175,19 @@ def test_a_picture_is_drawn_of_any_data(make_data: Callable[..., Dataset], tmp_p
     figure = data_picture(data, "x")
     assert len(figure.axes) == min(channels, 3) + 2
     assert save(figure, tmp_path / "data.png").stat().st_size > 5_000
+
+
+def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_path: Path) -> None:
+    names, some = sorted(folder.iterdir(), key=lambda path: path.stat().st_size), tmp_path / "some"
+    some.mkdir()
+    for path in names[50:]:  # the longer ones first: the median falls when the others come
+        (some / path.name).write_bytes(path.read_bytes())
+    first = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--reducer", "pca", "--json").stdout)
+    for path in names[:50]:
+        (some / path.name).write_bytes(path.read_bytes())
+    again = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--json").stdout)
+    assert (first["import"]["imported"], again["import"]["known"]) == (30, 30)
+    assert again["import"]["imported"] == 47
+    wrong = dengine("train", "--data", some, "--store", tmp_path / "a.db", "--samples", 900)
+    assert wrong.exit_code == 1
+    assert "samples=" in wrong.output

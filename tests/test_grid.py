@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import fields, replace
+from importlib import import_module
 from pathlib import Path
 
 import joblib
@@ -14,13 +15,17 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
 from dengine.cli import main
+from dengine.errors import SettingError
 from dengine.experiments.contenders import Contender
 from dengine.experiments.costs import Forecast, makespan
 from dengine.experiments.grid import grid_tasks, iterate_replays, run_replays
 from dengine.experiments.kept import KeptReplays, Task
+from dengine.experiments.rivals import RIVALS
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
 TIMES = ("decide_seconds", "retrains", "seconds")
@@ -72,18 +77,20 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay(data: Da
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
 
 
+@pytest.mark.parametrize("within", [False, True])
 def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
-    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, within: bool
 ) -> None:
     source = "from sklearn.decomposition import PCA\n\nclass Own(PCA):\n    pass\n"
-    module = tmp_path / "own_reducer_of_test_grid.py"
+    module = tmp_path / f"own_reducer_of_test_grid_{within}.py"
     module.write_text(source, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    task, kept = Task(Contender.load(f"{module.stem}:Own"), seed=1), KeptReplays(tmp_path / "kept", data)
+    own = make_pipeline(StandardScaler(), import_module(module.stem).Own()) if within else f"{module.stem}:Own"
+    task, kept = Task(Contender.load(own), seed=1), KeptReplays(tmp_path / "kept", data)
     before = kept.path(task)
-    assert kept.path(task) == before
     module.write_text(source + "    # changed\n", encoding="utf-8")
-    assert kept.path(task) != before
+    assert kept.path(task) == before  # what is being played is what was imported, not what the file says by now
+    assert KeptReplays(tmp_path / "kept", data).path(task) != before
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", b"\x93NUMPY"])
@@ -94,6 +101,23 @@ def test_a_damaged_file_is_a_replay_that_is_not_there(data: Dataset, tmp_path: P
     (played,) = iterate_replays(data, [task], keep=tmp_path)
     assert not played.kept
     same(kept.get(task), played.replay)
+
+
+def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
+    task, kept, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data), np.random.default_rng(0)
+    played = replay(data, RECIPE, seed=1, cycles=50)
+    kept.put(task, played)
+    whole = np.frombuffer(kept.path(task).read_bytes(), dtype=np.uint8)
+    found = []
+    for size in [1, 1, 3, 50] * 75:
+        damaged = whole.copy()
+        damaged[rng.integers(len(whole), size=size)] = rng.integers(256, size=size)
+        kept.path(task).write_bytes(damaged.tobytes())
+        found.append(kept.get(task))
+    assert found.count(None) > 200
+    for back in found:
+        if back is not None:  # what was hit is nothing that is read
+            np.testing.assert_array_equal(back.action, played.action)
 
 
 def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:
@@ -127,6 +151,15 @@ def test_a_killed_grid_redoes_only_what_was_running(data: Dataset, tmp_path: Pat
     assert sum(each.kept for each in played) >= 3
     assert {path: path.stat().st_mtime_ns for path in finished} == finished  # none of them was written again
     assert sorted(each.position for each in played) == list(range(len(tasks)))
+
+
+def test_a_rival_without_its_library_is_refused_before_anything_is_played(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RIVALS, "always", replace(RIVALS["always"], needs="no_such_library"))
+    with pytest.raises(SettingError, match="always needs no_such_library"):
+        run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 # ------------------------------------------------------------------------------------------------------ backends
@@ -169,7 +202,15 @@ def test_a_grid_is_the_same_on_a_dask_cluster(
 def test_guarantees_and_feedbacks_are_conditions_of_their_own(data: Dataset) -> None:
     known = RECIPE.with_policy(stops="all")
     frame = run_grid(
-        data, [known], (0.1,), (0.9,), repeats=1, cycles=60, n_jobs=1, guarantees=("local", "pooled"), confirms=(False, True)
+        data,
+        [known],
+        (0.1,),
+        (0.9,),
+        repeats=1,
+        cycles=60,
+        n_jobs=1,
+        guarantees=("local", "pooled"),
+        confirms=(False, True),
     )
     assert list(zip(frame["guarantee"], frame["confirm"], strict=True)) == [
         ("local", False), ("local", True), ("pooled", False), ("pooled", True)

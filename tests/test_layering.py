@@ -38,6 +38,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "loop": 8,
     "engine": 9,
     "checks": 10,
+    "forms": 9,
     "importing": 10,
     "export": 10,
     "experiments": 11,

@@ -76,6 +76,12 @@ def test_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> None:
     found = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
     assert by_claim(found, "share of false positives") == [True] * 9
     assert by_claim(found, "delays the first") == []
+    assert by_claim(found, "answer") == []
+
+
+def test_a_rival_is_not_asked_what_the_interval_does() -> None:
+    claims = {each.claim for each in findings(frame(recipe="knn k=5"))}
+    assert claims == {"the mean share of false positives stays below 1 - LB", "a retrain of knn k=5 takes less than 0.45 s"}
 
 
 @pytest.mark.parametrize("confirm", [False, True])

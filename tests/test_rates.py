@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score
 
 from dengine import Recipe, wilson_interval
+from dengine.errors import SettingError
 from dengine.experiments.rates import decided_rates, net_seconds, pooled_error, saved_seconds
 from dengine.experiments.replay import Replay
 
@@ -76,6 +77,8 @@ def test_rejects_are_a_side_of_their_own() -> None:
     one = played(np.array(["reject", "reject", "reject", "accept"]), truth, np.arange(4))
     assert pooled_error([one], "rejected").rate == pytest.approx(1 / 3)
     assert pooled_error([one]).rate == 1.0
+    with pytest.raises(SettingError, match="accepted or rejected, got 'reject'"):
+        pooled_error([one], "reject")
 
 
 def test_the_interval_covers_the_true_share_of_other_parts() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import runpy
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
-from dengine.errors import DataError
+from dengine.errors import DataError, TraceError
+from dengine.importing import import_labelled
 from dengine.recordings.folder import natural
 from dengine.recordings.labels import label_of, named
 from dengine.recordings.recording import rate_of
@@ -105,7 +108,7 @@ def as_series(data: Dataset, tmp: Path) -> Any:
 
 
 def as_frames(data: Dataset, tmp: Path) -> Any:
-    return [pd.DataFrame({"Timestamp": np.arange(x.size), "FZ_Base": x}) for x in data.X], [
+    return [pd.DataFrame({"Timestamp": np.arange(x.size) / 500, "FZ_Base": x}) for x in data.X], [
         "ok" if y else "nok" for y in data.y
     ]
 
@@ -483,3 +486,276 @@ def test_a_damaged_file_is_a_data_error(tmp_path: Path, suffix: str) -> None:
     path.write_bytes(b"PK\x03\x04 broken")
     with pytest.raises(DataError, match="Cannot read"):
         load_dataset(path)
+
+
+# ------------------------------------------------------------------------------------------------- folders as they are
+
+
+def text_of(path: Path) -> str:
+    """A written recording, its text."""
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def few(small: Dataset, tmp_path: Path) -> Path:
+    """Four recordings of one channel."""
+    return write_folder(tmp_path / "cell", Dataset(small.X[:4], small.y[:4]))
+
+
+def test_a_header_is_found_in_any_case_and_a_comma_at_the_end_of_lines_is_no_column(few: Path, small: Dataset) -> None:
+    for path, (head, row) in zip(sorted(few.iterdir()), (("", ""), (",", ","), ("", ","), (",", "")), strict=True):
+        first, *lines = text_of(path).splitlines()
+        path.write_text("\n".join([first.lower() + head, *(line + row for line in lines)]) + "\n")
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    assert data.faults == ()
+    np.testing.assert_array_equal(load_dataset(few, channel="fz_base").X, small.X[:4])
+
+
+def test_a_channel_that_is_there_twice_is_a_fault(few: Path) -> None:
+    path = next(few.iterdir())
+    path.write_text("\n".join(line + "," + line.split(",")[1] for line in text_of(path).splitlines()) + "\n")
+    data = load_dataset(few)
+    assert [(f.source, f.line) for f in data.faults] == [(path.name, 1)]
+    assert "got it twice or more" in data.faults[0].what
+
+
+def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few: Path, small: Dataset) -> None:
+    write_csv(few / ".ipynb_checkpoints" / "x_True.csv", small.X[5])
+    write_csv(few / "__MACOSX" / "._x_True.csv", small.X[5])
+    (few / "readme.txt").write_text("of cell 3")
+    (few / "y_True.csv").mkdir()
+    (few / "z_True.csv").symlink_to(few / "gone.csv")
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    assert [f.source for f in data.faults] == ["z_True.csv"]
+
+
+@pytest.mark.parametrize("added", [" (2)", "(1)", " - Copy", " - Kopie (3)"])
+def test_a_copy_has_the_label_of_its_original(added: str) -> None:
+    assert named(None).label(f"run_7_true{added}.csv") == (1, None)
+    assert named(None).label(f"run_7_NOK{added}.csv") == (0, None)
+
+
+def test_a_folder_above_may_be_the_label() -> None:
+    assert [named(None).label(name)[0] for name in ("ok/monday/7.csv", "nok/1/x.csv", "cell/nok/b/3.csv")] == [1, 0, 0]
+
+
+def test_a_labels_file_names_recordings_as_people_write_paths(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:6]):
+        write_csv(tmp_path / "cell" / "sub" / f"Run_{i}.CSV", x)
+    files = [
+        "run_0.csv",
+        "./sub/Run_1.csv",
+        "C:\\data\\sub\\Run_2.CSV",
+        "/old/cell/sub/Run_3.csv",
+        "Run_4",
+        '"sub/Run_5.csv"',
+    ]
+    rows = [f'"a, b",{file},{word}' for file, word in zip(files, ("ok", "nok") * 3, strict=True)]
+    (tmp_path / "labels.csv").write_text("\n".join(["note,path,verdict", *rows]) + "\n")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
+    assert (data.y.tolist(), data.faults) == ([1, 0] * 3, ())
+    (tmp_path / "turned.csv").write_text("verdict,Datei\n" + "".join(f"ok,run_{i}\n" for i in range(6)))
+    assert load_dataset(tmp_path / "cell", labels=tmp_path / "turned.csv").y.tolist() == [1] * 6
+    bare = [f"{file},{word}" for file, word in zip(files, ("ok", "nok") * 3, strict=True)]
+    (tmp_path / "bare.csv").write_text("\n".join(bare) + "\n")
+    assert load_dataset(tmp_path / "cell", labels=tmp_path / "bare.csv").y.tolist() == [1, 0] * 3
+
+
+def test_a_row_of_a_labels_file_is_not_used_for_two_recordings(small: Dataset, tmp_path: Path) -> None:
+    for name in ("a/1.csv", "b/1.csv", "a/2.csv", "a/3.csv", "c/4.csv", "4.csv"):
+        write_csv(tmp_path / "cell" / name, small.X[0])
+    rows = ["1.csv,OK", "2.csv,NOK", "3.csv,OK", "c/4.csv,NOK", "4.csv,OK"]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
+    assert dict(zip(data.source.tolist(), data.y.tolist(), strict=True)) == {
+        "4.csv": 1,
+        "a/2.csv": 0,
+        "a/3.csv": 1,
+        "c/4.csv": 0,
+    }
+    assert [(f.source, f.what) for f in data.faults] == [
+        ("a/1.csv", "Expected its folder in labels.csv, line 2, which names b/1.csv too"),
+        ("b/1.csv", "Expected its folder in labels.csv, line 2, which names a/1.csv too"),
+    ]
+
+
+def test_what_a_labels_file_does_not_have_is_said(few: Path, tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("a,b\nOK,1\nNOK,2\n")
+    with pytest.raises(DataError, match=r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label"):
+        load_dataset(few, labels=tmp_path / "labels.csv")
+    with pytest.raises(DataError, match="Expected a column workpiece of parts' numbers in"):
+        load_dataset(few, labels=tmp_path / "labels.csv", part="workpiece")
+    with pytest.raises(DataError, match="Expected a file of labels with a column workpiece"):
+        load_dataset(few, part="workpiece")
+    with pytest.raises(DataError, match="got both; leave one out"):
+        load_dataset(few, labels=tmp_path / "labels.csv", label="_(OK)_")
+
+
+def test_of_two_rates_the_one_of_more_recordings_is_kept(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:7]):
+        write_csv(tmp_path / f"{i}_OK.csv", x, rate_hz=500.0 if i < 4 else 125.0)
+    data = load_dataset(tmp_path)
+    assert (len(data), data.rate_hz, len(data.faults)) == (4, 500.0, 3)
+    (tmp_path / "3_OK.csv").unlink()
+    assert len(load_dataset(tmp_path)) == 3  # half of each: no rate lies between them
+
+
+@pytest.mark.parametrize(("step", "rate"), [(2, 500.0), (8, 125.0), (2000, 500.0), (2_000_000, 500.0), (0.02, 50.0)])
+def test_a_clock_without_a_unit_is_taken_for_what_a_recorder_may_count(step: float, rate: float, tmp_path: Path) -> None:
+    pd.DataFrame({"Timestamp": np.arange(50) * step, "FZ_Base": np.arange(50.0)}).to_csv(tmp_path / "a_OK.csv", index=False)
+    assert load_dataset(tmp_path).rate_hz == rate
+
+
+def test_one_time_that_is_no_number_is_named_by_its_own_line(few: Path) -> None:
+    path = sorted(few.iterdir())[0]
+    lines = text_of(path).splitlines()
+    lines[8] = "late," + lines[8].split(",")[1]
+    path.write_text("\n".join(lines))
+    (fault,) = load_dataset(few).faults
+    assert (fault.source, fault.line) == (path.name, 9)
+    assert "got 'late'; a stated rate (rate_hz) leaves times unread" in fault.what
+
+
+# -------------------------------------------------------------------------------------------------- tables and arrays
+
+
+def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(small: Dataset) -> None:
+    names = [None, *(f"P{i // 2}" for i in range(1, 24))]
+    part = load_dataset(wide(small).assign(part=names)).part.tolist()
+    assert part == ["row, line 1", *names[1:]]
+    numbers = [np.nan, *(float(i) for i in range(1, 24))]
+    assert load_dataset(wide(small).assign(part=numbers)).part.tolist() == ["row, line 1", *map(str, range(1, 24))]
+
+
+def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(small: Dataset, tmp_path: Path) -> None:
+    table = wide(small)
+    lengths = [45 + i % 6 for i in range(24)]
+    for i, length in enumerate(lengths):
+        table.iloc[i, length:50] = np.nan
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    for source in (table, tmp_path / "wide.csv"):
+        data = load_dataset(source)
+        assert (data.fit, data.lengths.tolist(), data.X.shape) == ("pad", lengths, (24, 47))
+        assert np.isfinite(data.X).all()
+        np.testing.assert_array_equal(
+            data.X, load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X
+        )
+
+
+def test_columns_of_lists_are_channels(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(6, samples=40, channels=2)
+    cells = {name: [x.tolist() for x in data.X[:, c]] for c, name in enumerate(("FX_Base", "FZ_Base"))}
+    table = pd.DataFrame(cells).assign(label=data.y)
+    table.to_parquet(tmp_path / "lists.parquet")
+    for source in (table, tmp_path / "lists.parquet"):
+        np.testing.assert_array_equal(load_dataset(source, channel="FX_Base,FZ_Base").X, data.X)
+        np.testing.assert_array_equal(load_dataset(source).X, data.X[:, 1])
+    table["FX_Base"] = [cell[:2] if i == 2 else cell for i, cell in enumerate(table["FX_Base"])]
+    (fault,) = load_dataset(table, channel="FX_Base,FZ_Base").faults
+    assert (fault.line, fault.what[:40]) == (3, "Expected a list of numbers in each chann")
+
+
+def test_tables_that_would_be_misread_are_refused(small: Dataset, tmp_path: Path) -> None:
+    table = wide(small)
+    table.to_csv(tmp_path / "bare.csv", index=False, header=False)
+    for source, words in (
+        (table.drop(columns="FZ_5"), "after FZ_4 comes FZ_6"),
+        (pd.concat([table, table], axis=1), "Expected each column once"),
+        (tmp_path / "bare.csv", "its first line is of numbers"),
+        (write_csv(tmp_path / "one_True.csv", small.X[0]), "as in one recording; give its folder"),
+    ):
+        with pytest.raises(DataError, match=words):
+            load_dataset(source)
+
+
+def test_a_comma_at_the_end_of_a_tables_rows_is_no_column(small: Dataset, tmp_path: Path) -> None:
+    lines = text_of(as_wide_csv(small, tmp_path)).splitlines()
+    (tmp_path / "wide.csv").write_text("\n".join([lines[0], *(line + "," for line in lines[1:])]))
+    data = load_dataset(tmp_path / "wide.csv")
+    assert data.faults == ()
+    np.testing.assert_array_equal(data.X, small.X)
+
+
+def test_labels_of_an_array_may_be_words(small: Dataset, tmp_path: Path) -> None:
+    words = np.where(small.y == 1, "OK", "NOK")
+    np.savez(tmp_path / "words.npz", X=small.X, y=words)
+    for source in ((small.X, words), (small.X, pd.Series(words)), (small.X.astype(object), words), tmp_path / "words.npz"):
+        data = load_dataset(source)
+        np.testing.assert_array_equal(data.X, small.X)
+        np.testing.assert_array_equal(data.y, small.y)
+    with pytest.raises(DataError, match=r"Expected a label, as True/False.*got 'perhaps'"):
+        load_dataset((small.X[:2], ["OK", "perhaps"]))
+    with pytest.raises(DataError, match="got 'None'"):
+        load_dataset((small.X[:2], [1, None]))
+
+
+@pytest.mark.parametrize("X", [np.zeros((3, 9), dtype=complex), np.zeros((3, 9)).astype(str), (x for x in range(3))])
+def test_what_holds_no_real_numbers_is_refused(X: Any) -> None:
+    with pytest.raises(DataError, match="Expected X of real numbers"):
+        load_dataset((X, [1, 0, 1]))
+
+
+def test_frames_tell_their_rate_and_give_the_force(small: Dataset) -> None:
+    steps = np.arange(50)
+    frames = [pd.DataFrame({"Timestamp": 7 + steps / 125, "FX_Base": 0.0 * x, "FZ_Base": x}) for x in small.X[:5]]
+    frames[2]["Timestamp"] = 7 + steps / 500
+    frames[3].loc[9, "Timestamp"] = 0.0
+    data = load_dataset((frames, small.y[:5]))
+    assert (data.rate_hz, data.channels) == (125.0, ("FZ_Base",))
+    np.testing.assert_array_equal(data.X, small.X[[0, 1, 4]])
+    assert [f.source for f in data.faults] == ["data", "trace 3"]
+    assert len(load_dataset((frames, small.y[:5]), rate_hz=125.0)) == 5
+
+
+def test_an_archive_that_claims_more_than_there_is_memory_is_a_data_error(small: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with zipfile.ZipFile(tmp_path / "claim.npz", "w") as archive:
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**7, 10**6)})
+        archive.writestr("X.npy", header.getvalue())
+    with h5py.File(tmp_path / "claim.h5", "w") as file:
+        file.create_dataset("X", shape=(10**6, 10**7), chunks=(10, 1000), dtype="f4")
+        file["y"] = small.y
+    for name in ("claim.npz", "claim.h5"):
+        with pytest.raises(DataError, match=r"Unable to allocate|at most 8 GB"):
+            load_dataset(tmp_path / name)
+
+
+def test_an_archives_facts_are_checked(small: Dataset, tmp_path: Path) -> None:
+    for number, (about, words) in enumerate(
+        (
+            ({"rate_hz": 0.0}, "rate above 0"),
+            ({"rate_hz": [1.0, 2.0]}, "Cannot read"),
+            ({"channels": ["a", "b"]}, "a name for each of 1 channels"),
+        )
+    ):
+        np.savez(tmp_path / f"{number}.npz", X=small.X, y=small.y, **about)
+        with pytest.raises(DataError, match=words):
+            load_dataset(tmp_path / f"{number}.npz")
+
+
+def test_a_file_of_another_kind_lists_those_that_are_read(tmp_path: Path) -> None:
+    for name in ("data.xlsx", "data.txt", "data.npy"):
+        (tmp_path / name).write_text("FZ_0,FZ_1,label")
+        with pytest.raises(DataError, match=r"Expected a file \.npz, \.csv, \.parquet or \.h5, got"):
+            load_dataset(tmp_path / name)
+
+
+# --------------------------------------------------------------------------------------------------------- in a store
+
+
+def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path: Path) -> None:
+    rng, store = np.random.default_rng(0), tmp_path / "cell.db"
+    for i in range(9):
+        write_csv(tmp_path / "cell" / f"{i}_OK.csv", rng.normal(size=100 + i))
+    first = import_labelled(store, tmp_path / "cell", "pca")
+    for i in range(9, 29):
+        write_csv(tmp_path / "cell" / f"{i}_NOK.csv", rng.normal(size=96))
+    again = import_labelled(store, tmp_path / "cell")
+    assert (first.imported, again.imported, again.known) == (9, 20, 9)
+    with pytest.raises(TraceError, match="to 104 samples by pad, cell was to 96 by pad; load it with samples=104"):
+        import_labelled(store, load_dataset(tmp_path / "cell"))
+    with pytest.raises(TraceError, match="was to 104 by resample"):
+        import_labelled(store, load_dataset(tmp_path / "cell", samples=104, fit="resample"))

@@ -233,6 +233,17 @@ def test_a_run_is_told_cycle_by_cycle(data: Dataset) -> None:
     assert seen == [0, 1, 2, 3, 4]
 
 
+def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(played: Replay) -> None:
+    frame, row = played.to_frame(), played.summary()
+    assert frame.index.tolist() == list(range(1, len(played) + 1))
+    assert (frame["action"] != "verify").sum() == row["certain"] > 0
+    assert ((frame["action"] == "accept") & ~frame["truth"]).sum() == row["false_positive"]
+    assert (frame["reason"] == "certain").sum() == row["certain"]
+    assert frame["reason"].eq("no_model").sum() == 40 == frame["version"].eq(0).sum()
+    assert frame.loc[row["first_certain"], "action"] != "verify"
+    np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
+
+
 # --------------------------------------------------------------------------------------------------------- grids
 
 

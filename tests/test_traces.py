@@ -349,3 +349,13 @@ def test_a_first_array_with_more_channels_than_samples_looks_transposed() -> Non
 def test_traces_need_no_pandas() -> None:
     source = Path(as_trace.__code__.co_filename).read_text(encoding="utf-8")
     assert "import pandas" not in source
+
+
+def test_a_first_dataframe_with_a_row_a_trace_is_refused_and_not_taken_for_many_channels() -> None:
+    wide = pd.DataFrame(np.random.default_rng(0).normal(size=(2, 1000)))
+    with DataEngine("pca") as engine:
+        with pytest.raises(TraceError, match="got 2 rows of 1000 columns; pass one row, as a Series"):
+            engine.decide(wide)
+        assert engine.trace is None
+        engine.decide(wide.iloc[0])
+        assert (engine.trace.channels, engine.trace.samples) == (1, 1000)

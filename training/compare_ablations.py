@@ -198,7 +198,7 @@ def main() -> None:
     parser.add_argument("--alpha", type=float, default=0.1, help="error level of the interval")
     parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
     parser.add_argument("--only", default=",".join(AXES), help="axes, with commas between")
-    parser.add_argument("--seeds", default="100:110", help="first:last, the last one left out; a replay each")
+    parser.add_argument("--seeds", type=span, default="100:110", help="first:last, the last one left out; a replay each")
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most as many as there are traces")
     parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; times are honest with 1 only")
     parser.add_argument("--keep", type=Path, help="folder of finished replays")
@@ -207,7 +207,6 @@ def main() -> None:
     unknown = set(args.only.split(",")) - set(AXES)
     if unknown:
         parser.error(f"expected axes among {', '.join(AXES)}, got {', '.join(sorted(unknown))}")
-    args.seeds = range(*map(int, args.seeds.split(":")))
     data = load_dataset(args.data, args.samples)
     base = Recipe.load(args.recipe).with_policy(alpha=args.alpha, lower_bound=args.lower_bound)
     played = {axis: play(axis, data, base, args) for axis in args.only.split(",")}
@@ -215,11 +214,20 @@ def main() -> None:
         print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
     as_it_is, replays = baseline(data, base, args), [replay for some in played.values() for replay in some]
     rows = pool(frame_of(as_it_is + replays), as_it_is + replays)
-    title = f"{args.recipe} on {data.name}, ({args.alpha:g}, {100 * args.lower_bound:g} %), seeds {args.seeds[0]} to {args.seeds[-1]}"
+    level, seeds = f"({args.alpha:g}, {100 * args.lower_bound:g} %)", f"seeds {args.seeds[0]} to {args.seeds[-1]}"
+    title = f"{args.recipe} on {data.name}, {level}, {seeds}"
     Console(width=100).print(pooled_table(rows, title))
     print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv')}")
     if replays:
         print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png')}")
+
+
+def span(text: str) -> range:
+    """'100:110' -> the seeds 100 to 109."""
+    first, last = map(int, text.split(":"))
+    if not 0 <= first < last:
+        raise argparse.ArgumentTypeError(f"expected first:last with 0 <= first < last, as 100:110, got {text}")
+    return range(first, last)
 
 
 def baseline(data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:

@@ -17,6 +17,7 @@ run writes the table of all that it asked for.
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from dengine import Replay, load_dataset
-from dengine.experiments.contenders import Contender
+from dengine.experiments.contenders import Contender, contenders
 from dengine.experiments.grid import iterate_replays
 from dengine.experiments.kept import Task
 from dengine.experiments.rates import pooled_error
@@ -54,7 +55,7 @@ def tries(name: str) -> list[Contender]:
         every = [
             replace(base, params=params) for params in RIVALS[name].tries[: 1 if not any(RIVALS[name].tries) else None]
         ]
-        return [replace(one, name=f"{name} {_said(one.params)}") for one in every]
+        return [replace(one, name=f"{name} {_said(one.params)}".strip()) for one in every]
     return [replace(base, name=f"{name} radius={r:g}", recipe=replace(base.recipe, radius=r)) for r in TRIES[name]]
 
 
@@ -124,6 +125,19 @@ def markdown(rows: Sequence[dict[str, str]]) -> str:
     return "\n".join([*head, *(f"| {' | '.join(row[name] for name in COLUMNS)} |" for row in rows)])
 
 
+def span(text: str) -> range:
+    """'100:130' -> the seeds 100 to 129."""
+    first, last = map(int, text.split(":"))
+    if not 0 <= first < last:
+        raise argparse.ArgumentTypeError(f"expected first:last with 0 <= first < last, as 100:130, got {text}")
+    return range(first, last)
+
+
+def policies(text: str) -> list[tuple[float, float]]:
+    """'0.1:0.9,0.05:0.95' -> (alpha, LB) of each."""
+    return [(float(alpha), float(bound)) for alpha, bound in (pair.split(":") for pair in text.split(","))]
+
+
 def main() -> None:
     """Parse, replay, show."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -132,9 +146,11 @@ def main() -> None:
     parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
     parser.add_argument("--cycles", type=int, default=1503, help="cycles of a replay, at most as many as there are traces")
     parser.add_argument("--reducers", default="conv,umap,pca", help="and rivals and TOML files, with commas between")
-    parser.add_argument("--policies", help="alpha:LB with commas between; 0.1:0.9 to choose, and 0.05:0.95 to report")
+    parser.add_argument(
+        "--policies", type=policies, help="alpha:LB with commas between; by default 0.1:0.9, to report 0.05:0.95 too"
+    )
     parser.add_argument("--confirm", action="store_true", help="good accepted parts are confirmed, not stops alone known")
-    parser.add_argument("--seeds", help="first:last, the last one left out, instead of 0:5 or 100:130")
+    parser.add_argument("--seeds", type=span, help="first:last, the last one left out, instead of 0:5 or 100:130")
     parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; -1: one a core; times are honest with 1")
     parser.add_argument("--keep", type=Path, help="folder of finished replays")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the table")
@@ -143,13 +159,15 @@ def main() -> None:
     unknown = [name for name in asked if name not in TRIES and name not in RIVALS]
     if choosing and unknown:
         parser.error(f"choose has tries of {', '.join([*TRIES, *RIVALS])}, none of {', '.join(unknown)}; add them to TRIES")
-    seeds = range(*map(int, (args.seeds or ("0:5" if choosing else "100:130")).split(":")))
-    policies = [pair.split(":") for pair in (args.policies or ("0.1:0.9" if choosing else "0.1:0.9,0.05:0.95")).split(",")]
+    seeds = args.seeds or (range(5) if choosing else range(100, 130))
+    if len(set(asked)) < len(asked):
+        parser.error(f"expected each of --reducers once, got {args.reducers}")
+    sys.path.append(str(Path.cwd()))  # module:Class of the current folder, as in `dengine compare`
     data = load_dataset(args.data, args.samples)
     args.cycles = min(args.cycles, len(data))
-    who = [one for name in asked for one in (tries(name) if choosing else [Contender.load(name)])]
+    who = contenders([one for name in asked for one in (tries(name) if choosing else [name])])
     replays, pages = [], []
-    for alpha, bound in ((float(a), float(b)) for a, b in policies):
+    for alpha, bound in args.policies or ([(0.1, 0.9)] if choosing else [(0.1, 0.9), (0.05, 0.95)]):
         by_name = play(data, [one.with_policy(alpha=alpha, lower_bound=bound) for one in who], seeds, args)
         title = (
             f"{args.do}: {data.name}, ({alpha:g}, {100 * bound:g} %), seeds {seeds[0]} to {seeds[-1]}, {args.cycles} cycles"

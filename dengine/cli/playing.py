@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from ..experiments.kept import Task
     from ..experiments.replay import Replay
 
+ANSWERS_WITHIN = "5 s"  # what a scheduler has for it, before it counts as not there
+
 
 @dataclass(frozen=True)
 class Stream:
@@ -99,5 +101,12 @@ def _cluster(stream: Stream, dataset: Dataset) -> Iterator[tuple[int, int]]:
     from distributed import Client
 
     connect: Any = Client  # untyped
-    with connect(stream.scheduler) as client, parallel_config("dask", client=client, scatter=[dataset]):
+    try:
+        connected = connect(stream.scheduler, timeout=ANSWERS_WITHIN)
+    except (OSError, ValueError, MemoryError) as error:  # the last: what answered there speaks another language
+        raise SettingError(
+            f"Expected --scheduler to be the address of a running dask scheduler, as tcp://host:8786, got "
+            f"{stream.scheduler!r}: {error}"
+        ) from error
+    with connected as client, parallel_config("dask", client=client, scatter=[dataset]):
         yield -1, max(1, sum(client.nthreads().values()))

@@ -195,7 +195,8 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Reducers and rivals, under one policy or a grid of them. UMAP takes a minute a replay. Ctrl-C shows the replays that were finished.
+    Reducers and rivals, under one policy or a grid of them. UMAP takes a minute a replay. Ctrl-C shows the replays that
+    were finished.
     """
     asked = [name.strip() for name in reducers.split(",") if name.strip()]
     if not asked:

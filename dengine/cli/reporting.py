@@ -22,7 +22,7 @@ MANY_CORES = 1000
 def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: Path | None, as_json: bool) -> None:
     """Print the tables, or one JSON document; write CSV, tables and pictures to `out`."""
     from ..experiments.paper import finding_lines
-    from ..experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, retrain_line
+    from ..experiments.tables import CONDITION, frame_of, pool, pooled_table, promise_kept, promise_lines, retrain_line
 
     replays = finished.replays
     by_name = _grouped(replays, lambda each: each.name)
@@ -33,15 +33,16 @@ def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out:
     retrains = {name: [r for each in some for r in each.retrains] for name, some in by_name.items()}
     found = _findings(frame)
     if as_json:
-        dropped = {name: sum(not r.accepted for r in reports) for name, reports in retrains.items()}
-        rows = [row | {"retrains_dropped": dropped[row["recipe"]]} for row in rows]
+        dropped = [sum(not r.accepted for r in each.retrains) for each in replays]
+        sums = frame.assign(dropped=dropped).groupby(CONDITION, sort=False)["dropped"].sum()
+        rows = [row | {"retrains_dropped": int(n)} for row, n in zip(rows, sums, strict=True)]
         about = {"verb": verb, "data": dataset.name, "in_order": not stream.shuffle, "interrupted": finished.interrupted}
         about |= {"faults": dataset.faults}
         costs = _costs(finished) | {"found": finished.found}
         write_json(about | {"rows": rows, "findings": found, "costs": costs, "files": files})
         return
     show(pooled_table(rows, title))
-    show(*(promise_line(row) for row in rows))
+    show(*promise_lines(rows))
     show(*(f"{name}: {retrain_line(reports)}" for name, reports in retrains.items()))
     show(*finding_lines(found))
     show(_cost_line(finished))
@@ -133,9 +134,10 @@ def _costs(finished: Finished) -> dict[str, float]:
 
 def _cost_line(finished: Finished) -> str:
     costs = _costs(finished)
+    many = "" if len(finished.replays) == 1 else "s"
     kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
     return (
-        f"{len(finished.replays)} replays, {duration(costs['core_seconds'])} of one core's time, in "
+        f"{len(finished.replays)} replay{many}, {duration(costs['core_seconds'])} of one core's time, in "
         f"{duration(costs['seconds'])}{kept}. {MANY_CORES:,} cores would take "
         f"{duration(costs[f'on_{MANY_CORES}_cores_s'])}, their start left out."
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import click
@@ -40,7 +40,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    dataset, recipe = source.load(), choice.load() if choice.asked else None
+    dataset, recipe = _as_before(source, store).load(), choice.load() if choice.asked else None
     with interruptible() as asked:
         imported = _import(dataset, store, recipe, seed, as_json, asked)
         trained = _train(store, retrains, as_json, asked)
@@ -53,6 +53,14 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
         end_interrupted(f"Interrupted after {len(trained.reports)} of at most {retrains} retrains; they are in {store}.")
     if not trained.reports[-1].accepted:
         raise click.ClickException(f"The last retrain was {trained.reports[-1].reason}.")
+
+
+def _as_before(source: DataChoice, store: str) -> DataChoice:
+    """The choice, in the form of what the store has, where no other was asked for."""
+    from ..forms import form_in
+
+    form = form_in(store, source.data)
+    return replace(source, **{name: value for name, value in form.items() if getattr(source, name) is None})
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from inspect import isfunction
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any
 
 from ..engine import DataEngine
 from ..errors import SettingError
-from ..recipe import RECIPES, Recipe, described
+from ..recipe import PLAIN, RECIPES, Recipe, described
 from .rivals import RIVALS, make_rival
 
 TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
@@ -61,18 +63,53 @@ class Contender:
     def description(self) -> str:
         """All that its decisions depend on, beside data and seed, as text that is the same at every start."""
         own = self.recipe.reducer
-        handed_in = "" if isinstance(own, str) else f"\n{described(own)}"
+        handed_in = "" if isinstance(own, str) else f"\n{described(own)}\n{_digest_of(own)}"
         return f"{self.recipe.to_toml()}{handed_in}\n{self.rival} {sorted(self.params.items())}"
 
 
 def contenders(asked: Sequence[Any]) -> list[Contender]:
     """Each as it was asked for, under a name of its own: equal names are followed by the settings in which they differ.
 
-    Recipes that differ in `TOLD_APART` alone keep one name. SettingError where two do not differ at all.
+    Recipes that differ in `TOLD_APART` alone keep one name. Transformers whose settings read alike, as two functions of one
+    name, are numbered. SettingError where two do not differ at all.
     """
-    loaded = [Contender.load(one) for one in asked]
+    loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
     names = [one.name for one in loaded]
-    return [one if names.count(one.name) == 1 else _apart(one, loaded) for one in loaded]
+    return _numbered([one if names.count(one.name) == 1 else _apart(one, loaded) for one in loaded])
+
+
+def parts_of(reducer: Any) -> list[Any]:
+    """The classes of a transformer and of the estimators that it is made of, and its functions."""
+    held = reducer.get_params(deep=True).values()
+    kinds = [type(part) for part in [reducer, *(each for each in held if hasattr(each, "fit"))]]
+    return list(dict.fromkeys([*kinds, *(each for each in held if isfunction(each))]))
+
+
+def _digest_of(reducer: Any) -> str:
+    """Of all that a transformer holds: arrays and functions too, which its description only names."""
+    from joblib import hash as digest
+
+    try:
+        return str(digest(reducer))
+    except (PicklingError, TypeError, AttributeError) as error:
+        raise SettingError(
+            f"Expected a reducer that can be told apart from others, to keep its replays; {described(reducer)} holds what "
+            f"has no name in a module, as a lambda ({error}); define it in a module, or leave keep out."
+        ) from error
+
+
+def _numbered(named: list[Contender]) -> list[Contender]:
+    """The same, with a number behind each name that several transformers would share."""
+    held: dict[str, dict[int, int]] = {}
+    for one in named:
+        if not isinstance(one.recipe.reducer, str):
+            known = held.setdefault(one.name, {})
+            known.setdefault(id(one.recipe.reducer), 1 + len(known))
+    shared = {name for name, known in held.items() if len(known) > 1}
+    return [
+        replace(one, name=f"{one.name} {held[one.name][id(one.recipe.reducer)]}") if one.name in shared else one
+        for one in named
+    ]
 
 
 def _apart(one: Contender, among: Sequence[Contender]) -> Contender:
@@ -87,6 +124,13 @@ def _apart(one: Contender, among: Sequence[Contender]) -> Contender:
 def _flat(one: Contender) -> dict[str, Any]:
     """Every setting by its name, without those that have columns of their own."""
     plain = {f.name: getattr(one.recipe, f.name) for f in fields(Recipe) if f.name not in ("policy", "params")}
-    plain["reducer"] = plain["reducer"] if isinstance(plain["reducer"], str) else described(plain["reducer"])
+    own = plain["reducer"]
+    if not isinstance(own, str):
+        plain |= {"reducer": type(own).__name__} | {key: _short(value) for key, value in own.get_params().items()}
     policy = {key: value for key, value in asdict(one.recipe.policy).items() if key not in TOLD_APART}
     return {**plain, **policy, **one.recipe.params, **one.params}
+
+
+def _short(value: Any) -> Any:
+    """A transformer's setting as a name can show it: a part of its own, or a function, by what it is called."""
+    return value if isinstance(value, PLAIN) or value is None else getattr(value, "__name__", type(value).__name__)

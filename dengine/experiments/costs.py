@@ -29,10 +29,6 @@ class Forecast:
         self.waiting[kind] -= 1
         self.took.setdefault(kind, []).append(seconds)
 
-    def skip(self, kind: str) -> None:
-        """One replay of this kind need not be played."""
-        self.waiting[kind] -= 1
-
     def left(self) -> tuple[float, bool] | None:
         """Seconds that are left, and whether kinds of unknown cost come on top; None where nothing is known yet."""
         known = {kind: sum(took) / len(took) for kind, took in self.took.items()}

@@ -17,6 +17,7 @@ from ..datasets import Dataset, load_dataset
 from .contenders import Contender, contenders
 from .kept import KeptReplays, Task
 from .replay import Replay, replay
+from .rivals import require
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +44,7 @@ def iterate_replays(
     n_jobs : replays at a time, as joblib counts; times are honest with 1 alone.
     keep : folder of finished replays: those that are there are not played again, the others are kept as they end.
     on_cycle : as in `replay`, where n_jobs is 1: a callback does not travel.
+    SettingError, before anything is played, where a rival's library is missing.
     """
     from joblib import Parallel, delayed
 
@@ -50,6 +52,9 @@ def iterate_replays(
     kept = None if keep is None else KeptReplays(keep, data)
     found = {i: one for i, task in enumerate(tasks) if kept and (one := kept.get(task)) is not None}
     yield from (Played(i, one, True) for i, one in found.items())
+    rivals = {task.contender.rival for i, task in enumerate(tasks) if i not in found}
+    for name in sorted(rivals - {None}, key=str):
+        require(str(name))  # now, and not when the others have been played
     left = sorted(((i, task) for i, task in enumerate(tasks) if i not in found), key=lambda each: each[1].seed)
     parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
     for i, one in parallel(delayed(_play)(data, i, task, on_cycle if n_jobs == 1 else None) for i, task in left):
@@ -98,7 +103,8 @@ def run_grid(
 ) -> pd.DataFrame:
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds.
 
-    recipes : anything `replay` takes, rivals too. The column `recipe` names each; two of one reducer keep apart.
+    recipes : a name, or a list of what `replay` takes, rivals too. The column `recipe` names each; two of one reducer keep
+        apart.
     guarantees : "local", "pooled", or None for the recipe's own.
     confirms : whether accepted good parts are confirmed; False is the paper's feedback, stops alone.
     keep : folder of finished replays, by which an interrupted grid goes on.

@@ -4,8 +4,9 @@
     replay = kept.get(task) or ...            # the very same, but for the times of that run
     kept.put(task, replay)
 
-A file's name is a hash of all that its decisions depend on: the traces and labels, every setting, the seed, and
-dengine's own source. Nothing is unpickled. A file that cannot be read is a replay that is not there.
+A file's name is a hash of all that its decisions depend on: the traces and labels, every setting, the seed, dengine's own
+source, and the versions of the libraries that compute. Nothing is unpickled. A file that cannot be read is a replay that is
+not there.
 """
 
 from __future__ import annotations
@@ -13,22 +14,29 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, fields
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from inspect import getsourcefile
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
 from ..datasets import Dataset
 from ..records import RetrainReport
-from .contenders import Contender
+from .contenders import Contender, parts_of
 from .replay import Replay
 
 ABOUT = ("name", "dataset", "seed", "confirm", "seconds")  # what of a replay is no array, beside its recipe
+LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
+DAMAGED = (  # what reading a damaged file ends in, by where the damage is
+    OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -55,10 +63,11 @@ class KeptReplays:
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._of_data = _digest_of(data)
+        self._own: dict[Any, str] = {}  # read once: a file that changes while a grid is played is not what was imported
 
     def path(self, task: Task) -> Path:
         """Where the replay of a task is kept."""
-        said = f"{self._of_data}\n{_digest_of_source()}\n{_own_source(task.contender)}\n{task.description}"
+        said = f"{self._of_data}\n{_digest_of_source()}\n{self._own_source(task.contender)}\n{task.description}"
         return self.folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
 
     def get(self, task: Task) -> Replay | None:
@@ -67,18 +76,27 @@ class KeptReplays:
         try:
             with np.load(path, allow_pickle=False) as file:
                 return _replay_of({name: file[name] for name in file.files}, task.contender)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        except DAMAGED:
             return None
+
+    def _own_source(self, contender: Contender) -> str:
+        """The text of the files that a reducer and its parts stand in: what it does changes with them."""
+        from ..reducers import reducer_class
+
+        own = contender.recipe.reducer
+        parts = [reducer_class(own)] if isinstance(own, str) else parts_of(own)
+        self._own |= {part: _source_of(part) for part in parts if part not in self._own}
+        return "".join(self._own[part] for part in parts)
 
     def put(self, task: Task, replay: Replay) -> None:
         """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
-        with NamedTemporaryFile(dir=self.folder, prefix=".", suffix=".partial", delete=False) as file:
-            try:
+        partial = self.folder / f".{uuid4().hex}.partial"
+        try:
+            with partial.open("xb") as file:
                 np.savez_compressed(file, **_arrays_of(replay))
-            except BaseException:
-                Path(file.name).unlink()
-                raise
-        Path(file.name).replace(self.path(task))
+            partial.replace(self.path(task))
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 def _arrays_of(replay: Replay) -> dict[str, Any]:
@@ -104,19 +122,21 @@ def _digest_of(data: Dataset) -> str:
 
 @cache
 def _digest_of_source() -> str:
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"{sys.version_info[:2]} {[_version_of(name) for name in LIBRARIES]}".encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def _own_source(contender: Contender) -> str:
-    """The text of the file that a reducer of the user's own stands in: what it does changes with it."""
-    from ..reducers import reducer_class
-
-    own = contender.recipe.reducer
-    kind = reducer_class(own) if isinstance(own, str) else type(own)
+def _version_of(library: str) -> str:
     try:
-        return Path(getsourcefile(kind) or "").read_text(encoding="utf-8")
+        return version(library)
+    except PackageNotFoundError:
+        return ""
+
+
+def _source_of(part: Any) -> str:
+    try:
+        return Path(getsourcefile(part) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
         return ""  # typed at a prompt, or compiled

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .rivals import RIVALS
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -105,21 +107,23 @@ class Finding:
 def findings(frame: pd.DataFrame) -> list[Finding]:
     """Which of the paper's findings the replays of a grid bear out, cell by cell.
 
-    Those that they say nothing of are left out. frame : as `run_grid` gives it, of one feedback and one guarantee.
+    Those that they say nothing of are left out: of rivals, which decide by rules of their own, what the intervals do.
+    frame : as `run_grid` gives it, of one feedback and one guarantee.
     """
     found = []
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
-        found += _answers(rows, f"{recipe}, {interval}", str(interval))
+        ours = str(recipe).split(" ")[0] not in RIVALS
+        found += _answers(rows, f"{recipe}, {interval}", str(interval)) if ours else []
         found += _tolerances(rows, f"{recipe}, {interval}")
-        found += _delays(rows, f"{recipe}, {interval}") if interval == "wilson" else []
+        found += _delays(rows, f"{recipe}, {interval}") if ours and interval == "wilson" else []
     return found + _budgets(frame)
 
 
 def _answers(rows: pd.DataFrame, where: str, interval: str) -> list[Finding]:
     certain = rows.groupby(["alpha", "lower_bound"])["certain"].mean()
-    if len(certain) < 2 or interval not in INTERVALS:
+    if len(certain) < 2 or interval not in INTERVALS or not certain.any():
         return []
-    spread = float((certain.max() - certain.min()) / certain.mean()) if certain.mean() else 0.0
+    spread = float((certain.max() - certain.min()) / certain.mean())
     said = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells, {100 * spread:.0f} % of the mean"
     if interval == "wilson":
         return [Finding("Wilson answers to alpha and LB", where, "", said, spread > ANSWERS)]

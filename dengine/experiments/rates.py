@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.bounds import wilson_interval
+from ..errors import SettingError
 
 if TYPE_CHECKING:
     from .replay import Replay
 
+SIDES = ("accepted", "rejected")
 VERIFY_SECONDS = 5.0  # what a height check costs a cycle, in the paper's cell
 CYCLE_SECONDS = 47.5  # the paper: an insertion takes 45 to 50 s; a good part that was rejected takes one more
 STOP_SECONDS = 120.0  # a system stop, operator included: of the simulated cell, the paper gives none
@@ -67,7 +69,11 @@ def pooled_error(replays: Sequence[Replay], side: str = "accepted", alpha: float
     the unit: the variance of the ratio is that between traces (linearised, Cochran 1977, Sampling Techniques, 6.3), and
     the interval is Wilson's at the number of independent decisions that has this variance, at most the number of
     different traces where no decision was wrong. It speaks of other parts of the same kind, not of another cell.
+
+    side : "accepted" or "rejected"; SettingError for another.
     """
+    if side not in SIDES:
+        raise SettingError(f"Expected side {' or '.join(SIDES)}, got {side!r}.")
     size = 1 + max((int(r.index.max()) for r in replays if len(r)), default=0)
     decided, wrong = np.zeros(size), np.zeros(size)
     for one in replays:

@@ -1,7 +1,7 @@
 """Replays as tables: a row a replay in the CSV, a pooled row a recipe on the screen.
 
     frame = frame_of(replays)
-    Console().print(pooled_table(pool(frame, replays)))   # and promise_line(row) for each
+    Console().print(pooled_table(pool(frame, replays)))   # and promise_lines(rows)
 
 Which promise is shown: the one about all parts together. Among all parts accepted in all replays the share of bad ones
 should be at most 1 - LB, and likewise the share of good ones among the rejected. Each row names its guarantee: under
@@ -109,17 +109,25 @@ def promise_kept(row: Mapping[str, Any]) -> bool | None:
     return bool(row["precision"] >= row["lower_bound"])
 
 
-def promise_line(row: Mapping[str, Any]) -> str:
-    """The promise of one row in words."""
+def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The promise of each row in words, with those of its settings in which the rows differ."""
+    telling = [name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1]
+    return [promise_line(row, telling) for row in rows]
+
+
+def promise_line(row: Mapping[str, Any], telling: Sequence[str] = ()) -> str:
+    """The promise of one row in words. telling : settings that are named beside the guarantee."""
+    said = {"interval": row["interval"], "alpha": f"alpha {row['alpha']:g}"}
+    said["confirm"] = "good ones confirmed" if row["confirm"] else "stops alone"
+    who = f"{row['recipe']} ({', '.join([row['guarantee'], *(said[name] for name in telling)])})"
     if not row["total_accepted"]:
-        return f"{row['recipe']} ({row['guarantee']}): no part was accepted."
+        return f"{who}: no part was accepted."
     verdict = {True: "kept", False: "broken", None: f"fewer than {ENOUGH} accepted parts, too few to say"}[
         promise_kept(row)
     ]
     good, bound = _percent(row["precision"]), 100 * row["lower_bound"]
-    who = f"{row['recipe']} ({row['guarantee']})"
     bad = f"; bad: {100 * row['error_lower']:.1f} to {_percent(row['error_upper'])} at 95 %"
-    bad = "" if math.isnan(row.get("error_lower", math.nan)) else bad
+    bad = "" if math.isnan(row["error_lower"]) else bad
     return f"{who}: {good} of {row['total_accepted']} accepted parts were good{bad}, LB {bound:g} %: {verdict}."
 
 
@@ -143,9 +151,11 @@ def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> T
     table.add_column("recipe\nguarantee", overflow="fold")
     for name in _CELLS_OF:
         table.add_column(name, justify="right", no_wrap=True)
+    intervals = {row["interval"] for row in rows}
     for row in rows:
         known = "confirmed" if row["confirm"] else row["stops"]
-        table.add_row(f"{row['recipe']}\n{row['guarantee']}, {known}", *(show(row) for show in _CELLS_OF.values()))
+        name = f"{row['recipe']}\n{row['guarantee']}, {known}" + (f"\n{row['interval']}" if len(intervals) > 1 else "")
+        table.add_row(name, *(show(row) for show in _CELLS_OF.values()))
     return table
 
 

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError, TraceError
-from ..traces import as_trace, spec_of
+from ..traces import as_trace, is_time, spec_of
 from .asked import Asked
 from .dataset import Dataset, Fault, UnreadableError, make_dataset
+from .folder import FORCE, leave_out_other_rates
 from .labels import label_of
 from .lengths import Collected, as_dataset, refit
+from .recording import rate_of, seconds_of
 
 LARGEST = 8 * 2**30  # bytes of an archive's arrays, unpacked
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")
@@ -31,7 +33,7 @@ def read_npz(path: Path, name: str, asked: Asked) -> Dataset:
         with np.load(path, allow_pickle=False) as file:
             found = {key: file[key] for key in file.files if key in (*USED, asked.part)}
             return _from_arrays(found, file.files, path, name, asked)
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+    except (OSError, ValueError, TypeError, MemoryError, zipfile.BadZipFile, EOFError) as error:
         if isinstance(error, DataError):
             raise
         said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
@@ -46,10 +48,16 @@ def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
 
     try:
         with h5py.File(path, "r") as file:
-            have = [key for key in file if isinstance(file[key], h5py.Dataset)]
+            have: list[str] = []
+            file.visititems(lambda key, item: have.append(key) if isinstance(item, h5py.Dataset) else None)
+            size = sum(file[key].nbytes for key in have)
+            if size > LARGEST:
+                raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
             found = {key: _plain(file[key]) for key in have if key in (*USED, asked.part)}
             return _from_arrays(found, have, path, name, asked)
-    except OSError as error:
+    except (OSError, TypeError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
         raise DataError(f"Cannot read {path} as an HDF5 file: {error}.") from error
 
 
@@ -64,44 +72,66 @@ def _from_arrays(found: Mapping[str, Any], have: Sequence[str], path: Path, name
         raise DataError(f"Expected arrays X and y in {path}, found {listed}.")
     if asked.part != "part" and asked.part not in found:
         raise DataError(f"Expected an array {asked.part} in {path}, found {listed}.")
-    X = found["X"].astype(np.float32)
-    X *= np.float32(found.get("scale", 1.0))
+    X = found["X"]
+    if "scale" in found:
+        X = X.astype(np.float32) * found["scale"].astype(np.float32)
     about = {key: found[key] for key in ("cause",) if key in found}
     rate, unit = float(found.get("rate_hz", 500.0)), str(found.get("unit", "N"))
     channels = tuple(map(str, np.atleast_1d(found["channels"]))) if "channels" in found else ()
     part = found.get(asked.part)
     return refit(
-        make_dataset(X, found["y"], name=name, rate_hz=rate, unit=unit, part=part, channels=channels, **about), asked
+        make_dataset(X, _labels(found["y"]), name=name, rate_hz=rate, unit=unit, part=part, channels=channels, **about),
+        asked,
     )
 
 
 def from_pair(X: Any, y: Any, asked: Asked) -> Dataset:
     """Traces in memory and their labels: one array, or a list of arrays, Series or DataFrames of any length."""
-    if isinstance(X, list | tuple) or (isinstance(X, np.ndarray) and X.dtype.kind == "O"):
+    if isinstance(X, list | tuple) or (isinstance(X, np.ndarray) and X.dtype.kind == "O" and X.ndim == 1):
         traces = list(X)
         if traces and not all(np.isscalar(each) for each in traces):
             return _from_list(traces, list(y), asked)
-    return refit(make_dataset(X, y), asked)
+    return refit(make_dataset(X, _labels(y)), asked)
+
+
+def _labels(y: Any) -> Any:
+    """Labels as they came; words as 1 and 0."""
+    words = np.asarray(y)
+    if words.dtype.kind not in "OUS" or words.ndim != 1:
+        return words
+    text = words.astype(np.str_) if words.dtype.kind == "S" else words
+    try:
+        return np.array([label_of(word) for word in text.tolist()], dtype=np.int8)
+    except UnreadableError as error:
+        raise DataError(f"{error.what}.") from error
 
 
 def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
     if len(traces) != len(labels):
         raise DataError(f"Expected a label for each trace, got {len(traces)} traces and {len(labels)} labels.")
-    found = Collected("data", asked.channels, [])
+    has_force = any(FORCE in getattr(trace, "columns", ()) for trace in traces)
+    found = Collected("data", asked.channels or ((FORCE,) if has_force else ()), [])
     for number, (trace, word) in enumerate(zip(traces, labels, strict=True), start=1):
         try:
             picked = _picked(trace, found.channels)
-            x, label = as_trace(picked, None), label_of(word)
+            x, label, rate = as_trace(picked, None), label_of(word), None if asked.rate_hz else _rate(trace)
             if found.traces and len(x) != len(found.traces[0]):
                 raise UnreadableError(f"Expected {len(found.traces[0])} channel(s), as the first one has, got {len(x)}")
         except (TraceError, UnreadableError) as error:
             found.faults.append(Fault("data", number, str(error).rstrip(".")))
             continue
         found.channels = found.channels or spec_of(x, picked).columns
-        found.add(x, label, f"trace {number}", None, None)
+        found.add(x, label, f"trace {number}", None, rate)
     if found.traces and len(found.channels) not in (0, len(found.traces[0])):
         raise DataError(f"Expected a name for each of {len(found.traces[0])} channels, got {', '.join(found.channels)}.")
+    leave_out_other_rates(found)
     return as_dataset(found, asked)
+
+
+def _rate(trace: Any) -> float | None:
+    """Of a DataFrame of pandas, from its timestamps."""
+    names = [name for name in trace.columns if is_time(str(name))] if hasattr(trace, "iloc") and trace.ndim == 2 else []
+    return rate_of(seconds_of(trace[names[0]], str(names[0]))) if names else None
 
 
 def _picked(trace: Any, channels: tuple[str, ...]) -> Any:

@@ -23,6 +23,10 @@ class Asked:
     rate_hz: float | None = None
 
     def __post_init__(self) -> None:
+        if self.label is not None and self.labels is not None:
+            raise DataError(
+                "Expected a pattern for the labels (label) or a file of them (labels), got both; leave one out."
+            )
         if self.fit is not None and self.fit not in FITS:
             raise DataError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
         if self.rate_hz is not None and not self.rate_hz > 0:

@@ -98,9 +98,28 @@ class Dataset:
         return replace(self, X=X, channels=channels)
 
 
+def _real(X: ArrayLike) -> NDArray[np.float32]:
+    try:
+        array: NDArray[Any] = np.asarray(X)
+        if array.dtype.kind not in "cmMSU":
+            with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
+                return array.astype(np.float32, copy=False)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"Expected X of real numbers, (n, T) or (n, C, T), got something else: {error}.") from error
+    raise DataError(f"Expected X of real numbers, got dtype {array.dtype}.")
+
+
+def _must_fit(X: NDArray[np.float32], rate_hz: float = 500.0, channels: tuple[str, ...] = ()) -> None:
+    if not 0 < rate_hz < np.inf:
+        raise DataError(f"Expected a rate above 0 Hz, got {rate_hz}.")
+    n_channels = 1 if X.ndim == 2 else X.shape[1]
+    if channels and len(channels) != n_channels:
+        raise DataError(f"Expected a name for each of {n_channels} channels, got {', '.join(channels)}.")
+
+
 def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
     """A `Dataset` from arrays; DataError where they do not fit together."""
-    X, y = np.asarray(X, dtype=np.float32), np.asarray(y)
+    X, y = _real(X), np.asarray(y)
     if X.ndim not in (2, 3) or y.shape != (len(X),):
         raise DataError(f"Expected X (n, T) or (n, C, T) with n labels, got X {X.shape} and y {y.shape}.")
     if not len(y):
@@ -111,7 +130,8 @@ def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
             "transposed; pass X.transpose(0, 2, 1)."
         )
     if not np.isin(y, (0, 1)).all():
-        raise DataError(f"Expected labels 1 (success) and 0 (failure), got {np.unique(y)[:5]}.")
+        raise DataError(f"Expected labels 1 (success) and 0 (failure), got {sorted(set(map(str, y.tolist())))[:5]}.")
+    _must_fit(X, **{name: about[name] for name in ("rate_hz", "channels") if name in about})
     part, cause = (about.pop(name, None) for name in ("part", "cause"))
     if part is not None:
         part = np.asarray(part)

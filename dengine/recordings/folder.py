@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from pathlib import Path
-
-import numpy as np
 
 from ..errors import DataError
 from ..traces import is_time
@@ -24,17 +23,20 @@ NEAR = 0.03  # of the others' rate
 def read_folder(folder: Path, asked: Asked) -> Dataset:
     """The recordings below a folder; DataError where there are none, or none that can be read."""
     skipped = None if asked.labels is None else Path(asked.labels).resolve()
-    paths = [p for p in folder.rglob("*") if p.suffix.lower() == ".csv" and p.is_file() and p.resolve() != skipped]
-    names = {p.relative_to(folder).as_posix(): p for p in paths if not p.name.startswith(".")}
+    paths = [p for p in folder.rglob("*") if p.suffix.lower() == ".csv" and (p.is_file() or p.is_symlink())]
+    seen = {p.relative_to(folder): p for p in paths if p.resolve() != skipped}
+    names = {p.as_posix(): path for p, path in seen.items() if not any(word.startswith(".") for word in p.parts)}
     if not names:
         raise DataError(f"Expected CSV files, one an insertion, in the folder {folder}, found none.")
     ordered = {name: names[name] for name in sorted(names, key=natural)}
-    labels, faults = (named(asked.label), []) if asked.labels is None else listed(asked.labels, asked.part)
+    if asked.labels is None and asked.part != "part":
+        raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
+    labels, faults = (named(asked.label), []) if asked.labels is None else listed(asked.labels, asked.part, list(names))
     found = Collected(folder.resolve().name, _channels(ordered, asked, folder), faults)
     _read_all(ordered, labels, found, asked)
     if isinstance(labels, Listed):
         found.faults.extend(labels.unused())
-    _leave_out_other_rates(found)
+    leave_out_other_rates(found)
     return as_dataset(found, asked)
 
 
@@ -48,8 +50,9 @@ def _channels(paths: dict[str, Path], asked: Asked, folder: Path) -> tuple[str, 
     """Those that were asked for; else the force, or the only one there is."""
     if asked.channels:
         return asked.channels
-    headers = Counter(tuple(n for n in read_header(path) if n and not is_time(n)) for path in paths.values())
-    if any(FORCE in header for header in headers):
+    readable = [path for path in paths.values() if os.access(path, os.R_OK)]
+    headers = Counter(tuple(n for n in read_header(path) if n and not is_time(n)) for path in readable)
+    if not headers or any(FORCE.lower() in map(str.lower, header) for header in headers):
         return (FORCE,)
     usual = headers.most_common(1)[0][0]
     if len(usual) != 1:
@@ -78,15 +81,15 @@ def _read_all(paths: dict[str, Path], labels: Named | Listed, found: Collected, 
     if unlabelled > len(paths) / 2:
         raise DataError(
             f"Expected a label for each recording, {unlabelled} of {len(paths)} have none, {found.faults[-1].source} for "
-            "one; give the pattern of it in the name (label='_(OK|NOK)'), or a file of labels."
+            f"one; {labels.advice()}."
         )
 
 
-def _leave_out_other_rates(found: Collected) -> None:
+def leave_out_other_rates(found: Collected) -> None:
     """A recording at another rate is another trace of the same insertion: it is a fault."""
     known = [rate for rate in found.rates if rate is not None]
     if not known:
         return
-    usual = float(np.median(known))
+    usual = max(known, key=lambda rate: sum(abs(other - rate) <= NEAR * rate for other in known))
     off = [i for i, rate in enumerate(found.rates) if rate is not None and abs(rate - usual) > NEAR * usual]
     found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {found.rates[i]:g} Hz" for i in off})

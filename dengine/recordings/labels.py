@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ..errors import DataError
 from .dataset import Fault, UnreadableError
-from .text import read_lines, split_line
+from .text import fitting, read_lines, split_line
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "0")
+COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
@@ -50,12 +52,17 @@ class Named:
             raise UnreadableError(f"Expected a label where the pattern {self.pattern.pattern} finds it, found none")
         return label_of(match[1]), None
 
+    def advice(self) -> str:
+        """What to do where most recordings have no label."""
+        return "give the pattern of it in the path (label='_(OK|NOK)'), or a file of labels"
+
 
 def _usual(path: PurePosixPath) -> int:
-    """What the name ends with, or its folder is called: in good/1.csv the 1 is a number, and in 1/x_OK.csv the 1 is too."""
-    found, folder = IN_NAME.search(path.stem), path.parent.name
+    """What the name ends with, or a folder that it is in is called: in good/1.csv, and in 1/x_OK.csv, the 1 is a number."""
+    found = IN_NAME.search(COPY.sub("", path.stem))
+    folder = next((name for name in reversed(path.parent.parts) if WORD.fullmatch(name) and not name.isdecimal()), "")
     by_name = None if found is None else label_of(found[0].lstrip("_-. "))
-    by_folder = label_of(folder) if WORD.fullmatch(folder) and not folder.isdecimal() else None
+    by_folder = label_of(folder) if folder else None
     if by_folder is not None and (found is None or found[2].isdecimal()):
         return by_folder
     if by_name is None:
@@ -83,17 +90,20 @@ class Listed:
     """Labels, and parts' numbers, from a file: a row a recording."""
 
     source: str
-    rows: Mapping[str, tuple[int, str, str | None]]  # file -> line, word, part
-    seen: set[str] = field(default_factory=set)
+    rows: list[tuple[int, str, str, str | None]]  # line, file, word, part
+    names: Sequence[str]  # of all recordings
+    used: set[int] = field(default_factory=set)  # lines
 
     def label(self, name: str) -> tuple[int, str | None]:
-        """Of the file with this path, listed by its path, its name or its name without suffix."""
-        path = PurePosixPath(name)
-        key = next((key for key in (name, path.name, path.stem) if key in self.rows), None)
-        if key is None:
+        """Of the file with this path, listed by its path, its end, or longer by a folder; without suffix, in any case."""
+        rows = [row for row in self._rows_by_file.get(_words(name)[-1], ()) if _alike(row[1], name)]
+        if not rows:
             raise UnreadableError(f"Expected a row of {self.source} that names it, found none")
-        self.seen.add(key)
-        line, word, part = self.rows[key]
+        self.used.update(line for line, *_ in rows)
+        line, file, word, part = max(rows, key=lambda row: (_words(row[1]) == _words(name), len(_words(row[1]))))
+        others = [other for other in self._names_by_file[_words(name)[-1]] if other != name and _alike(file, other)]
+        if others and _words(file) != _words(name):
+            raise UnreadableError(f"Expected its folder in {self.source}, line {line}, which names {others[0]} too")
         try:
             return label_of(word), part
         except UnreadableError as error:
@@ -101,37 +111,85 @@ class Listed:
 
     def unused(self) -> list[Fault]:
         """Rows that name no recording."""
-        lost = [(line, key) for key, (line, _, _) in self.rows.items() if key not in self.seen]
-        return [Fault(self.source, line, f"Expected the name of a recording, found no file {key}") for line, key in lost]
+        lost = [(line, file) for line, file, *_ in self.rows if line not in self.used]
+        return [Fault(self.source, line, f"Expected the name of a recording, found no file {file}") for line, file in lost]
+
+    def advice(self) -> str:
+        """What to do where most recordings have no label."""
+        files = ", ".join(file for _, file, *_ in self.rows[:3])
+        return f"{self.source} names {files or 'no files'}: call its columns file and label, and the files as they are"
+
+    @cached_property
+    def _rows_by_file(self) -> dict[str, list[tuple[int, str, str, str | None]]]:
+        found: dict[str, list[tuple[int, str, str, str | None]]] = {}
+        for row in self.rows:
+            found.setdefault(_words(row[1])[-1], []).append(row)
+        return found
+
+    @cached_property
+    def _names_by_file(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        for name in self.names:
+            found.setdefault(_words(name)[-1], []).append(name)
+        return found
 
 
-def listed(path: str | os.PathLike[str], part: str) -> tuple[Listed, list[Fault]]:
-    """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one."""
+def _words(path: str) -> list[str]:
+    """A path's folders and file, in lower case, without suffix, as Windows or another system writes it."""
+    words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
+    return [*words[:-1], words[-1].removesuffix(".csv")]
+
+
+def _alike(one: str, other: str) -> bool:
+    """Whether one of two paths is the end of the other."""
+    pairs = zip(reversed(_words(one)), reversed(_words(other)), strict=False)
+    return all(a == b for a, b in pairs)
+
+
+def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> tuple[Listed, list[Fault]]:
+    """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one.
+
+    names : of all recordings.  A file without a header, which names a .csv in its first line, has them in this order.
+    """
     source = Path(path).name
     try:
         header, lines, delimiter = read_lines(Path(path))
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    of_file, of_label = _column(header, FILE_COLUMNS, 0, path), _column(header, LABEL_COLUMNS, 1, path)
+    if header[0].lower().endswith(".csv"):
+        header, lines = ["file", "label"], [(1, delimiter.join(header)), *lines]
+    of_file, of_label = _columns(header, path)
+    if part != "part" and part not in header:
+        raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
     of_part = header.index(part) if part in header else None
-    rows: dict[str, tuple[int, str, str | None]] = {}
+    rows: dict[str, tuple[int, str, str, str | None]] = {}
     faults = []
     for number, line in lines:
-        words = split_line(line, delimiter)
-        if len(words) != len(header):
-            faults.append(Fault(source, number, f"Expected {len(header)} columns, got {len(words)}"))
-        elif words[of_file] in rows:
+        try:
+            words = fitting(split_line(line, delimiter), len(header))
+        except UnreadableError as error:
+            faults.append(Fault(source, number, error.what))
+            continue
+        key = "/".join(_words(words[of_file]))
+        if key in rows:
             faults.append(Fault(source, number, f"Expected each file once, {words[of_file]} came before"))
         else:
-            rows[words[of_file]] = number, words[of_label], None if of_part is None else words[of_part] or None
-    return Listed(source, rows), faults
+            rows[key] = number, words[of_file], words[of_label], None if of_part is None else words[of_part] or None
+    return Listed(source, list(rows.values()), names), faults
 
 
-def _column(header: Sequence[str], known: Sequence[str], otherwise: int, path: str | os.PathLike[str]) -> int:
-    lower = [name.lower() for name in header]
-    for name in known:
-        if name in lower:
-            return lower.index(name)
+def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Where the files and where the labels are; of two columns, the first and the second, or the one that is left."""
+    of_file, of_label = _place(header, FILE_COLUMNS), _place(header, LABEL_COLUMNS)
     if len(header) == 2:
-        return otherwise
-    raise DataError(f"Expected a column {known[0]} in {path}, got {', '.join(header)}; call it so.")
+        of_file = of_file if of_file is not None else 0 if of_label is None else 1 - of_label
+        of_label = 1 - of_file
+    if of_file is None or of_label is None:
+        wanted = FILE_COLUMNS[0] if of_file is None else "label"
+        raise DataError(f"Expected a column {wanted} in {path}, got {', '.join(header)}; call it so.")
+    return of_file, of_label
+
+
+def _place(header: Sequence[str], known: Sequence[str]) -> int | None:
+    lower = [name.lower() for name in header]
+    return next((lower.index(name) for name in known if name in lower), None)

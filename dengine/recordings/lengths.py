@@ -117,6 +117,8 @@ def refit(data: Dataset, asked: Asked) -> Dataset:
 
 
 def _must_have_some(found: Collected) -> None:
+    if not found.traces and not found.faults:
+        raise DataError(f"Expected at least one trace in {found.name}, got none.")
     if not found.traces:
         few = "; ".join(map(str, found.faults[:3]))
         raise DataError(f"Expected recordings that can be read in {found.name}, found none of {len(found.faults)}: {few}.")

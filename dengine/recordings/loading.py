@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Callable, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -18,7 +19,7 @@ from .tables import from_frame, read_csv, read_parquet
 
 BUNDLED = {"insertion": "insertion.npz"}
 Reader = Callable[[Path, str, Asked], Dataset]
-READERS: dict[str, Reader] = {  # by suffix; any other is read as .npz
+READERS: dict[str, Reader] = {  # by suffix; other zip files are read as .npz
     ".csv": read_csv,
     ".parquet": read_parquet,
     ".pq": read_parquet,
@@ -86,6 +87,8 @@ def _read(path: Path, asked: Asked) -> Dataset:
             f"{path} is neither."
         )
     suffix = path.suffix.lower()
+    if suffix not in (".npz", *READERS) and not zipfile.is_zipfile(path):
+        raise DataError(f"Expected a file .npz, .csv, .parquet or .h5, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
 

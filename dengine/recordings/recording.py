@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 
 from ..traces import is_time
 from .dataset import UnreadableError
-from .text import decimal_of, delimiter_of, find_fault, read_text, split_line
+from .text import decimal_of, delimiter_of, find_fault, is_number, named_columns, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
 
 GAP = 5.0  # median steps: a pause that a late message does not explain
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # a time of day as a number: above this, in units of so many seconds
+SLOW = (
+    0.5  # seconds: no recorder of forces steps so slowly, a clock without a unit counts thousandths, or thousandths of them
+)
 UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 
 
@@ -40,18 +43,25 @@ def read_recording(path: Path, channels: Sequence[str], timed: bool) -> Recordin
     text = read_text(path)
     head = text[: text.find("\n")] if "\n" in text else text
     delimiter = delimiter_of(head)
-    header = split_line(head, delimiter)
-    missing = [name for name in channels if name not in header]
-    if missing:
-        raise UnreadableError(f"Expected a column {missing[0]}, got {', '.join(header)[:100]}", 1)
-    places = [header.index(name) for name in channels]
+    header = named_columns(head, delimiter)
+    places = [place_of(name, header) for name in channels]
     clock = next((i for i, name in enumerate(header) if is_time(name)), None) if timed else None
     frame = _parse(text, header, places, clock, delimiter)
     if frame.empty:
         raise UnreadableError("Expected samples below the header, found none", 1)
     values = frame[places].to_numpy(dtype=np.float32).T
-    rate = None if clock is None else rate_of(_seconds(frame[clock], header[clock]))
+    rate = None if clock is None else rate_of(seconds_of(frame[clock], header[clock]))
     return Recording(np.ascontiguousarray(values), rate)
+
+
+def place_of(name: str, header: Sequence[str]) -> int:
+    """Where a header has a name, in any case if it is not there as it is written; UnreadableError for none, or several."""
+    places = [i for i, word in enumerate(header) if word == name]
+    places = places or [i for i, word in enumerate(header) if word.lower() == name.lower()]
+    if len(places) != 1:
+        listed = ", ".join(header)[:100] or "an empty line"
+        raise UnreadableError(f"Expected a column {name}, got {'it twice or more in ' if places else ''}{listed}", 1)
+    return places[0]
 
 
 def _parse(text: str, header: Sequence[str], places: list[int], clock: int | None, delimiter: str) -> pd.DataFrame:
@@ -73,7 +83,7 @@ def _parse(text: str, header: Sequence[str], places: list[int], clock: int | Non
         raise UnreadableError(f"It cannot be read as CSV: {' '.join(str(error).split())}") from error
 
 
-def _seconds(column: Any, name: str) -> NDArray[np.float64]:
+def seconds_of(column: Any, name: str) -> NDArray[np.float64]:
     """Timestamps as seconds from the first: numbers, in the unit that name or size tell, or times of day as text."""
     import pandas as pd
 
@@ -82,13 +92,28 @@ def _seconds(column: Any, name: str) -> NDArray[np.float64]:
         ending = re.search(r"[_ \[(](ms|us|µs|ns)[\])]?$", name.lower())
         unit = UNITS[ending[1]] if ending else 0.0
         first: float = np.nan_to_num(times[0])
-        unit = unit or next((seconds for above, seconds in EPOCHS if first > above), 1.0)
+        unit = unit or next((seconds for above, seconds in EPOCHS if first > above), 0.0) or _unit_of(np.diff(times))
         return np.asarray((times - times[0]) * unit)
+    words = column.astype(str).str.strip()
+    numbers = [is_number(word) for word in words]
+    if 2 * sum(numbers) > len(numbers):
+        _refuse_time(words, numbers.index(False), name)
     stamps = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
     bad = np.flatnonzero(stamps.isna())
     if len(bad):
-        raise UnreadableError(f"Expected a time in column {name}, got {str(column.iloc[bad[0]])[:30]!r}", int(bad[0]) + 2)
+        _refuse_time(words, int(bad[0]), name)
     return np.asarray((stamps - stamps.iloc[0]).dt.total_seconds(), dtype=np.float64)
+
+
+def _refuse_time(words: pd.Series, place: int, name: str) -> None:
+    what = f"Expected a time in column {name}, in seconds or as 2026-03-01T12:00:00.002, got {words.iloc[place][:30]!r}"
+    raise UnreadableError(f"{what}; a stated rate (rate_hz) leaves times unread", place + 2)
+
+
+def _unit_of(steps: NDArray[np.float64]) -> float:
+    """Seconds in one of a clock that names no unit: a second, or the thousandth, ... that makes its steps a recorder's."""
+    step = float(np.median(steps)) if len(steps) else 0.0
+    return next((unit for unit in (1.0, 1e-3, 1e-6) if step * unit < SLOW), 1e-9)
 
 
 def rate_of(seconds: NDArray[np.float64]) -> float | None:
@@ -98,7 +123,9 @@ def rate_of(seconds: NDArray[np.float64]) -> float | None:
         return None
     wrong = np.flatnonzero(~(steps > 0))
     if len(wrong):
-        raise UnreadableError("Expected a later time than that of the row before", int(wrong[0]) + 3)
+        raise UnreadableError(
+            "Expected a later time than that of the row before, or a stated rate (rate_hz)", int(wrong[0]) + 3
+        )
     step = float(np.median(steps))
     jumps = np.flatnonzero(steps > GAP * step)
     if len(jumps):

@@ -1,7 +1,7 @@
 """Wide tables, a row an insertion: CSV, Parquet, or a DataFrame; samples in numbered columns, and one column of labels.
 
 Columns `FZ_0 … FZ_999` are a channel FZ, `0 … 999` or `x1 … x1000` one without need of a name; further channels have
-as many.
+as many. Or a column a channel, whose cells are lists of numbers, as Parquet keeps them.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
+from ..traces import is_time
 from .asked import Asked
-from .dataset import Dataset, Fault, UnreadableError, make_dataset
+from .dataset import Dataset, Fault, UnreadableError
 from .folder import FORCE
 from .labels import LABEL_COLUMNS, label_of
-from .lengths import refit
-from .text import NOTHING, read_lines
+from .lengths import Collected, as_dataset
+from .text import NOTHING, is_number, read_lines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,11 +39,17 @@ def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
         header, lines, delimiter = read_lines(path)
     except UnreadableError as error:
         raise DataError(f"Cannot read {path}: {error.fault(path.name)}.") from error
+    if 2 * sum(is_number(word) and not word.isdecimal() for word in header) > len(header) > 2:
+        raise DataError(
+            f"Expected a header in {path}, its first line is of numbers; name the columns FZ_0, FZ_1, ..., label."
+        )
     faults, rows = [], []
     for number, line in lines:
         columns = line.count(delimiter) + 1
         if columns == len(header) or '"' in line:
             rows.append((number, line))
+        elif columns > len(header) and not any(word.strip() for word in line.split(delimiter)[len(header) :]):
+            rows.append((number, delimiter.join(line.split(delimiter)[: len(header)])))
         else:
             faults.append(Fault(path.name, number, f"Expected {len(header)} columns, got {columns}"))
     if not rows:
@@ -80,28 +87,63 @@ def from_frame(
 ) -> Dataset:
     """A table in memory. lines : where each row stands in its file; None: rows count from 1.
 
-    An empty cell is a NaN: the engine finds it, and the part is verified. A row with text in it, or no label, is a fault.
+    An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
+    a shorter trace. A row with text in it, or no label, is a fault.
     """
-    frame = frame.rename(columns=str)
-    lines = lines or list(range(1, len(frame) + 1))
+    frame = frame.set_axis([_name_of(each) for each in frame.columns], axis=1)
+    twice = frame.columns[frame.columns.duplicated()]
+    if len(twice):
+        raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
     label = _label_column(frame, asked)
     if asked.part != "part" and asked.part not in frame:
         raise DataError(f"Expected a column {asked.part} of parts' numbers, found {_few(frame.columns)}.")
-    columns = _sample_columns([c for c in frame.columns if c not in (label, asked.part)], asked)
     wrong: dict[int, str] = {}
-    block = np.stack([_numbers(frame, names, wrong) for names in columns.values()], axis=1)
-    y = _labels(frame[label], wrong)
+    channels, traces = _traces(frame.drop(columns=[c for c in (label, asked.part) if c in frame]), asked, wrong)
+    y, parts = _labels(frame[label], wrong), _parts(frame, asked.part)
+    lines = lines or list(range(1, len(frame) + 1))
     left_out = [Fault(source, lines[i], what) for i, what in sorted(wrong.items())]
-    kept = np.array([i not in wrong for i in range(len(frame))], dtype=bool)
-    if not kept.any():
-        few = "; ".join(map(str, left_out[:3]))
-        raise DataError(f"Expected rows that can be read in {source}, found none of {len(frame)}: {few}.")
-    about: dict[str, Any] = {"faults": (*(faults or []), *left_out), "channels": tuple(n for n in columns if n)}
-    about["source"] = np.array([f"{source}, line {lines[i]}" for i in np.flatnonzero(kept)])
-    part = frame[asked.part].astype(str).to_numpy(dtype=np.str_)[kept] if asked.part in frame else None
-    X = (block[:, 0] if block.shape[1] == 1 else block)[kept]
-    picked = Asked(asked.samples, fit=asked.fit, rate_hz=asked.rate_hz)  # its channels are those that were asked for
-    return refit(make_dataset(X, y[kept], name=name, part=part, **about), picked)
+    found = Collected(name, tuple(n for n in channels if n), [*(faults or []), *left_out])
+    for i in (i for i in range(len(frame)) if i not in wrong):
+        found.add(traces[i], int(y[i]), f"{source}, line {lines[i]}", parts[i], None)
+    return as_dataset(found, asked)
+
+
+def _name_of(column: Any) -> str:
+    """A column's name; FZ_0 of one in two levels, FZ and 0."""
+    return "_".join(str(word) for word in column if word != "") if isinstance(column, tuple) else str(column)
+
+
+def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[tuple[str, ...], list[NDArray[np.float32]]]:
+    """The channels' names, and of each row (C, T): a row whose last cells are empty is a shorter trace."""
+    lists = {c: [c] for c in frame.columns if any(isinstance(cell, list | np.ndarray) for cell in frame[c])}
+    if lists:
+        chosen = _chosen(lists, asked)
+        return chosen, [_of_lists(row, i, wrong) for i, row in enumerate(frame[list(chosen)].to_numpy())]
+    columns = _sample_columns(list(frame.columns), asked)
+    block = np.stack([_numbers(frame, names, wrong) for names in columns.values()], axis=1)
+    known: NDArray[np.bool_] = np.asarray(~np.isnan(block).all(axis=1))
+    ends = np.where(known.any(axis=1), block.shape[2] - np.argmax(known[:, ::-1], axis=1), block.shape[2])
+    return tuple(columns), [row[:, :end] for row, end in zip(block, ends.tolist(), strict=True)]
+
+
+def _of_lists(cells: NDArray[Any], place: int, wrong: dict[int, str]) -> NDArray[np.float32]:
+    """A row's channels, a list each, as (C, T)."""
+    try:
+        trace = np.stack([np.asarray(cell, dtype=np.float32) for cell in cells])
+    except (TypeError, ValueError):
+        trace = np.empty(0, dtype=np.float32)
+    if trace.ndim != 2 or not trace.size:
+        wrong[place] = "Expected a list of numbers in each channel, all of one length, got something else"
+    return trace
+
+
+def _parts(frame: pd.DataFrame, column: str) -> list[str | None]:
+    """Parts' numbers as text; None where there is none."""
+    if column not in frame:
+        return [None] * len(frame)
+    known = frame[column].notna()
+    words = [str(part).removesuffix(".0").strip() for part in frame[column].tolist()]
+    return [word or None if there else None for word, there in zip(words, known, strict=True)]
 
 
 def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
@@ -113,6 +155,8 @@ def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
     for known in LABEL_COLUMNS:
         if known in lower:
             return str(lower[known])
+    if any(is_time(c) for c in frame.columns):
+        raise DataError(f"Expected a row an insertion, found {_few(frame.columns)}, as in one recording; give its folder.")
     raise DataError(f"Expected a column of labels, y or label, found {_few(frame.columns)}; name it: label='...'.")
 
 
@@ -123,7 +167,7 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
         found = NUMBERED.fullmatch(name)
         if found:
             groups.setdefault(found[1], []).append((int(found[2]), name))
-    several = {name: [column for _, column in sorted(those)] for name, those in groups.items() if len(those) > 1}
+    several = {name: _in_order(sorted(those)) for name, those in groups.items() if len(those) > 1}
     if not several:
         raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {_few(names)}.")
     chosen = _chosen(several, asked)
@@ -132,6 +176,16 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
         each = ", ".join(f"{name} {len(several[name])}" for name in chosen)
         raise DataError(f"Expected as many samples of each channel, got {each}.")
     return {name: several[name] for name in chosen}
+
+
+def _in_order(numbered: list[tuple[int, str]]) -> list[str]:
+    """Names by their numbers; DataError where one is missing, or there twice: what comes after it would be shifted."""
+    steps = np.diff([number for number, _ in numbered])
+    uneven = np.flatnonzero(steps != np.median(steps))
+    if len(uneven):
+        before, after = (numbered[int(uneven[0]) + i][1] for i in (0, 1))
+        raise DataError(f"Expected columns that are numbered one by one, after {before} comes {after}.")
+    return [name for _, name in numbered]
 
 
 def _chosen(have: Mapping[str, list[str]], asked: Asked) -> tuple[str, ...]:

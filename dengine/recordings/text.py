@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,14 +34,14 @@ def read_lines(path: Path) -> tuple[list[str], Lines, str]:
     """A file's header, its other lines with their numbers, without blank ones, and its delimiter."""
     lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     delimiter = delimiter_of(lines[0][1])
-    return split_line(lines[0][1], delimiter), lines[1:], delimiter
+    return named_columns(lines[0][1], delimiter), lines[1:], delimiter
 
 
 def read_header(path: Path) -> list[str]:
     """The names in a file's first line; none where it has no such line."""
     with path.open("rb") as file:
         line = file.readline(2**20).decode("utf-8-sig", errors="replace")
-    return split_line(line, delimiter_of(line)) if line.strip() else []
+    return named_columns(line, delimiter_of(line)) if line.strip() else []
 
 
 def delimiter_of(line: str) -> str:
@@ -49,8 +50,24 @@ def delimiter_of(line: str) -> str:
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Its words, without blanks and quotes around them."""
-    return [word.strip().strip('"') for word in line.rstrip("\r\n").split(delimiter)]
+    """Its words, without blanks and quotes around them; a delimiter between quotes is part of a word."""
+    words = next(csv.reader([line.rstrip("\r\n").replace("\0", "")], delimiter=delimiter, skipinitialspace=True), [])
+    return [word.strip().strip('"') for word in words]
+
+
+def fitting(words: list[str], n: int) -> list[str]:
+    """A line's words where they are n, but for empty ones that a comma at its end makes; UnreadableError elsewhere."""
+    if len(words) < n or any(words[n:]):
+        raise UnreadableError(f"Expected {n} columns, got {len(words)}")
+    return words[:n]
+
+
+def named_columns(line: str, delimiter: str) -> list[str]:
+    """A header's names, without the empty ones that a comma at its end makes."""
+    names = split_line(line, delimiter)
+    while names and not names[-1]:
+        names.pop()
+    return names
 
 
 def decimal_of(text: str, delimiter: str) -> str:
@@ -63,9 +80,10 @@ def find_fault(text: str, header: Sequence[str], wanted: Sequence[int], delimite
     for number, line in enumerate(text.splitlines()[1:], start=2):
         if not line.strip():
             continue
-        words = split_line(line, delimiter)
-        if len(words) != len(header):
-            raise UnreadableError(f"Expected {len(header)} columns, got {len(words)}", number)
+        try:
+            words = fitting(split_line(line, delimiter), len(header))
+        except UnreadableError as error:
+            raise UnreadableError(error.what, number) from None
         for place in wanted:
             if not is_number(words[place].replace(decimal, ".")):
                 raise UnreadableError(f"Expected a number in column {header[place]}, got {words[place][:20]!r}", number)

@@ -18,7 +18,7 @@ from ...errors import SettingError
 if TYPE_CHECKING:
     from .base import Rival
 
-__all__ = ["RIVALS", "Rival", "RivalKind", "make_rival"]
+__all__ = ["RIVALS", "Rival", "RivalKind", "make_rival", "require"]
 
 Params = Mapping[str, Any]
 
@@ -142,11 +142,8 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
     minute when it is used for the first time.
     SettingError for an unknown name, an unknown parameter, a value out of range, or a library that is missing.
     """
-    if name not in RIVALS:
-        raise SettingError(f"Expected a rival among {', '.join(RIVALS)}, got {name!r}.")
+    require(name)
     kind = RIVALS[name]
-    if kind.needs and find_spec(kind.needs) is None:
-        raise SettingError(f'The rival {name} needs {kind.needs}, which is missing; pip install "dengine[rivals]".')
     allowed = [each.name for each in signature(kind.rival).parameters.values() if each.kind is Parameter.KEYWORD_ONLY]
     unknown = sorted(set(params) - set(allowed))
     if unknown:
@@ -154,6 +151,15 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
             f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(allowed) or 'none'}."
         )
     return kind.rival(policy.alpha, policy.lower_bound, seed, **params)
+
+
+def require(name: str) -> None:
+    """SettingError where there is no rival of this name, or the library that it is made with is missing."""
+    if name not in RIVALS:
+        raise SettingError(f"Expected a rival among {', '.join(RIVALS)}, got {name!r}.")
+    needs = RIVALS[name].needs
+    if needs and find_spec(needs) is None:
+        raise SettingError(f'The rival {name} needs {needs}, which is missing; pip install "dengine[rivals]".')
 
 
 __getattr__, __dir__ = lazy_names(__name__, {"base": ("Rival",)})
