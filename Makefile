@@ -37,7 +37,7 @@ $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) --editable ".[dev]"
+	$(PIP) --no-compile --editable ".[dev]"
 	touch $@ $(VENV)/.demo
 
 demo: $(VENV)/.demo

@@ -36,15 +36,16 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data numbered.npz": "--cycles 80",
     "dengine train --data insertion": "--data small.npz --retrains 1",
     "dengine train --data recordings": "--retrains 1",
-    "python training/compare_reducers.py report --data insertion": f"{ONE_REPLAY} --reducers conv,pca,rocket",
+    "python training/compare_reducers.py report --data insertion": f"{ONE_REPLAY} --reducers conv,pca,knn",
     "python training/compare_reducers.py report --data screw_driving.npz": f"{ONE_REPLAY} --reducers conv,pca",
-    "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 1",
+    "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1 --umap-most 1",
     "python training/check_noise.py": "--data screw_driving.npz --samples 100 --seeds 100:101",
     "python training/show_scenarios.py": "--cycles 12 --n-jobs 1",
     "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_ablations.py": "--data small.npz --only length --seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
+    "cmake -S tests/cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0",  # test_cpp.py builds it as it is meant
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
 }
 HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")

@@ -41,15 +41,20 @@ def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any
         ("process", ProcessPoolExecutor(1, mp_context=get_context("spawn"))),
     ):
         deciding[f"decide, retraining in a {name}"], swaps[f"decide and swap, {name}"] = beside(data, recipe, executor)
-    umap_fit, deciding["UMAP single transform"] = umap_times(data, args.umap_repeats)
     rows = [
         row(f"retrain, all of {args.replays} replays", retrains, BUDGET),
         row(f"retrain on {len(data)} traces", whole, BUDGET),
-        row(f"UMAP fit on {len(data)} traces", umap_fit),
         *(row(name, seconds) for name, seconds in (deciding | swaps).items()),
-        ratio("UMAP fit / retrain", umap_fit, whole, 6.0),
-        ratio("UMAP single transform / decide", deciding["UMAP single transform"], deciding["decide"], 15.0),
     ]
+    if args.umap_repeats:
+        umap_fit, umap_transform = umap_times(data, args.umap_repeats)
+        rows += [
+            row(f"UMAP fit on {len(data)} traces", umap_fit),
+            row("UMAP single transform", umap_transform),
+            ratio("UMAP fit / retrain", umap_fit, whole, 6.0),
+            ratio("UMAP single transform / decide", umap_transform, deciding["decide"], 15.0),
+        ]
+        deciding["UMAP single transform"] = umap_transform
     return rows, deciding
 
 
@@ -165,7 +170,9 @@ def main() -> None:
     parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, or module:Class")
     parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
     parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
-    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each")
+    parser.add_argument(
+        "--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each; 0: none"
+    )
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
     args = parser.parse_args()
     data = load_dataset(args.data, args.samples)

@@ -111,6 +111,8 @@ def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: P
 
 def measure_umap(data: Dataset, sizes: list[int]) -> dict[int, float]:
     """UMAP's fit, in seconds, by number of traces; a first one compiles."""
+    if not sizes:
+        return {}
     rng = np.random.default_rng(0)
     make_reducer("umap").fit(noisy(data, 200, rng)[0].reshape(200, -1))
     seconds = {}
