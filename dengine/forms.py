@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -12,6 +11,7 @@ from .datasets import Dataset
 from .errors import StoreError, TraceError
 from .recordings.loading import TABLES
 from .records import TraceSpec
+from .settings import trace_in
 from .store.base import Store, opening
 
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
@@ -29,12 +29,11 @@ def form_in(store: str | os.PathLike[str] | Store, source: Any) -> dict[str, Any
         return {}
     try:
         with opening(store, must_exist=True) as opened:
-            known = opened.settings().get("trace")
+            agreed = trace_in(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:
         return {}  # a new one; what else is wrong is found when it is opened to write
-    agreed = None if known is None else TraceSpec(**json.loads(known))
     if agreed is None:
         return {}
     return {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}

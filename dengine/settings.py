@@ -91,8 +91,7 @@ class EngineSettings:
                 raise SettingError(
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
-        trace = TraceSpec(**json.loads(known["trace"])) if "trace" in known else None
-        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace)
+        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace_in(known))
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
@@ -108,11 +107,11 @@ class EngineSettings:
         """SettingError where what is asked for, as `DataEngine` takes it, is not what is set; None asks for nothing."""
         given = {name: value for name, value in asked.items() if value is not None}
         reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
-        have = _flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
+        have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
         unknown = sorted(set(given) - set(have))
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
-        wished = {} if recipe is None else _flat(chosen_recipe(reducer, recipe, {}))
+        wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
         wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
@@ -155,7 +154,13 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
         )
 
 
-def _flat(recipe: Recipe) -> dict[str, Any]:
+def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
+    """The traces' contract among a store's settings; None before the first trace."""
+    return TraceSpec(**json.loads(known["trace"])) if "trace" in known else None
+
+
+def flat(recipe: Recipe) -> dict[str, Any]:
+    """Every setting of a recipe by its name, the policy's among them."""
     plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
     policy: Policy = plain.pop("policy")
     return plain | asdict(policy)

@@ -5,6 +5,7 @@ reason, the part is verified, and the cell goes on. So is a wrong length, where 
 """
 
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -114,13 +115,13 @@ def _without_frame(trace: Any, spec: TraceSpec | None) -> Any:
     if spec is not None and spec.columns:
         missing = [name for name in spec.columns if name not in have]
         if missing:
-            raise TraceError(f"Expected the columns {', '.join(spec.columns)}, got {_listed(have)}.")
+            raise TraceError(f"Expected the columns {', '.join(spec.columns)}, got {listed(have)}.")
         return trace[list(spec.columns)].to_numpy().T
     names = _channels(trace)
     if not names or (spec is not None and len(names) != spec.channels):
         wanted = "at least one channel" if spec is None else f"{spec.channels} channel(s)"
         raise TraceError(
-            f"Expected a DataFrame with {wanted}, a column each, got the columns {_listed(have)}; "
+            f"Expected a DataFrame with {wanted}, a column each, got the columns {listed(have)}; "
             "pass the right ones, or name them in TraceSpec(columns=...)."
         )
     return trace[names].to_numpy().T
@@ -132,7 +133,9 @@ def _channels(frame: Any) -> list[Any]:
     return [name for name in frame.columns if name not in dated and not is_time(str(name))]
 
 
-def _listed(names: list[Any]) -> str:
+def listed(names: Iterable[Any]) -> str:
+    """The first few of some names, and how many more there are."""
+    names = list(names)
     few = ", ".join(map(str, names[:8]))
     return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
 

@@ -140,7 +140,7 @@ def test_every_help_ends_in_a_command_that_works(
 def test_the_programs_own_example_parses() -> None:
     program, verb, *words = shlex.split(succeed("--help").rstrip().splitlines()[-1])
     assert program == "dengine"
-    with click.Context(main) as parent:
+    with click.Context(main, **main.context_settings) as parent:  # click keeps the help option of the first context
         main.commands[verb].make_context(verb, words, parent=parent)  # UsageError for an option that does not exist
 
 

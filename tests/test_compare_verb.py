@@ -1,6 +1,7 @@
 """`dengine compare` over grids, rivals and feedbacks, in this process; what it writes, and what it refuses."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from click.testing import CliRunner, Result
 
 from dengine import Dataset
 from dengine.cli import main
+from dengine.experiments.rivals import RIVALS
 
 
 @pytest.fixture
@@ -97,6 +99,11 @@ def test_an_address_that_is_none_of_a_scheduler_says_what_is_expected(folder: Pa
     result = compare(f"--reducers pca --repeats 1 --scheduler {address}")
     assert result.exit_code == 1
     assert "Expected --scheduler to be the address of a running dask scheduler" in result.output
+
+
+def test_the_help_names_every_rival(folder: Path) -> None:
+    shown = re.findall(r"\w+", compare("--help").output)
+    assert [name for name in RIVALS if name not in shown] == []
 
 
 @pytest.mark.parametrize(

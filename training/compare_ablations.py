@@ -15,9 +15,11 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from compare_reducers import span
 from matplotlib.figure import Figure
 from rich.console import Console
 from torch import Tensor
@@ -25,8 +27,9 @@ from torch import Tensor
 from dengine import ConvReducer, Dataset, Recipe, Replay, load_dataset
 from dengine.experiments.contenders import Contender
 from dengine.experiments.figures import save
-from dengine.experiments.grid import iterate_replays
+from dengine.experiments.grid import play_tasks
 from dengine.experiments.kept import Task
+from dengine.experiments.look import GREEN, LIMIT
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
 from dengine.reducers.features import ConvFeatures
 
@@ -123,8 +126,8 @@ def channels(data: Dataset, base: Recipe) -> Variants:
     """Each channel alone, and all; nothing where there is but one."""
     if data.X.ndim == 2 or data.X.shape[1] == 1:
         return {}
-    names = getattr(data, "channels", ()) or [f"channel {c}" for c in range(data.X.shape[1])]
-    alone = {str(name): Variant(replace(data, X=data.X[:, c], channels=()), base) for c, name in enumerate(names)}
+    names = data.channels or [f"channel {c}" for c in range(data.X.shape[1])]
+    alone = {name: Variant(replace(data, X=data.X[:, c], channels=()), base) for c, name in enumerate(names)}
     return alone | {"all": Variant(data, base)}
 
 
@@ -157,14 +160,15 @@ AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
 
 def play(axis: str, data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:
     """The replays of every variant of an axis, named by it."""
-    replays: dict[tuple[int, int], Replay] = {}
     variants = AXES[axis](data, base)
-    for v, (name, one) in enumerate(variants.items()):
-        who = Contender(f"{axis} {name}", one.recipe)
-        tasks = [Task(who, seed, min(args.cycles, len(one.data)), True, one.confirm) for seed in args.seeds]
-        for played in iterate_replays(one.data, tasks, n_jobs=args.n_jobs, keep=args.keep):
-            replays[v, played.position] = played.replay
-    return [replays[key] for key in sorted(replays)]
+    return [replay for name, one in variants.items() for replay in shuffles(f"{axis} {name}", one, args)]
+
+
+def shuffles(name: str, one: Variant, args: argparse.Namespace) -> list[Replay]:
+    """The replays of one variant, a seed each."""
+    cycles = min(args.cycles, len(one.data))
+    tasks = [Task(Contender(name, one.recipe), seed, cycles, True, one.confirm) for seed in args.seeds]
+    return play_tasks(one.data, tasks, n_jobs=args.n_jobs, keep=args.keep)
 
 
 def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
@@ -179,8 +183,8 @@ def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
     for axes, (axis, some) in zip(panels.flat, axes_of.items(), strict=True):
         names = [row["recipe"].removeprefix(f"{axis} ") for row in some]
         deviation = np.nan_to_num([row["certain_sd"] for row in some])
-        axes.barh(names, [row["certain"] for row in some], xerr=deviation, color="#009E73", alpha=0.7, height=0.7)
-        axes.axvline(as_it_is, color="black", linestyle=":", linewidth=1.2)
+        axes.barh(names, [row["certain"] for row in some], xerr=deviation, color=GREEN, alpha=0.7, height=0.7)
+        axes.axvline(as_it_is, **LIMIT)
         axes.invert_yaxis()
         axes.set_ylabel(axis)
         axes.spines[["top", "right"]].set_visible(False)
@@ -204,6 +208,13 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder of finished replays")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
     args = parser.parse_args()
+    with TemporaryDirectory() as kept:  # what stands on several axes, the recipe as it is, is played once
+        args.keep = args.keep or kept
+        compare(args, parser)
+
+
+def compare(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Play every axis that was asked for, print, write."""
     unknown = set(args.only.split(",")) - set(AXES)
     if unknown:
         parser.error(f"expected axes among {', '.join(AXES)}, got {', '.join(sorted(unknown))}")
@@ -212,7 +223,8 @@ def main() -> None:
     played = {axis: play(axis, data, base, args) for axis in args.only.split(",")}
     for axis in (axis for axis, some in played.items() if not some):
         print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
-    as_it_is, replays = baseline(data, base, args), [replay for some in played.values() for replay in some]
+    as_it_is = shuffles("as it is", Variant(data, base), args)
+    replays = [replay for some in played.values() for replay in some]
     rows = pool(frame_of(as_it_is + replays), as_it_is + replays)
     level, seeds = f"({args.alpha:g}, {100 * args.lower_bound:g} %)", f"seeds {args.seeds[0]} to {args.seeds[-1]}"
     title = f"{args.recipe} on {data.name}, {level}, {seeds}"
@@ -220,20 +232,6 @@ def main() -> None:
     print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv')}")
     if replays:
         print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png')}")
-
-
-def span(text: str) -> range:
-    """'100:110' -> the seeds 100 to 109."""
-    first, last = map(int, text.split(":"))
-    if not 0 <= first < last:
-        raise argparse.ArgumentTypeError(f"expected first:last with 0 <= first < last, as 100:110, got {text}")
-    return range(first, last)
-
-
-def baseline(data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:
-    """The recipe as it is, on the same streams."""
-    tasks = [Task(Contender("as it is", base), seed, min(args.cycles, len(data))) for seed in args.seeds]
-    return [played.replay for played in iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep)]
 
 
 if __name__ == "__main__":

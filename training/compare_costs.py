@@ -16,6 +16,7 @@ from typing import Any
 
 import pandas as pd
 import torch
+from compare_reducers import span
 from joblib import Parallel, delayed
 
 from dengine import Dataset, Policy, Recipe, load_dataset, replay
@@ -78,7 +79,7 @@ def main() -> None:
     parser.add_argument("--part", default="part", help="name of the array of parts' numbers in the file")
     parser.add_argument("--alpha", type=float, default=0.1, help="error level of the interval")
     parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
-    parser.add_argument("--seeds", default="100:130", help="first:last, the last one left out; a replay each")
+    parser.add_argument("--seeds", type=span, default="100:130", help="first:last, the last one left out; a replay each")
     parser.add_argument("--cycles", type=int, default=1503, help="of a replay")
     parser.add_argument("--n-jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for costs.csv")
@@ -88,7 +89,7 @@ def main() -> None:
     tasks = [
         (name, played, recipe, seed, cycles)
         for name, (played, recipe) in rows(data, args.alpha, args.lower_bound).items()
-        for seed in range(*map(int, args.seeds.split(":")))
+        for seed in args.seeds
     ]
     table = pd.DataFrame(Parallel(n_jobs=args.n_jobs)(delayed(play)(*task) for task in tasks))
     args.out.mkdir(parents=True, exist_ok=True)

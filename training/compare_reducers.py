@@ -52,10 +52,9 @@ def tries(name: str) -> list[Contender]:
     """Every try of a reducer or a rival, named by what is tried."""
     base = Contender.load(name)
     if name in RIVALS:
-        every = [
-            replace(base, params=params) for params in RIVALS[name].tries[: 1 if not any(RIVALS[name].tries) else None]
-        ]
-        return [replace(one, name=f"{name} {_said(one.params)}".strip()) for one in every]
+        known = RIVALS[name].tries
+        different = [params for i, params in enumerate(known) if params not in known[:i]]
+        return [replace(base, name=f"{name} {_said(params)}".strip(), params=params) for params in different]
     return [replace(base, name=f"{name} radius={r:g}", recipe=replace(base.recipe, radius=r)) for r in TRIES[name]]
 
 

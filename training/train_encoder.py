@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from compare_reducers import span
 from rich.console import Console
 from rich.table import Table
 from torchmetrics import MetricCollection
@@ -110,7 +111,9 @@ def main() -> None:
     parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, of conv or rocket")
     parser.add_argument("--steps", type=int, default=15, help="optimiser steps of every head, at most")
     parser.add_argument("--seed", type=int, default=0, help="of the encoder, an integer")
-    parser.add_argument("--replays", default="100:110", help="first:last seed of the replays that the card tells of")
+    parser.add_argument(
+        "--replays", type=span, default="100:110", help="first:last seed of the replays that the card tells of"
+    )
     parser.add_argument("--out", type=Path, default=Path("models/conv"), help="folder for model.ts and card.md")
     args = parser.parse_args()
     data, recipe = load_dataset(args.data, args.samples), Recipe.load(args.recipe)
@@ -122,7 +125,7 @@ def main() -> None:
     Console().print(table)
     args.out.mkdir(parents=True, exist_ok=True)
     export_torchscript(model, args.out / "model.ts", trace=data.spec)
-    replays = run_replays(data, [recipe], range(*map(int, args.replays.split(":"))), n_jobs=-1)
+    replays = run_replays(data, [recipe], args.replays, n_jobs=-1)
     command = shlex.join(["python", "training/train_encoder.py", *sys.argv[1:]])
     (args.out / "card.md").write_text(card(data, recipe, history, replays, command), encoding="utf-8")
 

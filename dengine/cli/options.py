@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import SettingError
+from ..records import FITS
 
 if TYPE_CHECKING:
     from ..datasets import Dataset
@@ -91,20 +92,23 @@ def short_name(name: str) -> str:
     return Path(name.rpartition(":")[2]).stem
 
 
+ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
+LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
+GUARANTEE = click.Choice(["local", "pooled"])
 SETTINGS = {  # of a policy, and of a recipe: what they are by default is the recipe's affair
     "alpha": click.option(
         "--alpha",
-        type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+        type=ALPHA,
         help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
     ),
     "lower_bound": click.option(
         "--lower-bound",
-        type=click.FloatRange(0.5, 1.0, min_open=True, max_open=True),
+        type=LOWER_BOUND,
         help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
     ),
     "guarantee": click.option(
         "--guarantee",
-        type=click.Choice(["local", "pooled"]),
+        type=GUARANTEE,
         help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled).",
     ),
     "stops": click.option(
@@ -176,7 +180,7 @@ DATA = {  # how a data set is read: what `load_dataset` calls them
     "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
     "fit": click.option(
         "--fit",
-        type=click.Choice(["strict", "cut", "pad", "resample"]),
+        type=click.Choice(FITS),
         help="What becomes of traces of another length.  [default: strict where all are alike, else pad]",
     ),
     "rate_hz": click.option(

@@ -12,6 +12,9 @@ import click
 
 from .interrupting import end_interrupted
 from .options import (
+    ALPHA,
+    GUARANTEE,
+    LOWER_BOUND,
     DataChoice,
     RecipeChoice,
     data_options,
@@ -88,7 +91,7 @@ def replay(
     from ..experiments.contenders import Contender
 
     contender = Contender(choice.name, choice.load())
-    _play("replay", [contender], Grid(confirms=(confirm,)), source, stream, out, as_json)
+    _play("replay", [contender], {"confirms": [confirm]}, source, stream, out, as_json)
 
 
 class Listed(click.ParamType[Any]):
@@ -109,31 +112,11 @@ class Listed(click.ParamType[Any]):
         return tuple(self.of.convert(part, param, ctx) for part in parts)
 
 
-class Grid:
-    """The conditions under which every contender plays: lists of settings; None in a list leaves it to the recipe."""
-
-    def __init__(
-        self,
-        alphas: Sequence[float] | None = None,
-        lower_bounds: Sequence[float] | None = None,
-        intervals: Sequence[str] | None = None,
-        guarantees: Sequence[str] | None = None,
-        confirms: Sequence[bool] = (False,),
-    ) -> None:
-        self.alphas = alphas or (None,)
-        self.lower_bounds = lower_bounds or (None,)
-        self.intervals = intervals or (None,)
-        self.guarantees = guarantees or (None,)
-        self.confirms = confirms
-
-
-PROBABILITY = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
-BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
 FEEDBACKS = {"stops": False, "confirmed": True}
 
 
 def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Lists of settings, handed on as one `Grid`; `--paper` stands for the paper's own."""
+    """Lists of settings that were given, handed on as `grid`, as `grid_tasks` takes them; `--paper` is the paper's own."""
 
     @wraps(command)
     def gridded(paper: bool, feedback: tuple[str, ...], settings: Mapping[str, Any], **others: Any) -> Any:
@@ -142,16 +125,15 @@ def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
             if (lists[many] or (paper and many != "guarantees")) and one in settings:
                 flag = one.replace("_", "-")
                 raise click.UsageError(f"--{flag} names one value; leave it out beside --paper or --{flag}s.")
+        grid = {name: values for name, values in lists.items() if values}
         if paper:
-            from ..experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS
+            from ..experiments.paper import GRID
 
-            whole = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS, "intervals": INTERVALS}
-            lists = {name: lists[name] or whole.get(name) for name in lists}
-        grid = Grid(**lists, confirms=[FEEDBACKS[name] for name in feedback])
+            grid = GRID | grid
+        grid["confirms"] = [FEEDBACKS[name] for name in feedback]
         return command(grid=grid, settings=settings, **others)
 
     decorated: Callable[..., Any] = gridded
-    shown = {"feedback": ",".join(FEEDBACKS)}
     for option in (
         click.option(
             "--feedback",
@@ -159,12 +141,12 @@ def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
             default="stops",
             show_default=True,
             metavar="LIST",
-            help=f"What is known of accepted parts, of {shown['feedback']}: their stops alone, or of good ones too.",
+            help=f"What is known of accepted parts, of {','.join(FEEDBACKS)}: their stops alone, or of good ones too.",
         ),
-        click.option("--guarantees", type=Listed(click.Choice(["local", "pooled"])), metavar="LIST", help="local,pooled."),
+        click.option("--guarantees", type=Listed(GUARANTEE), metavar="LIST", help="local,pooled."),
         click.option("--intervals", type=Listed(click.STRING), metavar="LIST", help="As in wilson,binomial."),
-        click.option("--lower-bounds", type=Listed(BOUND), metavar="LIST", help="As in 0.8,0.9,0.95."),
-        click.option("--alphas", type=Listed(PROBABILITY), metavar="LIST", help="As in 0.5,0.1,0.05."),
+        click.option("--lower-bounds", type=Listed(LOWER_BOUND), metavar="LIST", help="As in 0.8,0.9,0.95."),
+        click.option("--alphas", type=Listed(ALPHA), metavar="LIST", help="As in 0.5,0.1,0.05."),
         click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."),
     ):
         decorated = option(decorated)
@@ -187,7 +169,7 @@ def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def compare(
     reducers: str,
     settings: Mapping[str, Any],
-    grid: Grid,
+    grid: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
     out: Path | None,
@@ -224,7 +206,7 @@ def _contender(asked: str, choice: RecipeChoice) -> Contender:
 def _play(
     verb: str,
     who: Sequence[Contender],
-    grid: Grid,
+    grid: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
     out: Path | None,
@@ -233,10 +215,7 @@ def _play(
     from ..experiments.grid import grid_tasks
 
     dataset = source.load(quiet=as_json)
-    tasks = grid_tasks(
-        who, grid.alphas, grid.lower_bounds, grid.intervals, stream.seeds, grid.guarantees, grid.confirms,
-        stream.cycles, stream.shuffle,
-    )  # fmt: skip
+    tasks = grid_tasks(who, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid)
     finished = play(dataset, tasks, stream, as_json)
     if finished.replays:
         report(verb, finished, dataset, stream, out, as_json)

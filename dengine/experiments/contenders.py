@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from inspect import isfunction
 from pathlib import Path
 from pickle import PicklingError
@@ -18,6 +18,7 @@ from typing import Any
 from ..engine import DataEngine
 from ..errors import SettingError
 from ..recipe import PLAIN, RECIPES, Recipe, described
+from ..settings import flat
 from .rivals import RIVALS, make_rival
 
 TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
@@ -123,12 +124,11 @@ def _apart(one: Contender, among: Sequence[Contender]) -> Contender:
 
 def _flat(one: Contender) -> dict[str, Any]:
     """Every setting by its name, without those that have columns of their own."""
-    plain = {f.name: getattr(one.recipe, f.name) for f in fields(Recipe) if f.name not in ("policy", "params")}
+    plain = {key: value for key, value in flat(one.recipe).items() if key not in (*TOLD_APART, "params")}
     own = plain["reducer"]
     if not isinstance(own, str):
         plain |= {"reducer": type(own).__name__} | {key: _short(value) for key, value in own.get_params().items()}
-    policy = {key: value for key, value in asdict(one.recipe.policy).items() if key not in TOLD_APART}
-    return {**plain, **policy, **one.recipe.params, **one.params}
+    return {**plain, **one.recipe.params, **one.params}
 
 
 def _short(value: Any) -> Any:

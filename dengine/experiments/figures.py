@@ -100,7 +100,8 @@ def _draw_curves(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int
     top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
     top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
     # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
-    n = {name: sum(each.summary()[name] for each in replays) for name in COUNTS}
+    counted = [each.stretch(slice(None)) for each in replays]
+    n = {name: sum(each[name] for each in counted) for name in COUNTS}
     bad, good = "{false_positive} bad of {accepted} accepted", "{false_negative} good of {rejected} rejected"
     bottom.plot(x, lines["false_positive"], color=colour, label=lead + bad.format_map(n))
     bottom.plot(x, lines["false_negative"], color=colour, linestyle="--", label=lead + good.format_map(n))

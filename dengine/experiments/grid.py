@@ -82,7 +82,8 @@ def run_replays(
 ) -> list[Replay]:
     """Every recipe under every seed, in parallel; a list in that order. The rest as in `replay` and `iterate_replays`."""
     pairs = itertools.product([Contender.load(r) for r in recipes], seeds)
-    return _played(dataset, [Task(who, seed, cycles, shuffle, confirm) for who, seed in pairs], n_jobs, keep, on_done)
+    tasks = [Task(who, seed, cycles, shuffle, confirm) for who, seed in pairs]
+    return play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done)
 
 
 def run_grid(
@@ -116,15 +117,16 @@ def run_grid(
     tasks = grid_tasks(
         recipes, alphas, lower_bounds, intervals, range(first_seed, first_seed + repeats), guarantees, confirms, cycles
     )
-    return pd.DataFrame([one.summary() for one in _played(dataset, tasks, n_jobs, keep, on_done)])
+    replays = play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done)
+    return pd.DataFrame([one.summary() for one in replays])
 
 
 def grid_tasks(
     recipes: Sequence[Any],
-    alphas: Sequence[float | None],
-    lower_bounds: Sequence[float | None],
-    intervals: Sequence[str | None],
-    seeds: Iterable[int],
+    alphas: Sequence[float | None] = (None,),
+    lower_bounds: Sequence[float | None] = (None,),
+    intervals: Sequence[str | None] = (None,),
+    seeds: Iterable[int] = (0,),
     guarantees: Sequence[str | None] = (None,),
     confirms: Sequence[bool] = (False,),
     cycles: int | None = None,
@@ -143,7 +145,10 @@ def _under(who: Contender, interval: Any, alpha: Any, bound: Any, guarantee: Any
     return who.with_policy(**{name: value for name, value in asked.items() if value is not None})
 
 
-def _played(dataset: Any, tasks: Sequence[Task], n_jobs: int, keep: Folder | None, on_done: OnDone) -> list[Replay]:
+def play_tasks(
+    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None, on_done: OnDone = None
+) -> list[Replay]:
+    """Each task's replay, in the tasks' order. on_done : called with each as it ends. The rest as in `iterate_replays`."""
     found: dict[int, Replay] = {}
     for played in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep):
         found[played.position] = played.replay

@@ -1,6 +1,6 @@
 """The paper's experiment, whole: its grid, its two tables in its form with its figures beside ours, and its findings.
 
-    frame = run_grid("insertion", ["conv"], *GRID, repeats=30)
+    frame = run_grid("insertion", ["conv"], **GRID, repeats=30)
     print(paper_table(frame, "conv", "wilson"))
     for finding in findings(frame): print(finding.sentence)
 
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 ALPHAS = (0.5, 0.1, 0.05)
 LOWER_BOUNDS = (0.8, 0.9, 0.95)
 INTERVALS = ("wilson", "binomial")
-REPEATS = 30
-GRID = (ALPHAS, LOWER_BOUNDS, INTERVALS)
+GRID = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS, "intervals": INTERVALS}
 
 PUBLISHED = {  # (interval, alpha, LB) -> (false positives, certain predictions)
     ("wilson", 0.5, 0.8): (36.1, 1317.1),

@@ -27,9 +27,7 @@ def read_npz(path: Path, name: str, asked: Asked) -> Dataset:
     """`X`, `y`, and what is known beside them: `scale`, `rate_hz`, `unit`, `cause`, `channels`, and the parts' numbers."""
     try:
         with zipfile.ZipFile(path) as archive:
-            size = sum(each.file_size for each in archive.infolist())
-        if size > LARGEST:
-            raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
+            _must_be_small(sum(each.file_size for each in archive.infolist()), path)
         with np.load(path, allow_pickle=False) as file:
             found = {key: file[key] for key in file.files if key in (*USED, asked.part)}
             return _from_arrays(found, file.files, path, name, asked)
@@ -50,15 +48,18 @@ def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
         with h5py.File(path, "r") as file:
             have: list[str] = []
             file.visititems(lambda key, item: have.append(key) if isinstance(item, h5py.Dataset) else None)
-            size = sum(file[key].nbytes for key in have)
-            if size > LARGEST:
-                raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
+            _must_be_small(sum(file[key].nbytes for key in have), path)
             found = {key: _plain(file[key]) for key in have if key in (*USED, asked.part)}
             return _from_arrays(found, have, path, name, asked)
     except (OSError, TypeError, ValueError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"Cannot read {path} as an HDF5 file: {error}.") from error
+
+
+def _must_be_small(size: int, path: Path) -> None:
+    if size > LARGEST:
+        raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
 
 
 def _plain(dataset: Any) -> Any:
@@ -75,14 +76,10 @@ def _from_arrays(found: Mapping[str, Any], have: Sequence[str], path: Path, name
     X = found["X"]
     if "scale" in found:
         X = X.astype(np.float32) * found["scale"].astype(np.float32)
-    about = {key: found[key] for key in ("cause",) if key in found}
     rate, unit = float(found.get("rate_hz", 500.0)), str(found.get("unit", "N"))
     channels = tuple(map(str, np.atleast_1d(found["channels"]))) if "channels" in found else ()
-    part = found.get(asked.part)
-    return refit(
-        make_dataset(X, _labels(found["y"]), name=name, rate_hz=rate, unit=unit, part=part, channels=channels, **about),
-        asked,
-    )
+    beside = {"part": found.get(asked.part), "cause": found.get("cause"), "channels": channels}
+    return refit(make_dataset(X, _labels(found["y"]), name=name, rate_hz=rate, unit=unit, **beside), asked)
 
 
 def from_pair(X: Any, y: Any, asked: Asked) -> Dataset:

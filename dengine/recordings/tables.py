@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from ..traces import is_time
+from ..traces import is_time, listed
 from .asked import Asked
 from .dataset import Dataset, Fault, UnreadableError
 from .folder import FORCE
@@ -96,7 +96,7 @@ def from_frame(
         raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
     label = _label_column(frame, asked)
     if asked.part != "part" and asked.part not in frame:
-        raise DataError(f"Expected a column {asked.part} of parts' numbers, found {_few(frame.columns)}.")
+        raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
     wrong: dict[int, str] = {}
     channels, traces = _traces(frame.drop(columns=[c for c in (label, asked.part) if c in frame]), asked, wrong)
     y, parts = _labels(frame[label], wrong), _parts(frame, asked.part)
@@ -149,15 +149,17 @@ def _parts(frame: pd.DataFrame, column: str) -> list[str | None]:
 def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
     if asked.label is not None:
         if asked.label not in frame:
-            raise DataError(f"Expected a column {asked.label} of labels, found {_few(frame.columns)}.")
+            raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
     lower = {c.lower(): c for c in frame.columns}
     for known in LABEL_COLUMNS:
         if known in lower:
             return str(lower[known])
     if any(is_time(c) for c in frame.columns):
-        raise DataError(f"Expected a row an insertion, found {_few(frame.columns)}, as in one recording; give its folder.")
-    raise DataError(f"Expected a column of labels, y or label, found {_few(frame.columns)}; name it: label='...'.")
+        raise DataError(
+            f"Expected a row an insertion, found {listed(frame.columns)}, as in one recording; give its folder."
+        )
+    raise DataError(f"Expected a column of labels, y or label, found {listed(frame.columns)}; name it: label='...'.")
 
 
 def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
@@ -169,7 +171,7 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
             groups.setdefault(found[1], []).append((int(found[2]), name))
     several = {name: _in_order(sorted(those)) for name, those in groups.items() if len(those) > 1}
     if not several:
-        raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {_few(names)}.")
+        raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {listed(names)}.")
     chosen = _chosen(several, asked)
     sizes = {len(several[name]) for name in chosen}
     if len(sizes) > 1:
@@ -191,12 +193,12 @@ def _in_order(numbered: list[tuple[int, str]]) -> list[str]:
 def _chosen(have: Mapping[str, list[str]], asked: Asked) -> tuple[str, ...]:
     missing = [name for name in asked.channels if name not in have]
     if missing:
-        raise DataError(f"Expected the channel {missing[0]}, in columns {missing[0]}_0 and so on, found {_few(have)}.")
+        raise DataError(f"Expected the channel {missing[0]}, in columns {missing[0]}_0 and so on, found {listed(have)}.")
     if asked.channels:
         return asked.channels
     if FORCE in have or len(have) == 1:
         return (FORCE,) if FORCE in have else tuple(have)
-    raise DataError(f"Expected the channel to be named, as in channel={next(iter(have))!r}; there are {_few(have)}.")
+    raise DataError(f"Expected the channel to be named, as in channel={next(iter(have))!r}; there are {listed(have)}.")
 
 
 def _numbers(frame: pd.DataFrame, names: list[str], wrong: dict[int, str]) -> NDArray[np.float32]:
@@ -223,8 +225,3 @@ def _labels(column: pd.Series, wrong: dict[int, str]) -> NDArray[np.int8]:
         except UnreadableError as error:
             wrong.setdefault(i, error.what)
     return y
-
-
-def _few(names: Any) -> str:
-    listed = [str(name) for name in names]
-    return ", ".join(listed[:8]) + (f" and {len(listed) - 8} more" if len(listed) > 8 else "")
