@@ -28,7 +28,7 @@ from .loop import drive
 from .model.base import EngineModel, Exportable, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
-from .retraining import Clock, Limits, Retrainer, Window
+from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
@@ -102,7 +102,8 @@ class DataEngine:
     ) -> None:
         torch.set_num_threads(1)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
-        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
+        encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
+        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
         self._versions = ModelVersions(template, retrainer, store, clock)
         self._feedback = Feedback(store, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
         self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
@@ -157,6 +158,7 @@ class DataEngine:
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
         self._versions.collect()
+        self.encoder_time.earn()
         x, number = self._as_trace(trace), as_part(part)
         self._feedback.settle()
         item = self._put(self._maker.decide(x, number, self._versions.answering, self.version))
@@ -188,16 +190,13 @@ class DataEngine:
         self._versions.collect()
         known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace, part)
         self._feedback.report(known, bool(success))
-        return None if known.quarantined else self._retrain_if_due()
+        return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
         if trace is None or success:
             raise unknown_stop(decision_id)
         item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
         return stored_decision(self._put(item))
-
-    def _retrain_if_due(self) -> RetrainReport | None:
-        return self._versions.start_retrain() if self.new_labels >= self.recipe.retrain_every else None
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
@@ -217,14 +216,19 @@ class DataEngine:
         return drive(self, cell, cycles)
 
     def settle(self) -> RetrainReport | None:
-        """Do between two cycles what need not wait for a report: a retrain that is due. The newest retrain, once."""
-        self._retrain_if_due()
+        """Do what need not wait for a report, a retrain or a slice of training; returns the newest retrain, once."""
+        self._versions.work(self.recipe.retrain_every)
         return self._versions.take_news()
 
     def flush(self) -> None:
         """Return when all that is known so far is on the disk."""
         self._feedback.store_waiting()
         self.store.flush()
+
+    @property
+    def encoder_time(self) -> EncoderTime:
+        """What the encoder's training took so far."""
+        return self._versions.retrainer.encoder_time
 
     @property
     def recipe(self) -> Recipe:

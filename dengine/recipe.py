@@ -44,6 +44,8 @@ class Recipe:
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
+    encoder_budget : seconds a cycle, on average, in which a reducer that trains without labels may do so, in slices between
+        two cycles or in the executor; 0: never. A replay counts them in steps (`retraining.STEP_SECONDS` each).
     max_steps : optimiser steps that a retrain may take at most; None: as many as the reducer's own settings say. A replay
         stops on steps alone and reads no clock, so that a seed repeats exactly.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
@@ -60,6 +62,7 @@ class Recipe:
     folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
+    encoder_budget: float = 0.0
     max_steps: int | None = None
     window: int = 10_000
     novelty: float = NOVELTY
@@ -73,6 +76,8 @@ class Recipe:
                 raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
         if not (isinstance(self.budget, Real) and self.budget > 0.0):
             raise SettingError(f"Expected budget > 0 seconds, got {self.budget!r}.")
+        if not (isinstance(self.encoder_budget, Real) and 0.0 <= self.encoder_budget < float("inf")):
+            raise SettingError(f"Expected encoder_budget >= 0 seconds a cycle, got {self.encoder_budget!r}.")
         if not (isinstance(self.novelty, Real) and 0.0 <= self.novelty < float("inf")):
             raise SettingError(f"Expected a finite novelty of 0 or more, got {self.novelty!r}; 0 turns it off.")
         if not isinstance(self.params, Mapping):
@@ -214,10 +219,12 @@ def _escaped(character: str) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    "conv": Recipe("conv", radius=0.05),  # of a probability: the encoder's own unit
+    "conv": Recipe("conv", radius=0.05, encoder_budget=0.01),  # radius of a probability: the encoder's own unit
     "umap": Recipe("umap"),
     "pca": Recipe("pca", radius=0.2),
     "rocket": Recipe("rocket", radius=0.05),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9), novelty=0.0),
+    "plane": Recipe("plane", radius=0.5),
+    "umap-encoded": Recipe("umap", params={"encoded": True}),
 }

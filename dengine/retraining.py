@@ -20,6 +20,10 @@ from .store.records import Labelled
 log = logging.getLogger("dengine")
 SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
 MARGIN = 1.2  # the tail grows a little with each retrain
+STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
+SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
+MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
+DRAWN = 1024  # traces that a slice trains on
 
 Clock = Callable[[], float]
 
@@ -55,6 +59,12 @@ class Window:
         """Take in many, oldest first."""
         for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
             self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
+
+    def draw(self, n: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Traces (m, C, T) and hashes (m,) of `n` at most, drawn blind to labels, others at each new label."""
+        assert self._traces is not None  # the caller knows of labels; for the type checker
+        slots = np.random.default_rng(self.total).permutation(len(self))[:n]
+        return self._traces[slots], self._hashes[slots]
 
     def snapshot(self) -> Labelled:
         """What is held, oldest first. Nobody writes to these arrays afterwards."""
@@ -104,11 +114,55 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class Slice:
+    """What one run of the encoder's training may use: seconds by the clock, or steps where a seed must repeat exactly."""
+
+    seconds: float | None
+    steps: int | None
+
+    def stop(self, clock: Clock) -> StopRule:
+        """The rule, from now on."""
+        return StopRule(None if self.seconds is None else clock() + self.seconds, self.steps, clock)
+
+
+class EncoderTime:
+    """The time in which the encoder may train: so much a cycle on average, saved up and taken in slices.
+
+    per_cycle : seconds.  in_steps : whether a step counts as `STEP_SECONDS`, whatever it took.
+    steps : taken so far.  seconds : that they counted as.  longest : seconds by the clock of the longest slice in line.
+    """
+
+    def __init__(self, per_cycle: float, in_steps: bool) -> None:
+        self.per_cycle, self.in_steps = per_cycle, in_steps
+        self.saved, self.steps, self.seconds, self.longest = 0.0, 0, 0.0, 0.0
+
+    def earn(self) -> None:
+        """A cycle has begun."""
+        self.saved = min(self.saved + self.per_cycle, max(MOST_SECONDS, self.per_cycle))
+
+    def take(self, least: float = 0.0, most: float = MOST_SECONDS) -> Slice | None:
+        """Up to `most` seconds of what is saved up, where it is `least` at least; None: nothing is due."""
+        seconds = min(self.saved, most)
+        if seconds <= 0.0 or self.saved < least:
+            return None
+        if self.in_steps:
+            return Slice(None, steps) if (steps := round(seconds / STEP_SECONDS)) else None
+        return Slice(seconds, None)
+
+    def spend(self, steps: int, seconds: float) -> None:
+        """Account for steps that took so long."""
+        counted = steps * STEP_SECONDS if self.in_steps else seconds
+        self.saved = max(0.0, self.saved - counted)
+        self.steps, self.seconds = self.steps + steps, self.seconds + counted
+
+
+@dataclass(frozen=True)
 class Candidate:
     """The outcome of a training.
 
     model : to swap in; None: dropped.  reason : why, in words.
     seconds : of the whole.  tail : of what followed the reducer's last step, the next retrain's reserve.
+    encoder_steps, encoder_seconds : that the encoder trained before, beside the cell.
     """
 
     model: EngineModel | None
@@ -116,6 +170,8 @@ class Candidate:
     n_steps: int
     seconds: float
     tail: float
+    encoder_steps: int = 0
+    encoder_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -131,9 +187,18 @@ class Retrainer:
     """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
 
     clock : seconds, of any origin; with a process executor it must pickle, as `time.perf_counter` does.
+    encoder_time : in which the encoder may train; None: it never does.
     """
 
-    def __init__(self, window: Window, limits: Limits, executor: Executor | None, clock: Clock = time.perf_counter) -> None:
+    def __init__(
+        self,
+        window: Window,
+        limits: Limits,
+        executor: Executor | None,
+        clock: Clock = time.perf_counter,
+        encoder_time: EncoderTime | None = None,
+    ) -> None:
+        self.encoder_time = encoder_time or EncoderTime(0.0, in_steps=True)
         self.window = window
         self.limits = limits
         self.executor = executor
@@ -145,6 +210,17 @@ class Retrainer:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
         return self._pending is not None
 
+    def improve(self, current: EngineModel) -> None:
+        """Train the current model's encoder for a slice, in line, where one is due."""
+        piece = self.encoder_time.take(SLICE_SECONDS, SLICE_SECONDS)
+        if piece is None or self.executor is not None or not len(self.window):
+            return
+        begin = self.clock()
+        steps = current.improve_safely(*self.window.draw(DRAWN), piece.stop(self.clock))
+        seconds = self.clock() - begin
+        self.encoder_time.spend(steps, seconds)
+        self.encoder_time.longest = max(self.encoder_time.longest, seconds)
+
     def train(self, current: EngineModel) -> Trained:
         """Train a successor of the current model, in line."""
         begin, data = self.clock(), self.window.snapshot()
@@ -155,7 +231,8 @@ class Retrainer:
         """Train a successor of the current model beside the cell."""
         assert self.executor is not None  # the caller asked; for the type checker
         data = self.window.snapshot()
-        future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock)
+        piece = self.encoder_time.take()
+        future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
         self._pending = (future, data.seq)
 
     def collect(self, wait: bool = False) -> Trained | None:
@@ -168,6 +245,7 @@ class Retrainer:
         except Exception as error:  # the worker died: recorded, and the old version goes on answering
             log.exception("a retrain in the executor failed")
             candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
+        self.encoder_time.spend(candidate.encoder_steps, candidate.encoder_seconds)
         return self._note(Trained(candidate, seq, self.clock() - candidate.seconds))
 
     def _note(self, trained: Trained) -> Trained:
@@ -176,9 +254,13 @@ class Retrainer:
         return trained
 
 
-def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:
+def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock, piece: Slice | None) -> Candidate:
     torch.set_num_threads(1)  # per thread, and first thing in each
-    return train_candidate(successor, data, limits, clock)
+    begin, steps = clock(), 0
+    if piece is not None and len(data.seq):
+        steps = successor.improve_safely(data.traces, data.hashes, piece.stop(clock))
+    seconds = clock() - begin
+    return replace(train_candidate(successor, data, limits, clock), encoder_steps=steps, encoder_seconds=seconds)
 
 
 def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:

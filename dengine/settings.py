@@ -23,6 +23,7 @@ LOOP = (
     "trace",
     "retrain_every",
     "budget",
+    "encoder_budget",
     "max_steps",
     "window",
     "audit_rate",

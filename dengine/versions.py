@@ -77,6 +77,14 @@ class ModelVersions:
         self.new_labels = 0
         return self._swap(self.retrainer.train(self.newest))
 
+    def work(self, retrain_every: int) -> RetrainReport | None:
+        """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training."""
+        if self.new_labels >= retrain_every:
+            return self.start_retrain()
+        if self.answering is not None:
+            self.retrainer.improve(self.answering)
+        return None
+
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
         if self.retrainer.executor is None:

@@ -32,7 +32,8 @@ from ..records import RetrainReport
 from .contenders import Contender, parts_of
 from .replay import Replay
 
-ABOUT = ("name", "dataset", "seed", "confirm", "seconds")  # what of a replay is no array, beside its recipe
+# What of a replay is no array, beside its recipe.
+ABOUT = ("name", "dataset", "seed", "confirm", "seconds", "encoder_steps", "encoder_seconds", "slice_max_s")
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
 DAMAGED = (  # what reading a damaged file ends in, by where the damage is
     OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError

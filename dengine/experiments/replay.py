@@ -31,6 +31,8 @@ class Replay(RunLog):
     name : of who played, in tables.  recipe : of the engine.  dataset : its name.
     seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
     seconds : wall time of the whole replay.
+    encoder_steps : of label-free training between cycles.  encoder_seconds : that were assumed for them, so many a step
+        whatever they took, so that a seed repeats exactly.  slice_max_s : wall time of the longest slice of them.
     """
 
     truth: NDArray[np.bool_]
@@ -41,6 +43,9 @@ class Replay(RunLog):
     seed: int
     confirm: bool = False
     seconds: float = float("nan")
+    encoder_steps: int = 0
+    encoder_seconds: float = 0.0
+    slice_max_s: float = 0.0
 
     @property
     def first_certain(self) -> float:
@@ -74,6 +79,8 @@ class Replay(RunLog):
             "retrains": len(self.retrains),
             "retrain_p50_s": _quantile(self.retrain_seconds, 0.5),
             "retrain_max_s": _quantile(self.retrain_seconds, 1.0),
+            "encoder_s": self.encoder_seconds,
+            "slice_max_s": self.slice_max_s,
             "decide_p50_us": 1e6 * _quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * _quantile(self.decide_seconds, 0.99),
             "saved_s": saved_seconds(certain),
@@ -120,7 +127,9 @@ def collect(
     log = watch(engine, cell, len(cell.order), on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
     told = vars(log) | {"truth": log.truth.astype(np.bool_), "index": cell.order, "confirm": cell.confirm}
     about: dict[str, Any] = {"name": name or engine.recipe.name, "recipe": engine.recipe, "seed": seed}
-    return Replay(**told, **about, dataset=data.name, seconds=time.perf_counter() - begin)
+    spent = engine.encoder_time
+    trained: dict[str, Any] = {"encoder_steps": spent.steps, "encoder_seconds": spent.seconds, "slice_max_s": spent.longest}
+    return Replay(**told, **about, **trained, dataset=data.name, seconds=time.perf_counter() - begin)
 
 
 def order_of(data: Dataset, seed: int, cycles: int | None = None, shuffle: bool = True) -> NDArray[np.int64]:

@@ -64,7 +64,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
         three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
         `certain_sd` and `false_positive_sd` the standard deviations over the replays (NaN of one).
     error_lower, error_upper : 95 % interval of the share of bad ones among the accepted parts; NaN without replays.
-    retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, decide_p99_us : the worst replay's.
+    retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, slice_max_s, decide_p99_us : the worst replay's.
+    encoder_s : seconds of label-free training that a replay assumed, the mean.
     """
     groups = frame.reset_index(drop=True).groupby(CONDITION, sort=False)
     of = {key: [replays[i] for i in part.index] if replays else [] for key, part in groups}
@@ -89,6 +90,8 @@ def _pooled(condition: dict[str, Any], part: pd.DataFrame) -> dict[str, Any]:
             "npv": _share_right(total["false_negative"], total["rejected"]),
             "retrain_p50_s": float(part["retrain_p50_s"].median()),
             "retrain_max_s": float(part["retrain_max_s"].max()),
+            "encoder_s": float(part["encoder_s"].mean()),
+            "slice_max_s": float(part["slice_max_s"].max()),
             "decide_p50_us": float(part["decide_p50_us"].median()),
             "decide_p99_us": float(part["decide_p99_us"].max()),
             "first_certain": float(part["first_certain"].mean()),
@@ -179,6 +182,7 @@ _CELLS_OF: dict[str, Any] = {
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",
     "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
+    "encoder s\nslice ms": lambda r: f"{r['encoder_s']:.1f}\n{1e3 * r['slice_max_s']:.0f}",
     "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
     "saved\nnet, s": lambda r: f"{r['saved_s']:.0f}\n{r['net_s']:.0f}",
 }

@@ -114,6 +114,10 @@ class EngineModel(ABC):
     def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
         """Learn from traces (n, C, T), labels (n,) and content hashes (n,), from where an earlier training ended."""
 
+    def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
+        """Train what reads no label further, apart from what answers; see `Reducer.improve`."""
+        return 0
+
     @abstractmethod
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
@@ -174,7 +178,15 @@ class EngineModel(ABC):
         """What an exporter starts from; ExportError where there is nothing that can be exported."""
         raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
 
-    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these four.
+    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
+
+    def improve_safely(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
+        """`improve`; one that fails at it goes on with what it has."""
+        try:
+            return self.improve(X, hashes, stop)
+        except Exception:
+            log.exception("the encoder cannot be trained further; it goes on as it is")
+            return 0
 
     def tell_safely(self, told: Told) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""

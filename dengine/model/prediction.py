@@ -143,6 +143,10 @@ class ModelPrediction(EngineModel):
         self._compiled = None  # built by `prepare`, or when it is asked
         return self
 
+    def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
+        """Train the reducer's encoder further, apart from what answers."""
+        return self.spaces.improve(as_traces(X), hashes, stop)
+
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
         if isinstance(previous, ModelPrediction):

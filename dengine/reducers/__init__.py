@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .conv import ConvReducer
     from .cross_fitting import CrossFitted
     from .pca import PcaReducer
+    from .plane import PlaneReducer
     from .rocket import RocketReducer
     from .umap import UmapReducer
 
@@ -24,6 +25,7 @@ _WHERE = {
     "conv": ("ConvReducer",),
     "cross_fitting": ("CrossFitted",),
     "pca": ("PcaReducer",),
+    "plane": ("PlaneReducer",),
     "rocket": ("RocketReducer",),
     "umap": ("UmapReducer",),
 }
@@ -32,6 +34,7 @@ _CLASSES = {
     "umap": "dengine.reducers.umap:UmapReducer",
     "pca": "dengine.reducers.pca:PcaReducer",
     "rocket": "dengine.reducers.rocket:RocketReducer",
+    "plane": "dengine.reducers.plane:PlaneReducer",
 }
 
 __all__ = [
@@ -39,6 +42,7 @@ __all__ = [
     "ConvReducer",
     "CrossFitted",
     "PcaReducer",
+    "PlaneReducer",
     "Reducer",
     "RocketReducer",
     "UmapReducer",

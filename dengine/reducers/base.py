@@ -102,6 +102,14 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         self.fit(X, y if self.uses_labels else None)
         return self.embed_own(X, folds)
 
+    def improve(self, X: Floats, parts: Ints, stop: StopRule) -> int:
+        """Train further what reads no label, apart from what answers; the next `train` takes it over. Returns steps taken.
+
+        X : (n, C, T) traces, labelled or not.  parts : (n,) hashes of their parts.  stop : asked before each step.
+        0 where a kind has nothing that trains so.
+        """
+        return 0
+
     def embed(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, K, d) float32, every trace in every space."""
         return as_points(self.transform(X))[:, None, :]

@@ -8,6 +8,8 @@ hidden layer converges to (Baldi and Hornik, 1989, Neural Networks 2; PCANet: Ch
 closed form replaces its training. No label is read anywhere here: one set of features serves every fold.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ from torch import Tensor, nn
 from ..errors import SettingError
 
 Floats = NDArray[np.float32]
+# Weights (m, P), biases (m,) of scores on features as they were -> those that say the same on features as they are.
+Carry = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 PATCH_TRACES = 256
 PATCHES = 5000  # enough for a covariance of 50 x 50, and 10 ms of work
 PATCH_SHARE = 20  # a patch is this part of a trace: a contact event, not a sample's noise
@@ -42,6 +46,11 @@ class Features(nn.Module):
         self.register_buffer("offset", torch.zeros(n_features))
         self.register_buffer("gain", torch.ones(n_features))
 
+    @property
+    def n_out(self) -> int:
+        """P, features that come out."""
+        return len(self.gain)
+
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
         f = torch.addcmul(self.offset, self.raw(x), self.gain)
@@ -67,11 +76,8 @@ class Features(nn.Module):
         some = X[torch.from_numpy(rng.permutation(len(X))[:PATCH_TRACES])]
         self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
 
-    def standardise(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Set the features' mean and deviation from raw features (n, P).
-
-        Returns those standardised, (n, P), and how they were before: ratio * f + shift, each (P,).
-        """
+    def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
+        """Set the features' mean and deviation from raw ones (n, P); returns them standardised, (n, P), and a `Carry`."""
         gain, offset = self.gain.clone(), self.offset.clone()
         wide = raw.double()
         deviation = wide.std(0, unbiased=False)
@@ -79,7 +85,9 @@ class Features(nn.Module):
         self.gain.copy_(1.0 / (deviation + floor))
         self.offset.copy_(-wide.mean(0) / (deviation + floor))
         ratio = gain / self.gain
-        return torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP), ratio, offset - ratio * self.offset
+        shift = offset - ratio * self.offset  # before, a feature was ratio * f + shift
+        standard = torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP)
+        return standard, lambda weight, bias: (weight * ratio, bias + weight @ shift)
 
 
 class ConvFeatures(Features):

@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from .base import StopRule, one_class_outside
+from .features import Carry
 
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 CONVERGED = 1e-5  # largest change of a weight
@@ -40,10 +41,11 @@ class CrossFittedScores(nn.Module):
         z = torch.sigmoid(F.linear(g, self.weight, self.bias)).mul_(self.unit)  # (B, K*d)
         return z.view(-1, self.folds, self.dim)
 
-    def carry_over(self, ratio: Tensor, shift: Tensor) -> None:
-        """Give the scores they had when features were ratio * g + shift: standardised anew, not moved."""
-        self.bias += self.weight @ shift
-        self.weight *= ratio
+    def carry_over(self, carry: Carry) -> None:
+        """Give the scores they had, on features that are standardised anew."""
+        weight, bias = carry(self.weight, self.bias)
+        self.weight.copy_(weight)
+        self.bias.copy_(bias)
 
     def train_on(self, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: StopRule | None) -> int:
         """At most `max_iter` Newton steps from the present weights; returns how many.

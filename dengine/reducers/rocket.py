@@ -8,7 +8,6 @@ So a trace's features are computed once and kept, and a retrain is the heads' cl
 Source: Dempster, Schmidt and Webb (2021), MiniRocket, KDD; arXiv:2012.08791. Here with one bias a kernel and dilation.
 """
 
-from hashlib import blake2b
 from itertools import combinations
 from typing import Any
 
@@ -18,7 +17,6 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
-from .base import Floats
 from .features import Features
 from .scored import FeatureReducer
 
@@ -73,6 +71,8 @@ class RocketReducer(FeatureReducer):
     n_components, folds, l2, max_iter, random_state : as in `ConvReducer`.
     """
 
+    keeps_features = True  # no kernel or bias ever changes
+
     def __init__(
         self,
         *,
@@ -93,23 +93,6 @@ class RocketReducer(FeatureReducer):
     def make_features(self, channels: int, samples: int) -> Features:
         """Shares of positive values."""
         return RocketFeatures(channels, samples, self.dilations)
-
-    def _build(self, channels: int, samples: int) -> None:
-        super()._build(channels, samples)
-        # Features of other biases must not be read again. A tensor for all: one each would pickle them all with each.
-        self._kept: dict[bytes, int] = {}
-        self._kept_features = torch.empty(0, len(self.net_.features.gain))
-
-    def raw_features(self, traces: Floats) -> Tensor:
-        """(n, C, T) -> (n, P): computed once a trace and kept, since no kernel or bias ever changes."""
-        keys = [blake2b(trace, digest_size=16).digest() for trace in traces]  # exact: a fold's hash is of rounded samples
-        new = [i for i, key in enumerate(keys) if key not in self._kept]
-        known = self._kept | {keys[i]: len(self._kept_features) + j for j, i in enumerate(new)}
-        rows = torch.cat([self._kept_features, super().raw_features(traces[new])]) if new else self._kept_features
-        # What has left the window leaves here too.
-        self._kept_features = rows[[known[key] for key in keys]]
-        self._kept = {key: i for i, key in enumerate(keys)}
-        return self._kept_features
 
 
 def _kernels() -> Tensor:

@@ -6,6 +6,7 @@ A kind gives its features; here they are fitted, warm-started, embedded with, st
 from __future__ import annotations
 
 from collections.abc import Mapping
+from hashlib import blake2b
 from typing import Any, Self
 
 import numpy as np
@@ -21,7 +22,6 @@ from .features import Features
 from .logistic import CrossFittedScores
 
 MIN_TRACES = 20  # that an engine's first model is trained on
-TRAIN_TRACES = 4000  # that train the heads in one fit, so that it ends in time however many references there are
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
 
 
@@ -50,12 +50,16 @@ class FeatureReducer(Reducer):
 
     uses_labels = True
     own_unit = True  # a radius of 0.05 is five in a hundred, never rescaled
+    train_traces = 4000  # that train the heads in one fit, so that it ends in time however many references there are
+    keeps_features = False  # whether a trace's features stay what they are from one training to the next
     n_components: int
     folds: int
     l2: float
     max_iter: int
     random_state: Any
     net_: FeatureEmbedding
+    _kept: dict[bytes, int]
+    _kept_features: Tensor
 
     @property
     def n_spaces(self) -> int:
@@ -106,8 +110,8 @@ class FeatureReducer(Reducer):
             raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
         head = self.net_.head
         with torch.no_grad():
-            g, ratio, shift = self.net_.features.standardise(self.raw_features(traces))
-            head.carry_over(ratio, shift)  # a warm start begins where the last fit ended
+            g, carry = self.net_.features.standardise(self.raw_features(traces))
+            head.carry_over(carry)  # a warm start begins where the last fit ended
             rows = torch.from_numpy(self._sample(len(g)))
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
             self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
@@ -116,14 +120,32 @@ class FeatureReducer(Reducer):
         return g
 
     def raw_features(self, traces: Floats) -> Tensor:
-        """(n, C, T) -> (n, P), not standardised."""
+        """(n, C, T) -> (n, P), not standardised; where a kind keeps them, computed once a trace."""
+        if not self.keeps_features:
+            return self._computed(traces)
+        keys = [blake2b(trace, digest_size=16).digest() for trace in traces]  # exact: a fold's hash is of rounded samples
+        new = [i for i, key in enumerate(keys) if key not in self._kept]
+        known = self._kept | {keys[i]: len(self._kept_features) + j for j, i in enumerate(new)}
+        rows = torch.cat([self._kept_features, self._computed(traces[new])]) if new else self._kept_features
+        # What has left the window leaves here too.
+        self._kept_features = rows[[known[key] for key in keys]]
+        self._kept = {key: i for i, key in enumerate(keys)}
+        return self._kept_features
+
+    def _computed(self, traces: Floats) -> Tensor:
         return in_chunks(self.net_.features.raw, torch.from_numpy(traces))
+
+    def _forget_features(self) -> None:
+        """Features of other filters must not be read again."""
+        # A tensor for all: one each would pickle them all with each.
+        self._kept = {}
+        self._kept_features = torch.empty(0, len(self.net_.features.gain))
 
     def _sample(self, n: int) -> Ints:
         """Rows that train the heads: all, or of many a draw that is blind to labels and another at each fit."""
-        if n <= TRAIN_TRACES:
+        if n <= self.train_traces:
             return np.arange(n)
-        return np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_]).permutation(n)[:TRAIN_TRACES]
+        return np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_]).permutation(n)[: self.train_traces]
 
     def _tell(self, losses: NDArray[Any], kept: list[int]) -> None:
         self.holdout_losses_ = np.array(losses, dtype=np.float64)
@@ -194,8 +216,9 @@ class FeatureReducer(Reducer):
 
     def _build(self, channels: int, samples: int) -> None:
         features = self.make_features(channels, samples)
-        head = CrossFittedScores(len(features.gain), self.folds, self.n_components)
+        head = CrossFittedScores(features.n_out, self.folds, self.n_components)
         self.net_ = FeatureEmbedding(features, head).eval()
+        self._forget_features()
 
 
 def in_chunks(f: Any, x: Tensor) -> Tensor:

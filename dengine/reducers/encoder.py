@@ -1,0 +1,245 @@
+"""The encoder: one wide 1-D convolution over the trace at several dilations, pooled, and a linear layer on top.
+
+    x (B, C, T) -> means of a few samples each, one scale a channel                              (B, C, L)
+      -> conv, F kernels of 9 taps at each of D dilations, at P places                           (B, D, P, F)
+      -> a ramp from 0 to 1 around a threshold, its mean over R regions                          (B, D*R*F)
+      -> standardised, clipped
+      -> linear: W principal components of these, and W directions that `vicreg.py` trains       (B, 2*W)
+
+It starts as MiniRocket does, from kernels of fixed weights and thresholds drawn from what they give on the first traces, so
+it is of use before anything was trained; then kernels, thresholds and half of the linear layer are trained without labels,
+so one encoder is honest for every fold. Instead of a hard share of positive values it counts by a ramp two deviations wide:
+that has a gradient, and measured better untrained (docs/explanation/measured.md).
+
+Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, for kernels, dilations and thresholds; Tan,
+Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36, for several channels.
+"""
+
+import zipfile
+import zlib
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from ..errors import SettingError
+from .features import Carry, Features
+
+TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
+FRAMES = 200  # a trace is averaged to about so many samples
+KEPT = 0.8  # share of the traces' variance that averaging must leave, or less is averaged
+PLACES = 99  # of each kernel and dilation: what a mean over a region needs, and half the time of all
+RAMP = 2.0  # deviations of a kernel's output from 0 to 1
+SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
+START = 4.0  # size of the trained directions before they are trained: outputs of about one deviation
+BASIS_TRACES = 1000  # that set the principal components
+LEARNED = ("kernel", "threshold", "slope", "unit", "middle", "mix")  # what a start from another encoder takes over
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+class ConvEncoder(Features):
+    """(B, C, T) raw traces -> (B, 2*W) features.
+
+    channels, samples : C and T.  average : samples of one mean, `averaging`.  kernels, dilations, regions, width : F, D, R
+    and W, fewer dilations on short traces.
+    """
+
+    taps: Tensor
+    slope: Tensor
+    middle: Tensor
+    unit: Tensor
+    basis: Tensor
+    centre: Tensor
+
+    def __init__(
+        self, channels: int, samples: int, average: int, kernels: int, dilations: int, regions: int, width: int
+    ) -> None:
+        if samples < 2:
+            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
+        frames = samples // average
+        places = PLACES // regions * regions
+        taps = _taps(frames, dilations, places)
+        n_pooled = len(taps) * regions * kernels
+        super().__init__(channels, n_pooled)
+        self.average, self.frames = average, frames
+        self.head = samples - frames * average  # left out at the start: the end of an insertion tells most
+        self.n_dilations, self.n_regions, self.n_kernels = len(taps), regions, kernels
+        self.register_buffer("taps", torch.from_numpy(taps.ravel()))
+        # Trained by a copy of this module (`vicreg.py`); the one that answers takes the values over.
+        self.kernel = nn.Parameter(torch.zeros(channels * TAPS, kernels), requires_grad=False)
+        self.threshold = nn.Parameter(torch.zeros(len(taps), 1, kernels), requires_grad=False)
+        self.mix = nn.Parameter(torch.zeros(n_pooled, width), requires_grad=False)
+        self.register_buffer("slope", torch.ones(len(taps), 1, kernels))
+        self.register_buffer("middle", torch.zeros(n_pooled))
+        self.register_buffer("unit", torch.ones(n_pooled))
+        self.register_buffer("basis", torch.zeros(n_pooled, 2 * width))
+        self.register_buffer("centre", torch.zeros(2 * width))
+
+    @property
+    def n_out(self) -> int:
+        """2*W, features that come out."""
+        return len(self.centre)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, 2*W)."""
+        f = torch.addcmul(self.offset, self.raw(x), self.gain)
+        return torch.addmm(self.centre, f.clamp_(-4.0, 4.0), self.basis)  # CLIP: a scripted method reads no global
+
+    def raw(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, D*R*F), not standardised."""
+        return self.pooled(self.averaged(x), self.taps)
+
+    def averaged(self, x: Tensor) -> Tensor:
+        """(B, C, T) raw -> (B, C, L), one scale a channel."""
+        if self.average > 1:
+            x = x[:, :, self.head :].reshape(x.size(0), x.size(1), self.frames, self.average).mean(3)
+        return torch.addcmul(self.shift, x, self.scale)
+
+    def pooled(self, a: Tensor, taps: Tensor) -> Tensor:
+        """(B, C, L) -> (B, D*R*F): how far each kernel is above its threshold, in the mean over each region.
+
+        taps : (D*P*9,), all or `thinned`.
+        """
+        groups, size = self.n_dilations * self.n_regions, self.n_kernels
+        h = nn.functional.hardtanh(torch.addcmul(self.threshold, self.convolved(a, taps), self.slope), 0.0, 1.0)
+        return h.view(a.size(0), groups, h.size(2) // self.n_regions, size).mean(2).view(a.size(0), groups * size)
+
+    def convolved(self, a: Tensor, taps: Tensor) -> Tensor:
+        """(B, C, L) -> (B, D, P, F): a convolution as one product, its frames gathered."""
+        padded = nn.functional.pad(a, [0, 1])  # taps beyond the ends read this zero
+        n_frames = taps.size(0) // 9
+        frames = padded.index_select(2, taps).view(a.size(0), a.size(1), n_frames, 9).transpose(1, 2)
+        h = torch.mm(frames.reshape(a.size(0) * n_frames, self.kernel.size(0)), self.kernel)  # (B*D*P, F)
+        return h.view(a.size(0), self.n_dilations, n_frames // self.n_dilations, self.n_kernels)
+
+    @torch.jit.unused
+    def thinned(self, first: int, step: int) -> Tensor:
+        """The taps of every `step`-th place of each region: what an estimate in training needs, in less time."""
+        taps = self.taps.view(self.n_dilations, self.n_regions, -1, TAPS)
+        return taps[:, :, first::step].flatten()
+
+    def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
+        """Kernels, and thresholds from what they give on traces (n, C, T), their channels scaled."""
+        # `x` is scaled already; averaging is linear, so the scale is taken out again.
+        a = self.averaged((x - self.shift) / self.scale)
+        self.kernel.copy_(_kernels(a.size(1), self.n_kernels, rng))
+        h = self.convolved(a, self.taps).permute(1, 3, 0, 2).flatten(2).sort(2).values  # (D, F, n*P)
+        # Low-discrepancy quantiles, as in MiniRocket; none at the very ends.
+        quantiles = 0.05 + 0.9 * (np.arange(1, h[..., 0].numel() + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
+        place = torch.from_numpy((quantiles * (h.size(2) - 1)).astype(np.int64)).view(*h.shape[:2], 1)
+        deviation = h.std(2, unbiased=False)
+        self.slope.copy_((1.0 / (RAMP * deviation + 1e-6))[:, None])
+        self.threshold.copy_(0.5 - h.gather(2, place).permute(0, 2, 1) * self.slope)
+        pooled = self.pooled(a, self.taps)
+        self.middle.copy_(pooled.mean(0))
+        self.unit.copy_(1.0 / (pooled.std(0) + 1e-2))  # of outputs between 0 and 1
+        self.mix.copy_(principal_axes((pooled - self.middle) * self.unit, self.mix.size(1)) * START / len(self.unit) ** 0.5)
+
+    def mixed(self, pooled: Tensor) -> Tensor:
+        """(B, D*R*F) -> (B, W): the directions that are trained."""
+        return torch.mm((pooled - self.middle) * self.unit, self.mix)
+
+    def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
+        """Set scale, principal axes and centre from pooled outputs (n, D*R*F); returns features (n, 2*W), and a `Carry`."""
+        g, carry = super().standardise(raw)
+        before, centre = self.basis.double(), self.centre.clone()
+        width = self.mix.size(1)
+        # The trained directions were trained on pooled * unit.
+        halves = [principal_axes(g, width), (self.unit / self.gain)[:, None] * self.mix]
+        scaled = [half * (SHARE / (g @ half).var(0).sum().clamp(min=1e-9)).sqrt() for half in halves]
+        self.basis.copy_(torch.cat(scaled, 1))
+        self.centre.copy_(-(g.double().mean(0) @ self.basis.double()))
+        back = torch.linalg.pinv(self.basis.double(), rtol=1e-4)  # (2*W, D*R*F)
+
+        def carried(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+            """The nearest scores that the new directions can give."""
+            on_pooled, bias = carry((weight.double() @ before.T).float(), bias + weight @ centre)
+            weight = (on_pooled.double() @ back.T).float()
+            return weight, bias - weight @ self.centre
+
+        return torch.addmm(self.centre, g, self.basis), carried
+
+
+def _sizes(encoder: ConvEncoder) -> dict[str, int]:
+    """C, F, D, R and W by name."""
+    sizes = {"channels": encoder.kernel.size(0) // TAPS, "kernels": encoder.n_kernels, "dilations": encoder.n_dilations}
+    return sizes | {"regions": encoder.n_regions, "width": encoder.mix.size(1)}
+
+
+def weights_of(encoder: ConvEncoder) -> dict[str, NDArray[Any]]:
+    """What an encoder learned, and its sizes, as plain arrays: what `start_from` reads from an .npz of them."""
+    learned = {name: getattr(encoder, name).detach().numpy().copy() for name in LEARNED}
+    return learned | {name: np.array(size) for name, size in _sizes(encoder).items()}
+
+
+def start_from(encoder: ConvEncoder, path: str) -> None:
+    """Set what an encoder learned from an .npz of `weights_of`; SettingError where it cannot be read, or sizes differ."""
+    own = _sizes(encoder)
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            found = {name: stored[name] for name in LEARNED}
+            sizes = {name: int(stored[name]) for name in own}
+    except UNREADABLE as error:
+        said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
+        raise SettingError(f"Cannot read start {path!r} as an .npz of an encoder's weights: {said}.") from error
+    if own["channels"] != 1:
+        raise SettingError(f"Expected traces of 1 channel to start from weights, got {own['channels']}; leave start out.")
+    differing = ", ".join(f"{name} {sizes[name]} instead of {size}" for name, size in own.items() if sizes[name] != size)
+    if differing:
+        raise SettingError(f"Expected start of the encoder's own sizes, got {path!r} with {differing}.")
+    for name, value in found.items():
+        shape = tuple(getattr(encoder, name).shape)
+        if value.shape != shape or value.dtype != np.float32 or not np.isfinite(value).all():
+            raise SettingError(f"Expected {name} in {path!r} as {shape} finite float32, got {value.shape} {value.dtype}.")
+    for name, value in found.items():
+        getattr(encoder, name).data.copy_(torch.from_numpy(value))
+
+
+def averaging(traces: Tensor) -> int:
+    """How many samples of traces (n, C, T) to average: so many that 200 are left, fewer where that loses an oscillation."""
+    samples = traces.size(2)
+    centred = traces.double() - traces.double().mean((0, 2), keepdim=True)
+    whole = centred.square().mean((0, 2))
+    for average in range(samples // FRAMES, 1, -1):
+        frames = samples // average
+        means = centred[:, :, samples - frames * average :].reshape(len(traces), -1, frames, average).mean(3)
+        if bool((means.square().mean((0, 2)) >= KEPT * whole).all()):
+            return average
+    return 1
+
+
+def principal_axes(g: Tensor, width: int) -> Tensor:
+    """(P, width) principal directions of features (n, P), the first ones; zeros where there are no more."""
+    some = g[:: 1 + (len(g) - 1) // BASIS_TRACES].double()
+    centred = some - some.mean(0)
+    sizes, axes = torch.linalg.eigh(centred.T @ centred)
+    n = min(width, int((sizes > 1e-9 * sizes[-1].clamp(min=1e-12)).sum()))
+    found = torch.zeros(g.size(1), width)
+    found[:, :n] = axes[:, axes.size(1) - n :].flip(1).float()
+    return found
+
+
+def _taps(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
+    """(D, P, 9) positions in the averaged trace; `frames`, one beyond its end, where there is none."""
+    widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0
+    spread = np.unique(np.floor(2.0 ** np.linspace(0.0, widest, dilations)).astype(np.int64))
+    middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
+    taps = middle[:, None] + spread[:, None, None] * (np.arange(TAPS) - TAPS // 2)
+    return np.where((taps < 0) | (taps >= frames), frames, taps)
+
+
+def _kernels(channels: int, n: int, rng: np.random.Generator) -> Tensor:
+    """(C*9, n) kernels of three 2s among -1s, of unit size, drawn at random; each reads a few of the channels."""
+    places = list(combinations(range(TAPS), 3))
+    drawn = [places[i % len(places)] for i in rng.permutation(max(n, len(places)))[:n]]
+    kernels = torch.full((n, TAPS), -1.0)
+    for row, three in enumerate(drawn):
+        kernels[row, list(three)] = 2.0
+    read = torch.zeros(channels, n)
+    for row in range(n):
+        some = rng.permutation(channels)[: int(2.0 ** rng.uniform(0.0, np.log2(channels + 1)))]
+        read[torch.from_numpy(some), row] = len(some) ** -0.5
+    return torch.flatten(read[:, None] * kernels.T / 18.0**0.5, 0, 1)
