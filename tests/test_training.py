@@ -134,12 +134,75 @@ def test_an_exported_model_is_said_in_kilobytes(run: Run, tiny: Path, tmp_path: 
     assert (tmp_path / "m.ts.sha256").is_file()
 
 
-def test_the_encoder_goes_on_from_its_last_step(tiny: Path) -> None:
+@pytest.fixture(scope="module")
+def causes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """200 traces of 120 samples, bad ones for one of two causes: as many as leave some to hold out."""
+    rng = np.random.default_rng(0)
+    cause = rng.choice(["none", "rim", "slip"], 200, p=[0.5, 0.3, 0.2])
+    x = np.linspace(0, 1, 120)
+    shapes = {"none": 5 * x, "rim": 5 * (x > 0.3), "slip": 5 * x * (1 - x)}
+    X = np.stack([shapes[each] for each in cause]) + rng.normal(0, 0.3, (200, 120))
+    path = tmp_path_factory.mktemp("data") / "causes.npz"
+    np.savez(path, X=X.astype(np.float32), y=(cause == "none").astype(np.int8), cause=cause)
+    return path
+
+
+def test_the_encoder_goes_on_from_its_last_run(causes: Path) -> None:
     from dengine import ModelPrediction, Recipe, load_dataset
 
     model = ModelPrediction.from_recipe(Recipe.load("conv"))
-    history = load("train_encoder").train(model, load_dataset(tiny), 4)
+    history, (before, after) = load("train_encoder").train(model, load_dataset(causes), 70)
+    assert [row["step"] for row in history] == [0, 30, 60, 70]
     assert history[-1]["held-out loss"] < history[0]["held-out loss"]
+    assert before.shape == after.shape
+    assert not np.array_equal(before, after)
+
+
+def test_a_trained_encoder_leaves_a_picture_a_card_a_model_and_its_weights(run: Run, causes: Path, tmp_path: Path) -> None:
+    words = ["--data", causes, "--steps", 20, "--replays", "0:1", "--out", tmp_path]
+    assert "held-out loss" in run("train_encoder", *words, "--weights", tmp_path / "deep" / "encoder.npz")
+    names = {"training.png", "card.md", "model.ts", "model.ts.sha256", "deep"}
+    assert names == {path.name for path in tmp_path.iterdir()}
+    card = (tmp_path / "card.md").read_text(encoding="utf-8")
+    for figure in (
+        "20 steps",
+        "| held-out loss |",
+        "| neighbours agree |",
+        "| auroc |",
+        "certain of 200",
+        "(training.png)",
+    ):
+        assert figure in card
+
+
+def test_the_weights_of_a_trained_encoder_start_another_one(run: Run, causes: Path, tmp_path: Path) -> None:
+    from dengine import ConvReducer, load_dataset
+    from dengine.reducers.encoder import weights_of
+
+    path, data = tmp_path / "encoder.npz", load_dataset(causes)
+    run("train_encoder", "--data", causes, "--steps", 20, "--replays", "0:1", "--out", tmp_path, "--weights", path)
+    encoder: Any = ConvReducer(start=str(path)).fit(data.X, data.y).net_.features
+    started = weights_of(encoder)
+    with np.load(path) as stored:
+        assert set(stored.files) == set(started)
+        assert all(np.array_equal(stored[name], value) for name, value in started.items())
+
+
+def test_neighbours_agree_where_each_label_keeps_to_itself() -> None:
+    agreement = load("train_encoder").neighbour_agreement
+    places = np.array([[0.0], [1.0], [10.0], [11.0]], dtype=np.float32)
+    assert agreement(places, np.array([0, 0, 1, 1])) == 1.0
+    assert agreement(places, np.array([0, 1, 0, 1])) == 0.0
+
+
+def test_traces_without_a_cause_have_no_panel_of_causes(tiny: Path) -> None:
+    from dengine import load_dataset
+
+    script, data = load("train_encoder"), load_dataset(tiny)
+    row = {"training loss": 1.0, "held-out loss": 1.0, "neighbours agree": 0.5, "accuracy": 0.5}
+    features = [np.random.default_rng(i).normal(size=(60, 5)).astype(np.float32) for i in range(2)]
+    figure = script.picture([{"step": 0, **row}, {"step": 9, **row}], features, data)
+    assert len(figure.axes) == 4
 
 
 def test_a_cycles_benchmark_has_empty_cells_for_what_never_happened() -> None:

@@ -3,8 +3,9 @@
     python training/compare_ablations.py --data insertion --seeds 100:110 --out out/ablations
     python training/compare_ablations.py --data screw_driving.npz --samples 400 --only radius,folds,length
 
-Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), length (a part is decided on
-the beginning of its trace: 0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
+Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), training (seconds of it in a
+replay), augmentations (what the encoder's views are distorted by), length (a part is decided on the beginning of its trace:
+0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
 Writes ablations.csv, a row a replay, and ablations.png. Finished replays are kept in --keep, so that an interrupted run
 goes on.
 """
@@ -22,73 +23,17 @@ import numpy as np
 from compare_reducers import span
 from matplotlib.figure import Figure
 from rich.console import Console
-from torch import Tensor
 
-from dengine import ConvReducer, Dataset, Recipe, Replay, load_dataset
+from dengine import Dataset, Recipe, Replay, load_dataset
 from dengine.experiments.contenders import Contender
 from dengine.experiments.figures import save
 from dengine.experiments.grid import play_tasks
 from dengine.experiments.kept import Task
 from dengine.experiments.look import GREEN, LIMIT
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
-from dengine.reducers.features import ConvFeatures
+from dengine.reducers.vicreg import AUGMENTATIONS
 
-STATISTICS = 4  # mean, deviation, minimum, maximum: so many features a segment
-
-
-class PartFeatures(ConvFeatures):
-    """conv's features without some of them: those left out are nought everywhere, and no head learns of them."""
-
-    def keep_only(self, part: slice) -> PartFeatures:
-        """The same, with those of `part` alone."""
-        self.left_out = np.ones(len(self.gain), dtype=bool)
-        self.left_out[part] = False
-        return self
-
-    def standardise(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As every kind of features, but for those that are left out."""
-        z, ratio, shift = super().standardise(raw)
-        for each, value in ((self.gain, 0.0), (self.offset, 0.0), (ratio, 1.0), (shift, 0.0)):
-            each[self.left_out] = value
-        z[:, self.left_out] = 0.0
-        return z, ratio, shift
-
-
-class PartReducer(ConvReducer):
-    """conv with a part of its features; a kind says which, as a slice of them."""
-
-    def part(self, of_segments: int) -> slice:
-        """Which features are kept, where so many are segment statistics."""
-        raise NotImplementedError
-
-    def make_features(self, channels: int, samples: int) -> PartFeatures:
-        """Conv's features, without the others."""
-        features = PartFeatures(channels, samples, self.segments, self.filters, self.regions)
-        return features.keep_only(self.part(STATISTICS * channels * features.segments))
-
-
-class StatisticsReducer(PartReducer):
-    """Segment statistics alone."""
-
-    def part(self, of_segments: int) -> slice:
-        """The first ones."""
-        return slice(0, of_segments)
-
-
-class FiltersReducer(PartReducer):
-    """Learned filters alone."""
-
-    def part(self, of_segments: int) -> slice:
-        """The last ones."""
-        return slice(of_segments, None)
-
-
-class MeansReducer(PartReducer):
-    """The segments' means alone."""
-
-    def part(self, of_segments: int) -> slice:
-        """A quarter of the statistics."""
-        return slice(0, of_segments // STATISTICS)
+CYCLES = 1503
 
 
 @dataclass(frozen=True)
@@ -109,10 +54,26 @@ def setting(name: str, values: tuple[Any, ...]) -> Callable[[Dataset, Recipe], V
 
 
 def features(data: Dataset, base: Recipe) -> Variants:
-    """Conv's features, parts of them, and those of rocket, under the same heads and radius."""
-    kinds = {"statistics": StatisticsReducer(), "filters": FiltersReducer(), "means": MeansReducer(), "rocket": "rocket"}
-    whole = {"all of conv's": Variant(data, base)}
-    return whole | {name: Variant(data, replace(base, reducer=kind)) for name, kind in kinds.items()}
+    """What the features are made of: conv's encoder, the statistics that it replaced, fewer kernels, and rocket's."""
+    others = {
+        "statistics of 0.4": replace(base, params={**base.params, "kernels": 0}),
+        "14 kernels": replace(base, params={**base.params, "kernels": 14}),
+        "32 directions": replace(base, params={**base.params, "width": 32}),
+        "rocket": replace(base, reducer="rocket", params={}, encoder_budget=0.0),
+    }
+    return {"all of conv's": Variant(data, base)} | {name: Variant(data, recipe) for name, recipe in others.items()}
+
+
+def training(data: Dataset, base: Recipe) -> Variants:
+    """Seconds that the encoder trains in a whole replay, as a replay counts them."""
+    return {f"{s:g} s": Variant(data, replace(base, encoder_budget=s / CYCLES)) for s in (0, 3, 10, 15, 60)}
+
+
+def augmentations(data: Dataset, base: Recipe) -> Variants:
+    """What distorts the views that the encoder trains on, each left out in turn."""
+    left = {name: " ".join(each for each in AUGMENTATIONS if each != name) for name in AUGMENTATIONS}
+    recipes = {f"no {name}": replace(base, params={**base.params, "augmentations": kept}) for name, kept in left.items()}
+    return {name: Variant(data, recipe) for name, recipe in recipes.items()}
 
 
 def length(data: Dataset, base: Recipe) -> Variants:
@@ -150,6 +111,8 @@ AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
     "retrain": setting("retrain_every", (25, 50, 100, 200, 400)),
     "folds": setting("folds", (2, 3, 5, 10)),
     "features": features,
+    "training": training,
+    "augmentations": augmentations,
     "length": length,
     "channels": channels,
     "feedback": feedback,
@@ -203,7 +166,7 @@ def main() -> None:
     parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
     parser.add_argument("--only", default=",".join(AXES), help="axes, with commas between")
     parser.add_argument("--seeds", type=span, default="100:110", help="first:last, the last one left out; a replay each")
-    parser.add_argument("--cycles", type=int, default=1503, help="of a replay, at most as many as there are traces")
+    parser.add_argument("--cycles", type=int, default=CYCLES, help="of a replay, at most as many as there are traces")
     parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; times are honest with 1 only")
     parser.add_argument("--keep", type=Path, help="folder of finished replays")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
