@@ -81,8 +81,7 @@ class ModelVersions:
         """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training."""
         if self.new_labels >= retrain_every:
             return self.start_retrain()
-        if self.answering is not None:
-            self.retrainer.improve(self.answering)
+        self.retrainer.improve(self.newest)
         return None
 
     def start_retrain(self) -> RetrainReport | None:

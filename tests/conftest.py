@@ -19,7 +19,7 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = ("test_docs", "test_notebooks", "test_golden", "test_training", "test_cli", "test_estimators", "test_reducers")
 # Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
-UMAP = ("test_golden", "test_estimators", "test_reducers")
+UMAP = ("test_golden", "test_estimators", "test_reducers", "test_plane")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups

@@ -77,7 +77,7 @@ def test_training_lowers_the_loss_on_traces_that_it_never_saw() -> None:
 @pytest.mark.parametrize(
     "spoil", [lambda mix: mix.fill_(float("nan")), lambda mix: mix.copy_(torch.randn(mix.shape))], ids=["nan", "noise"]
 )
-def test_an_encoder_that_does_worse_on_held_out_traces_is_given_up(spoil) -> None:  # noqa: ANN001  # of a tensor
+def test_an_encoder_that_does_worse_on_held_out_traces_is_given_up(spoil) -> None:  # of a tensor
     reducer, X, y = fitted()
     improved(reducer, X, 3)
     training, kernel = reducer.training_, reducer.net_.features.kernel.clone()
@@ -108,7 +108,7 @@ def test_a_training_that_was_stored_goes_on_as_one_that_never_stopped() -> None:
 
 
 @pytest.mark.parametrize("through", [copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))])
-def test_a_training_that_was_copied_goes_on_by_itself(through) -> None:  # noqa: ANN001  # either way of copying
+def test_a_training_that_was_copied_goes_on_by_itself(through) -> None:  # either way of copying
     reducer, X, _ = fitted()
     improved(reducer, X, 3)
     other = through(reducer)
@@ -175,6 +175,9 @@ def test_an_encoder_of_no_traces_and_of_one_trains_nothing() -> None:
 
 def test_time_is_saved_up_cycle_by_cycle_and_taken_in_slices() -> None:
     time = EncoderTime(0.01, in_steps=True)
+    assert time.saved == 2.0  # a cell begins slowly
+    time.spend(round(2.0 / STEP_SECONDS), seconds=99.0)
+    time.seconds = 0.0
     assert time.take(0.2, 0.2) is None
     for _ in range(20):
         time.earn()
@@ -220,7 +223,7 @@ def test_a_live_engine_ends_a_slice_by_the_clock() -> None:
         assert 0.0 < engine.encoder_time.longest < 0.45
 
 
-def test_a_reopened_engine_answers_the_same_and_goes_on_training(tmp_path) -> None:  # noqa: ANN001
+def test_a_reopened_engine_answers_the_same_and_goes_on_training(tmp_path) -> None:
     url = str(tmp_path / "cell.sqlite")
     X, _ = resonances(20, seed=5)
     with engine_after(120, store=url, replaying=True) as engine:
@@ -232,7 +235,7 @@ def test_a_reopened_engine_answers_the_same_and_goes_on_training(tmp_path) -> No
         assert 0 < kept <= steps  # what was trained since the last version was not stored
 
 
-def test_an_encoder_that_fails_at_training_costs_no_decision(monkeypatch, caplog) -> None:  # noqa: ANN001
+def test_an_encoder_that_fails_at_training_costs_no_decision(monkeypatch, caplog) -> None:
     def fail(*_: object) -> int:
         raise RuntimeError("no memory")
 
@@ -241,3 +244,19 @@ def test_an_encoder_that_fails_at_training_costs_no_decision(monkeypatch, caplog
         assert engine.version >= 1
         assert engine.encoder_time.steps == 0
     assert "cannot be trained further" in caplog.text
+
+
+def test_where_there_are_many_references_an_encoder_waits_until_all_are_embedded_with_it(monkeypatch) -> None:
+    monkeypatch.setattr("dengine.reducers.conv.AT_ONCE", 70)
+    reducer, X, y = fitted()
+    kernel = reducer.net_.features.kernel.clone()
+    improved(reducer, X, 4)
+    for left in (90, 20):
+        reducer.train(X, y, content_fold(X, 5))
+        assert f"waits until {left} more traces" in reducer.report.note
+        assert torch.equal(reducer.net_.features.kernel, kernel)
+    reducer.train(X, y, content_fold(X, 5))
+    assert "encoder after 4 steps" in reducer.report.note
+    assert not torch.equal(reducer.net_.features.kernel, kernel)
+    fresh = reducer.net_.features.raw(torch.from_numpy(X))
+    np.testing.assert_allclose(reducer.raw_features(X), fresh, atol=1e-5)

@@ -33,8 +33,8 @@ def test_features_of_a_trace_are_kept_until_it_leaves_the_window() -> None:
     reducer, folds = RocketReducer(), content_fold(X, 5)
     reducer.train(X[:60], y[:60], folds[:60])
     reducer.train(X[30:], y[30:], folds[30:])
-    assert len(reducer._kept) == len(reducer._kept_features) == 60
-    kept = reducer._kept_features.clone()
+    assert len(reducer.kept_.places) == len(reducer.kept_) == 60
+    kept = reducer.kept_.features.clone()
     np.testing.assert_array_equal(reducer.raw_features(X[30:]), kept)
     np.testing.assert_allclose(kept, reducer.net_.features.raw(torch.from_numpy(X[30:])), atol=0.05)
 

@@ -32,7 +32,11 @@ WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
     """Every quantity, in seconds, and the latencies behind those that are shown as a distribution."""
     recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
-    retrains = np.concatenate([replay(data, recipe, seed).retrain_seconds for seed in range(args.replays)])
+    played = [replay(data, recipe, seed) for seed in range(args.replays)]
+    retrains, slices = (
+        np.concatenate([one.retrain_seconds for one in played]),
+        np.array([one.slice_max_s for one in played]),
+    )
     whole = retrain_on_all(data, recipe, args.repeats)
     deciding = {"decide": decide_times(filled_engine(data, recipe), data)}
     swaps = {}
@@ -43,6 +47,7 @@ def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any
         deciding[f"decide, retraining in a {name}"], swaps[f"decide and swap, {name}"] = beside(data, recipe, executor)
     rows = [
         row(f"retrain, all of {args.replays} replays", retrains, BUDGET),
+        row("the longest slice of the encoder's training in each", slices, BUDGET),
         row(f"retrain on {len(data)} traces", whole, BUDGET),
         *(row(name, seconds) for name, seconds in (deciding | swaps).items()),
     ]

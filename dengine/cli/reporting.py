@@ -22,7 +22,16 @@ MANY_CORES = 1000
 def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: Path | None, as_json: bool) -> None:
     """Print the tables, or one JSON document; write CSV, tables and pictures to `out`."""
     from ..experiments.paper import finding_lines
-    from ..experiments.tables import CONDITION, frame_of, pool, pooled_table, promise_kept, promise_lines, retrain_line
+    from ..experiments.tables import (
+        CONDITION,
+        encoder_line,
+        frame_of,
+        pool,
+        pooled_table,
+        promise_kept,
+        promise_lines,
+        retrain_line,
+    )
 
     replays = finished.replays
     by_name = _grouped(replays, lambda each: each.name)
@@ -43,7 +52,7 @@ def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out:
         return
     show(pooled_table(rows, title))
     show(*promise_lines(rows))
-    show(*(f"{name}: {retrain_line(reports)}" for name, reports in retrains.items()))
+    show(*(f"{name}: {retrain_line(reports)}{encoder_line(by_name[name])}" for name, reports in retrains.items()))
     show(*finding_lines(found))
     show(_cost_line(finished))
     show(*(f"Wrote {path}" for path in files))

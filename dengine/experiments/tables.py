@@ -182,7 +182,6 @@ _CELLS_OF: dict[str, Any] = {
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",
     "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
-    "encoder s\nslice ms": lambda r: f"{r['encoder_s']:.1f}\n{1e3 * r['slice_max_s']:.0f}",
     "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
     "saved\nnet, s": lambda r: f"{r['saved_s']:.0f}\n{r['net_s']:.0f}",
 }
@@ -196,6 +195,15 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     last = f"; {len(dropped)} dropped, the last for: {dropped[-1].reason.removeprefix('dropped: ')}" if dropped else ""
     many = "" if len(retrains) == 1 else "s"
     return f"{len(retrains)} retrain{many}, the worst in {worst:.3f} s{last}."
+
+
+def encoder_line(replays: Sequence[Replay]) -> str:
+    """How much label-free training the replays of one contender assumed; "" where nothing was trained."""
+    if not any(one.encoder_steps for one in replays):
+        return ""
+    seconds = sum(one.encoder_seconds for one in replays) / len(replays)
+    longest = max(one.slice_max_s for one in replays)
+    return f" {seconds:.1f} s of the encoder's training assumed a replay, the longest slice in {longest:.3f} s."
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path) -> Path:

@@ -17,8 +17,10 @@ al. (2018), Econometrics Journal 21.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from typing import Any, Self
+from functools import partial
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -28,11 +30,21 @@ from ..errors import SettingError
 from .base import Floats, Ints, StopRule, seed_of
 from .encoder import ConvEncoder, averaging, start_from
 from .features import ConvFeatures, Features
-from .scored import FeatureReducer
+from .kept_features import KeptFeatures
+from .scored import MIN_TRACES, FeatureReducer, in_chunks
 from .vicreg import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
+AT_ONCE = 1500  # traces that a retrain embeds anew, so that it ends in time however many references there are
 HELD_OUT = 8  # one trace in so many is never trained on, by the hash of its part
+
+
+class _Next(NamedTuple):
+    """An encoder that may answer, the features of the traces that are embedded with it by now, and what is said of it."""
+
+    encoder: ConvEncoder
+    kept: KeptFeatures
+    said: str
 
 
 class ConvReducer(FeatureReducer):
@@ -101,14 +113,18 @@ class ConvReducer(FeatureReducer):
     def _start(self, traces: Floats) -> None:
         self.average_ = averaging(torch.from_numpy(traces)) if self.kernels else 1
         self.training_: EncoderTraining | None = None
+        self.next_: _Next | None = None
         super()._start(traces)
         if self.start is not None and isinstance(self.net_.features, ConvEncoder):
             start_from(self.net_.features, self.start)
 
     def improve(self, X: Floats, parts: Ints, stop: StopRule) -> int:
         """Train the encoder apart from what answers, which takes it over at the next `train`; see `Reducer.improve`."""
-        if not self.kernels or "net_" not in vars(self):
+        if not self.kernels or len(X) < MIN_TRACES:
             return 0
+        if "net_" not in vars(self):  # it needs no label, so it begins before the first heads can
+            self.check()
+            self._start(self.check_traces(X, reset=True))
         if self.training_ is None:
             self.training_ = self._new_training()
         apart = parts % HELD_OUT == 0
@@ -123,25 +139,36 @@ class ConvReducer(FeatureReducer):
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
         """Take over what the encoder has learned since, then fit the heads; see `Reducer.train`."""
-        released = self._release()
+        with torch.no_grad():
+            told = self._take_over(X)
         points = super().train(X, y, folds, stop)
-        self.note_ = "; ".join(filter(None, (released, self.note_)))
+        self.note_ = "; ".join(filter(None, (told, self.note_)))
         return points
 
-    def _release(self) -> str:
-        """Let the encoder that was trained answer from now on; what is to be said of it, "" where nothing was trained."""
+    def _take_over(self, traces: Floats) -> str:
+        """Let the encoder that was trained answer from now on; what is to be said of it, "" where nothing was trained.
+
+        Every reference moves with it. Where there are many, some are embedded at each retrain until none is left.
+        """
         training = vars(self).get("training_")
-        if training is None or not training.waits:
+        if training is None:
             return ""
-        release = training.release()
-        told = f"after {training.steps} steps: held-out loss {release.loss:.4g}, features moved by {release.moved:.2g}"
-        if release.encoder is None:
-            return f"kept the earlier encoder, {told}"
-        with torch.no_grad():
-            for own, trained in zip(self.net_.features.parameters(), release.encoder.parameters(), strict=True):
-                own.copy_(trained)
-        self._forget_features()
-        return f"encoder {told}"
+        if self.next_ is None and training.waits:
+            release = training.release()
+            said = f"after {training.steps} steps: held-out loss {release.loss:.4g}, features moved by {release.moved:.2g}"
+            if release.encoder is None:
+                return f"kept the earlier encoder, {said}"
+            self.next_ = _Next(copy.deepcopy(release.encoder), KeptFeatures(len(self.net_.features.gain)), said)
+        if self.next_ is None:
+            return ""
+        encoder, kept, said = self.next_
+        left = kept.add(traces, AT_ONCE, partial(in_chunks, encoder.raw))
+        if left:
+            return f"an encoder waits until {left} more traces are embedded with it, {said}"
+        for own, trained in zip(self.net_.features.parameters(), encoder.parameters(), strict=True):
+            own.copy_(trained)
+        self.kept_, self.next_ = kept, None
+        return f"encoder {said}"
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """What every reducer by features gives, and the encoder's training with its optimiser."""
@@ -160,6 +187,7 @@ class ConvReducer(FeatureReducer):
         super().set_state(state)
         trained = {name[9:]: value for name, value in state.items() if name.startswith("training.")}
         self.training_ = self._new_training().set_state(trained) if trained else None
+        self.next_ = None
         return self
 
     def check(self) -> None:

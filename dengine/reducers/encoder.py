@@ -35,6 +35,7 @@ PLACES = 99  # of each kernel and dilation: what a mean over a region needs, and
 RAMP = 2.0  # deviations of a kernel's output from 0 to 1
 SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
 START = 4.0  # size of the trained directions before they are trained: outputs of about one deviation
+SCALE_TRACES = 2000  # that set scales and centres
 BASIS_TRACES = 1000  # that set the principal components
 LEARNED = ("kernel", "threshold", "slope", "unit", "middle", "mix")  # what a start from another encoder takes over
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
@@ -144,7 +145,8 @@ class ConvEncoder(Features):
 
     def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
         """Set scale, principal axes and centre from pooled outputs (n, D*R*F); returns features (n, 2*W), and a `Carry`."""
-        g, carry = super().standardise(raw)
+        some = raw[:: 1 + (len(raw) - 1) // SCALE_TRACES]
+        g, carry = super().standardise(some)
         before, centre = self.basis.double(), self.centre.clone()
         width = self.mix.size(1)
         # The trained directions were trained on pooled * unit.
@@ -160,6 +162,7 @@ class ConvEncoder(Features):
             weight = (on_pooled.double() @ back.T).float()
             return weight, bias - weight @ self.centre
 
+        g = g if len(some) == len(raw) else torch.addcmul(self.offset, raw, self.gain).clamp_(-4.0, 4.0)  # CLIP
         return torch.addmm(self.centre, g, self.basis), carried
 
 

@@ -15,7 +15,6 @@ UMAP's loss, here a linear one: a hidden layer kept neighbours no better; and th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from hashlib import blake2b
 from typing import Any, Self
 
 import numpy as np
@@ -29,6 +28,7 @@ from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
 from .encoder import ConvEncoder, averaging
 from .features import Carry
 from .fuzzy_graph import cross_entropy, fuzzy_graph
+from .kept_features import KeptFeatures
 from .scored import in_chunks
 
 SIZES = (28, 5, 3, 64)  # kernels, dilations, regions and width of the encoder, as in `ConvReducer`
@@ -49,7 +49,7 @@ class PlaneReducer(Reducer):
     """
 
     net_: PlaneEmbedding
-    _kept: tuple[dict[bytes, int], Tensor]  # rows by trace, and their pooled outputs
+    _kept: KeptFeatures
 
     def __init__(self, *, n_components: int = 2, n_neighbors: int = 15, n_steps: int = 50, random_state: Any = 0) -> None:
         self.n_components = n_components
@@ -98,15 +98,7 @@ class PlaneReducer(Reducer):
 
     def _pooled(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P), computed once a trace: no kernel ever changes."""
-        keys = [blake2b(trace, digest_size=16).digest() for trace in traces]
-        known, kept = self._kept
-        new = [i for i, key in enumerate(keys) if key not in known]
-        rows = known | {keys[i]: len(kept) + j for j, i in enumerate(new)}
-        if new:
-            kept = torch.cat([kept, in_chunks(self.net_.encoder.raw, torch.from_numpy(traces[new]))])
-        kept = kept[[rows[key] for key in keys]]
-        self._kept = {key: i for i, key in enumerate(keys)}, kept  # what has left the window leaves here too
-        return kept
+        return self._kept.of(traces, lambda new: in_chunks(self.net_.encoder.raw, new))
 
     def transform(self, X: ArrayLike) -> Floats:
         """(n, T) or (n, C, T) -> (n, d); each trace alone, so that none moves by what is beside it."""
@@ -158,7 +150,7 @@ class PlaneReducer(Reducer):
 
     def _build(self, encoder: ConvEncoder) -> None:
         self.net_ = PlaneEmbedding(encoder, self.n_components).eval()
-        self._kept = {}, torch.empty(0, len(encoder.gain))
+        self._kept = KeptFeatures(len(encoder.gain))
 
 
 class PlaneEmbedding(nn.Module):

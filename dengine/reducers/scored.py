@@ -6,7 +6,6 @@ A kind gives its features; here they are fitted, warm-started, embedded with, st
 from __future__ import annotations
 
 from collections.abc import Mapping
-from hashlib import blake2b
 from typing import Any, Self
 
 import numpy as np
@@ -19,6 +18,7 @@ from ..errors import SettingError
 from ..folds import content_fold
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, own_places, seed_of
 from .features import Features
+from .kept_features import KeptFeatures
 from .logistic import CrossFittedScores
 
 MIN_TRACES = 20  # that an engine's first model is trained on
@@ -58,8 +58,7 @@ class FeatureReducer(Reducer):
     max_iter: int
     random_state: Any
     net_: FeatureEmbedding
-    _kept: dict[bytes, int]
-    _kept_features: Tensor
+    kept_: KeptFeatures
 
     @property
     def n_spaces(self) -> int:
@@ -121,25 +120,10 @@ class FeatureReducer(Reducer):
 
     def raw_features(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P), not standardised; where a kind keeps them, computed once a trace."""
-        if not self.keeps_features:
-            return self._computed(traces)
-        keys = [blake2b(trace, digest_size=16).digest() for trace in traces]  # exact: a fold's hash is of rounded samples
-        new = [i for i, key in enumerate(keys) if key not in self._kept]
-        known = self._kept | {keys[i]: len(self._kept_features) + j for j, i in enumerate(new)}
-        rows = torch.cat([self._kept_features, self._computed(traces[new])]) if new else self._kept_features
-        # What has left the window leaves here too.
-        self._kept_features = rows[[known[key] for key in keys]]
-        self._kept = {key: i for i, key in enumerate(keys)}
-        return self._kept_features
+        return self.kept_.of(traces, self._computed) if self.keeps_features else self._computed(torch.from_numpy(traces))
 
-    def _computed(self, traces: Floats) -> Tensor:
-        return in_chunks(self.net_.features.raw, torch.from_numpy(traces))
-
-    def _forget_features(self) -> None:
-        """Features of other filters must not be read again."""
-        # A tensor for all: one each would pickle them all with each.
-        self._kept = {}
-        self._kept_features = torch.empty(0, len(self.net_.features.gain))
+    def _computed(self, traces: Tensor) -> Tensor:
+        return in_chunks(self.net_.features.raw, traces)
 
     def _sample(self, n: int) -> Ints:
         """Rows that train the heads: all, or of many a draw that is blind to labels and another at each fit."""
@@ -218,7 +202,7 @@ class FeatureReducer(Reducer):
         features = self.make_features(channels, samples)
         head = CrossFittedScores(features.n_out, self.folds, self.n_components)
         self.net_ = FeatureEmbedding(features, head).eval()
-        self._forget_features()
+        self.kept_ = KeptFeatures(len(features.gain))  # of other filters nothing must be read again
 
 
 def in_chunks(f: Any, x: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ THIN = 3  # one in so many places of a kernel is looked at in a step, others in 
 PROJECTED = 128  # dimensions of the projector
 RATE = 1e-3  # of Adam
 INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0  # weights of the loss, as in its paper
-FEWEST = 16  # held-out traces that can say whether a training did well
+FEWEST = 8  # held-out traces that can say whether a training did well
 WORSE = 1.1  # times the held-out loss that a training may have, against the one that answers
 
 
