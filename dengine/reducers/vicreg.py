@@ -31,6 +31,7 @@ BATCH = 64
 THIN = 3  # one in so many places of a kernel is looked at in a step, others in the next
 PROJECTED = 128  # dimensions of the projector
 RATE = 1e-3  # of Adam
+KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
 INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0  # weights of the loss, as in its paper
 FEWEST = 8  # held-out traces that can say whether a training did well
 WORSE = 1.1  # times the held-out loss that a training may have, against the one that answers
@@ -143,10 +144,16 @@ class EncoderTraining:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.learner = _Learner(copy.deepcopy(encoder))
-        self.adam = torch.optim.Adam(self.learner.parameters(), lr=RATE, fused=True)
+        self.adam = self._optimiser()
         self.released = copy.deepcopy(self.learner)  # what answers, with the projector that it was trained behind
         self.released_at = 0
         self.held_out = torch.zeros(0, 1, 1)
+
+    def _optimiser(self) -> torch.optim.Adam:
+        encoder = self.learner.encoder
+        linear = [encoder.mix, *self.learner.project.parameters()]
+        groups = [{"params": [encoder.kernel, encoder.threshold], "lr": KERNEL_RATE}, {"params": linear, "lr": RATE}]
+        return torch.optim.Adam(groups, fused=True)
 
     @property
     def waits(self) -> bool:
@@ -192,7 +199,7 @@ class EncoderTraining:
             moved = self._moved()
         if not fine:
             self.learner.load_state_dict(self.released.state_dict())
-            self.adam = torch.optim.Adam(self.learner.parameters(), lr=RATE, fused=True)
+            self.adam = self._optimiser()
             return Release(None, loss, moved)
         self.released.load_state_dict(self.learner.state_dict())
         return Release(self.encoder, loss, moved)
