@@ -81,7 +81,8 @@ class ModelVersions:
         """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training."""
         if self.new_labels >= retrain_every:
             return self.start_retrain()
-        self.retrainer.improve(self.newest)
+        if self.answering is not None:
+            self.retrainer.improve(self.answering)
         return None
 
     def start_retrain(self) -> RetrainReport | None:

@@ -31,7 +31,7 @@ from .base import Floats, Ints, StopRule, seed_of
 from .encoder import ConvEncoder, averaging, start_from
 from .features import ConvFeatures, Features
 from .kept_features import KeptFeatures
-from .scored import MIN_TRACES, FeatureReducer, in_chunks
+from .scored import FeatureReducer, in_chunks
 from .vicreg import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
@@ -120,11 +120,8 @@ class ConvReducer(FeatureReducer):
 
     def improve(self, X: Floats, parts: Ints, stop: StopRule) -> int:
         """Train the encoder apart from what answers, which takes it over at the next `train`; see `Reducer.improve`."""
-        if not self.kernels or len(X) < MIN_TRACES:
+        if not self.kernels or "net_" not in vars(self):  # begun on fewer traces than a first model has, it did worse
             return 0
-        if "net_" not in vars(self):  # it needs no label, so it begins before the first heads can
-            self.check()
-            self._start(self.check_traces(X, reset=True))
         if self.training_ is None:
             self.training_ = self._new_training()
         apart = parts % HELD_OUT == 0
