@@ -154,7 +154,8 @@ class EncoderTime:
     def spend(self, steps: int, seconds: float) -> None:
         """Account for steps that took so long."""
         counted = steps * STEP_SECONDS if self.in_steps else seconds
-        self.saved = max(0.0, self.saved - counted)
+        # What trained nothing, having nothing to train or failing at it, is not asked again at every cycle.
+        self.saved = max(0.0, self.saved - counted) if steps else 0.0
         self.steps, self.seconds = self.steps + steps, self.seconds + counted
 
 
