@@ -136,7 +136,7 @@ class ConvEncoder(Features):
         self.threshold.copy_(0.5 - h.gather(2, place).permute(0, 2, 1) * self.slope)
         pooled = self.pooled(a, self.taps)
         self.middle.copy_(pooled.mean(0))
-        self.unit.copy_(1.0 / (pooled.std(0) + 1e-2))  # of outputs between 0 and 1
+        self.unit.copy_(1.0 / (pooled.std(0, unbiased=False) + 1e-2))  # of outputs between 0 and 1
         self.mix.copy_(principal_axes((pooled - self.middle) * self.unit, self.mix.size(1)) * START / len(self.unit) ** 0.5)
 
     def mixed(self, pooled: Tensor) -> Tensor:
@@ -151,7 +151,7 @@ class ConvEncoder(Features):
         width = self.mix.size(1)
         # The trained directions were trained on pooled * unit.
         halves = [principal_axes(g, width), (self.unit / self.gain)[:, None] * self.mix]
-        scaled = [half * (SHARE / (g @ half).var(0).sum().clamp(min=1e-9)).sqrt() for half in halves]
+        scaled = [half * (SHARE / (g @ half).var(0, unbiased=False).sum().clamp(min=1e-9)).sqrt() for half in halves]
         self.basis.copy_(torch.cat(scaled, 1))
         self.centre.copy_(-(g.double().mean(0) @ self.basis.double()))
         back = torch.linalg.pinv(self.basis.double(), rtol=1e-4)  # (2*W, D*R*F)
