@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import torch
 from dengine import ConvReducer, DataEngine, Recipe
 from dengine.decision.rule import script
 from dengine.folds import content_fold, content_hash
+from dengine.reducers.adam import Adam
 from dengine.reducers.base import StopRule
 from dengine.reducers.encoder import ConvEncoder, averaging
 from dengine.reducers.vicreg import AUGMENTATIONS, EncoderTraining, vicreg_loss
@@ -120,6 +123,35 @@ def test_a_training_that_was_copied_goes_on_by_itself(through) -> None:  # eithe
     assert mine is not None
     assert torch.equal(mine.encoder.kernel, its.encoder.kernel)
     assert mine.encoder.kernel.data_ptr() != its.encoder.kernel.data_ptr()
+
+
+def test_adam_steps_as_torchs_does() -> None:
+    rng = torch.Generator().manual_seed(0)
+    own, other = ([torch.zeros(4, 3, requires_grad=True), torch.ones(5, requires_grad=True)] for _ in range(2))
+    ours = Adam([([own[0]], 1e-2), ([own[1]], 1e-3)])
+    theirs = torch.optim.Adam([{"params": [other[0]], "lr": 1e-2}, {"params": [other[1]], "lr": 1e-3}])
+    for _ in range(20):
+        for a, b in zip(own, other, strict=True):
+            a.grad = torch.randn(a.shape, generator=rng)
+            b.grad = a.grad.clone()
+        ours.step()
+        theirs.step()
+    for a, b in zip(own, other, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_training_loads_no_compiler_in_the_middle_of_a_cycle() -> None:
+    program = """
+import sys, numpy as np
+from dengine import ConvReducer
+from dengine.folds import content_hash
+from dengine.reducers.base import StopRule
+X = np.random.default_rng(0).normal(size=(40, 1, 100)).astype(np.float32)
+reducer = ConvReducer(kernels=4, width=4).fit(X, np.arange(40) % 2)
+assert reducer.improve(X, content_hash(X), StopRule(max_steps=1)) == 1
+print("torch._dynamo" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
 def test_the_loss_of_a_collapsed_embedding_is_its_missing_variance() -> None:

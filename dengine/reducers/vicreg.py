@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
+from .adam import Adam
 from .base import StopRule
 from .encoder import ConvEncoder
 
@@ -149,11 +150,10 @@ class EncoderTraining:
         self.released_at = 0
         self.held_out = torch.zeros(0, 1, 1)
 
-    def _optimiser(self) -> torch.optim.Adam:
+    def _optimiser(self) -> Adam:
         encoder = self.learner.encoder
         linear = [encoder.mix, *self.learner.project.parameters()]
-        groups = [{"params": [encoder.kernel, encoder.threshold], "lr": KERNEL_RATE}, {"params": linear, "lr": RATE}]
-        return torch.optim.Adam(groups, fused=True)
+        return Adam([([encoder.kernel, encoder.threshold], KERNEL_RATE), (linear, RATE)])
 
     @property
     def waits(self) -> bool:
@@ -180,7 +180,6 @@ class EncoderTraining:
             drawn = torch.randperm(len(averaged), generator=g)[:BATCH]
             thinned = self.encoder.thinned(self.steps % THIN, THIN)
             loss = self.learner.loss(averaged[drawn], self.augmentations, g, thinned)
-            self.adam.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]  # torch's own
             self.adam.step()
             step, self.steps = step + 1, self.steps + 1
@@ -225,20 +224,15 @@ class EncoderTraining:
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Plain arrays: network, projector, the optimiser's moments and the steps."""
         state = {name: value.detach().numpy().copy() for name, value in self.learner.state_dict().items()}
-        for i, moments in self.adam.state_dict()["state"].items():
-            state |= {f"adam.{i}.{name}": value.numpy().copy() for name, value in moments.items()}
+        state |= {f"adam.{name}": value for name, value in self.adam.get_state().items()}
         return state | {"steps": np.array(self.steps)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> EncoderTraining:
         """Go on from what `get_state` gave."""
-        arrays = {name: torch.from_numpy(np.array(value)) for name, value in state.items() if name != "steps"}
-        self.learner.load_state_dict({name: value for name, value in arrays.items() if not name.startswith("adam.")})
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in arrays.items():
-            if name.startswith("adam."):
-                _, i, moment = name.split(".")
-                moments.setdefault(int(i), {})[moment] = value
-        self.adam.load_state_dict(self.adam.state_dict() | {"state": moments})
+        own = {name[5:]: value for name, value in state.items() if name.startswith("adam.")}
+        self.adam.set_state(own)
+        names = self.learner.state_dict()
+        self.learner.load_state_dict({name: torch.from_numpy(np.array(state[name])) for name in names})
         self.released.load_state_dict(self.learner.state_dict())
         self.steps = self.released_at = int(state["steps"])
         return self
