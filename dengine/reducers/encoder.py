@@ -2,7 +2,7 @@
 
     x (B, C, T) -> means of a few samples each, one scale a channel                              (B, C, L)
       -> conv, F kernels of 9 taps at each of D dilations, at P places                           (B, D, P, F)
-      -> a ramp from 0 to 1 around a threshold, its mean over R regions                          (B, D*R*F)
+      -> a ramp from 0 to 1 around a threshold, its mean over R regions, plus twice that over all (B, D*R*F)
       -> standardised, clipped
       -> linear: W principal components of these, and W directions that `vicreg.py` trains       (B, 2*W)
 
@@ -31,7 +31,8 @@ from .features import Carry, Features
 TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
 FRAMES = 200  # a trace is averaged to about so many samples
 KEPT = 0.8  # share of the traces' variance that averaging must leave, or less is averaged
-PLACES = 99  # of each kernel and dilation: what a mean over a region needs, and half the time of all
+PLACES = 198  # of each kernel and dilation: on traces that oscillate half of them are certain of less
+WHOLE = 2.0  # weight of the mean over the whole trace beside that over a region: where it does not matter when
 RAMP = 2.0  # deviations of a kernel's output from 0 to 1
 SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
 START = 4.0  # size of the trained directions before they are trained: outputs of about one deviation
@@ -49,6 +50,7 @@ class ConvEncoder(Features):
     """
 
     taps: Tensor
+    pool: Tensor
     slope: Tensor
     middle: Tensor
     unit: Tensor
@@ -69,6 +71,7 @@ class ConvEncoder(Features):
         self.head = samples - frames * average  # left out at the start: the end of an insertion tells most
         self.n_dilations, self.n_regions, self.n_kernels = len(taps), regions, kernels
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
+        self.register_buffer("pool", _pool(regions, places // regions))
         # Trained by a copy of this module (`vicreg.py`); the one that answers takes the values over.
         self.kernel = nn.Parameter(torch.zeros(channels * TAPS, kernels), requires_grad=False)
         self.threshold = nn.Parameter(torch.zeros(len(taps), 1, kernels), requires_grad=False)
@@ -91,7 +94,7 @@ class ConvEncoder(Features):
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, D*R*F), not standardised."""
-        return self.pooled(self.averaged(x), self.taps)
+        return self.pooled(self.averaged(x), self.taps, self.pool)
 
     def averaged(self, x: Tensor) -> Tensor:
         """(B, C, T) raw -> (B, C, L), one scale a channel."""
@@ -99,42 +102,45 @@ class ConvEncoder(Features):
             x = x[:, :, self.head :].reshape(x.size(0), x.size(1), self.frames, self.average).mean(3)
         return torch.addcmul(self.shift, x, self.scale)
 
-    def pooled(self, a: Tensor, taps: Tensor) -> Tensor:
+    def pooled(self, a: Tensor, taps: Tensor, pool: Tensor) -> Tensor:
         """(B, C, L) -> (B, D*R*F): how far each kernel is above its threshold, in the mean over each region.
 
-        taps : (D*P*9,), all or `thinned`.
+        taps, pool : (D*P*9,) and (R, P), all or `thinned`.
         """
-        groups, size = self.n_dilations * self.n_regions, self.n_kernels
-        h = nn.functional.hardtanh(torch.addcmul(self.threshold, self.convolved(a, taps), self.slope), 0.0, 1.0)
-        return h.view(a.size(0), groups, h.size(2) // self.n_regions, size).mean(2).view(a.size(0), groups * size)
+        h = torch.baddbmm(self.threshold, self.windows(a, taps), self.kernel * self.slope)
+        h = nn.functional.hardtanh(h, 0.0, 1.0).view(self.n_dilations, a.size(0), pool.size(1), self.n_kernels)
+        n_out = self.n_dilations * self.n_regions * self.n_kernels  # said: no traces have no size to guess it from
+        return torch.matmul(pool, h).transpose(0, 1).reshape(a.size(0), n_out)
 
-    def convolved(self, a: Tensor, taps: Tensor) -> Tensor:
-        """(B, C, L) -> (B, D, P, F): a convolution as one product, its frames gathered."""
-        padded = nn.functional.pad(a, [0, 1])  # taps beyond the ends read this zero
-        n_frames = taps.size(0) // 9
-        frames = padded.index_select(2, taps).view(a.size(0), a.size(1), n_frames, 9).transpose(1, 2)
-        h = torch.mm(frames.reshape(a.size(0) * n_frames, self.kernel.size(0)), self.kernel)  # (B*D*P, F)
-        return h.view(a.size(0), self.n_dilations, n_frames // self.n_dilations, self.n_kernels)
+    def windows(self, a: Tensor, taps: Tensor) -> Tensor:
+        """(B, C, L) -> (D, B*P, C*9): what each place of each dilation sees, so that a convolution is a product."""
+        # Traces last: a tap then moves a row of them at once.
+        rows = nn.functional.pad(a.permute(2, 1, 0).reshape(a.size(2), -1), [0, 0, 0, 1])  # taps beyond the ends read zeros
+        n_places = taps.size(0) // (9 * self.n_dilations)
+        if rows.size(1) == 1:  # one trace at a time, as a cell decides: 40 us less
+            return rows.view(-1).index_select(0, taps).view(self.n_dilations, n_places, 9)
+        seen = rows.index_select(0, taps).view(self.n_dilations, n_places, 9, a.size(1), a.size(0))
+        return seen.permute(0, 4, 1, 3, 2).reshape(self.n_dilations, a.size(0) * n_places, a.size(1) * 9)
 
     @torch.jit.unused
-    def thinned(self, first: int, step: int) -> Tensor:
-        """The taps of every `step`-th place of each region: what an estimate in training needs, in less time."""
-        taps = self.taps.view(self.n_dilations, self.n_regions, -1, TAPS)
-        return taps[:, :, first::step].flatten()
+    def thinned(self, first: int, step: int) -> tuple[Tensor, Tensor]:
+        """Taps and pool of every `step`-th place of each region: what an estimate in training needs, in less time."""
+        taps = self.taps.view(self.n_dilations, self.n_regions, -1, TAPS)[:, :, first::step]
+        return taps.flatten(), _pool(self.n_regions, taps.size(2))
 
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
         """Kernels, and thresholds from what they give on traces (n, C, T), their channels scaled."""
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         a = self.averaged((x - self.shift) / self.scale)
         self.kernel.copy_(_kernels(a.size(1), self.n_kernels, rng))
-        h = self.convolved(a, self.taps).permute(1, 3, 0, 2).flatten(2).sort(2).values  # (D, F, n*P)
+        h = torch.matmul(self.windows(a, self.taps), self.kernel).transpose(1, 2).sort(2).values  # (D, F, n*P)
         # Low-discrepancy quantiles, as in MiniRocket; none at the very ends.
         quantiles = 0.05 + 0.9 * (np.arange(1, h[..., 0].numel() + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
         place = torch.from_numpy((quantiles * (h.size(2) - 1)).astype(np.int64)).view(*h.shape[:2], 1)
         deviation = h.std(2, unbiased=False)
         self.slope.copy_((1.0 / (RAMP * deviation + 1e-6))[:, None])
         self.threshold.copy_(0.5 - h.gather(2, place).permute(0, 2, 1) * self.slope)
-        pooled = self.pooled(a, self.taps)
+        pooled = self.pooled(a, self.taps, self.pool)
         self.middle.copy_(pooled.mean(0))
         self.unit.copy_(1.0 / (pooled.std(0, unbiased=False) + 1e-2))  # of outputs between 0 and 1
         self.mix.copy_(principal_axes((pooled - self.middle) * self.unit, self.mix.size(1)) * START / len(self.unit) ** 0.5)
@@ -232,6 +238,12 @@ def _taps(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
     taps = middle[:, None] + spread[:, None, None] * (np.arange(TAPS) - TAPS // 2)
     return np.where((taps < 0) | (taps >= frames), frames, taps)
+
+
+def _pool(regions: int, per_region: int) -> Tensor:
+    """(R, P): the mean over each region, and `WHOLE` times the mean over all."""
+    own = torch.eye(regions).repeat_interleave(per_region, 1) / per_region
+    return own + WHOLE / own.size(1)
 
 
 def _kernels(channels: int, n: int, rng: np.random.Generator) -> Tensor:

@@ -29,7 +29,7 @@ from .base import StopRule
 from .encoder import ConvEncoder
 
 BATCH = 64
-THIN = 3  # one in so many places of a kernel is looked at in a step, others in the next
+THIN = 6  # one in so many places of a kernel is looked at in a step, others in the next
 PROJECTED = 128  # dimensions of the projector
 RATE = 1e-3  # of Adam
 KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
@@ -105,16 +105,16 @@ class _Learner(nn.Module):
             nn.Linear(PROJECTED, PROJECTED),
         )
 
-    def forward(self, a: Tensor, taps: Tensor) -> Tensor:
-        out: Tensor = self.project(self.encoder.mixed(self.encoder.pooled(a, taps)))
+    def forward(self, a: Tensor, taps: Tensor, pool: Tensor) -> Tensor:
+        out: Tensor = self.project(self.encoder.mixed(self.encoder.pooled(a, taps, pool)))
         return out
 
-    def loss(self, a: Tensor, augmentations: tuple[str, ...], g: torch.Generator, taps: Tensor) -> Tensor:
+    def loss(self, a: Tensor, augmentations: tuple[str, ...], g: torch.Generator, places: tuple[Tensor, Tensor]) -> Tensor:
         """VICReg's loss of averaged traces (n, C, L), each distorted twice."""
         views = torch.cat([a, a])
         for name in augmentations:
             views = AUGMENTATIONS[name](views, g)
-        return vicreg_loss(*self(views, taps).chunk(2))
+        return vicreg_loss(*self(views, *places).chunk(2))
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ class EncoderTraining:
         """Kornblith, Norouzi, Lee and Hinton (2019), Similarity of neural network representations revisited, ICML."""
         with torch.no_grad():
             both = (self.released.encoder, self.encoder)
-            pair = [each.mixed(each.pooled(self.held_out, each.taps)) for each in both]
+            pair = [each.mixed(each.pooled(self.held_out, each.taps, each.pool)) for each in both]
             a, b = (z - z.mean(0) for z in pair)
             alike = (a.T @ b).square().sum() / ((a.T @ a).norm() * (b.T @ b).norm()).clamp(min=1e-12)
         return float(1.0 - alike)
@@ -215,7 +215,8 @@ class EncoderTraining:
     def held_out_loss(self, learner: _Learner) -> float:
         """Of the held-out traces, always distorted alike."""
         with torch.no_grad():
-            return float(learner.loss(self.held_out, self.augmentations, self._generator(-1), self.encoder.taps))
+            places = self.encoder.taps, self.encoder.pool
+            return float(learner.loss(self.held_out, self.augmentations, self._generator(-1), places))
 
     def _generator(self, step: int) -> torch.Generator:
         # Of the step and the seed alone: a training that was stored goes on as it would have.
