@@ -125,6 +125,38 @@ def test_a_training_that_was_copied_goes_on_by_itself(through) -> None:  # eithe
     assert mine.encoder.kernel.data_ptr() != its.encoder.kernel.data_ptr()
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(channels: int) -> None:
+    samples, dilations, kernels = 60, 3, 4
+    encoder = ConvEncoder(channels, samples, 1, kernels, dilations, 3, 2)
+    a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
+    encoder.learn_filters(a, np.random.default_rng(0))
+    found = torch.matmul(encoder.windows(a, encoder.taps), encoder.kernel).view(dilations, 5, -1, kernels)
+    middle = encoder.taps.view(dilations, -1, 9)[:, :, 4]
+    weight = encoder.kernel.T.reshape(kernels, channels, 9)
+    for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
+        whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
+        torch.testing.assert_close(found[d], whole[:, :, middle[d]].transpose(1, 2))
+
+
+def test_one_trace_alone_is_pooled_as_it_is_among_others() -> None:
+    reducer, X, _ = fitted()
+    raw = reducer.net_.features.raw
+    torch.testing.assert_close(raw(torch.from_numpy(X[:1])), raw(torch.from_numpy(X))[:1])
+
+
+def test_a_ramp_is_pooled_over_its_region_and_twice_over_the_whole_trace() -> None:
+    reducer, _, _ = fitted()
+    encoder = reducer.net_.features
+    per_region = encoder.pool.size(1) // 3
+    inside = torch.zeros(encoder.pool.size(1))
+    inside[:per_region] = 1.0  # above every threshold in the first third, below in the others
+    torch.testing.assert_close(encoder.pool @ inside, torch.tensor([1.0, 0.0, 0.0]) + 2.0 / 3.0)
+    taps, pool = encoder.thinned(1, 6)
+    assert pool.size(1) * 9 * encoder.n_dilations == len(taps)
+    torch.testing.assert_close(pool.sum(1), encoder.pool.sum(1))
+
+
 def test_adam_steps_as_torchs_does() -> None:
     rng = torch.Generator().manual_seed(0)
     own, other = ([torch.zeros(4, 3, requires_grad=True), torch.ones(5, requires_grad=True)] for _ in range(2))
