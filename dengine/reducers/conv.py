@@ -35,7 +35,7 @@ from .scored import FeatureReducer, in_chunks
 from .vicreg import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
-AT_ONCE = 1500  # traces that a retrain embeds anew, so that it ends in time however many references there are
+AT_ONCE = 1000  # traces that a retrain embeds anew, so that it ends in time however many references there are
 HELD_OUT = 8  # one trace in so many is never trained on, by the hash of its part
 
 

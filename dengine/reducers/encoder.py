@@ -107,10 +107,12 @@ class ConvEncoder(Features):
 
         taps, pool : (D*P*9,) and (R, P), all or `thinned`.
         """
-        h = torch.baddbmm(self.threshold, self.windows(a, taps), self.kernel * self.slope)
-        h = nn.functional.hardtanh(h, 0.0, 1.0).view(self.n_dilations, a.size(0), pool.size(1), self.n_kernels)
-        n_out = self.n_dilations * self.n_regions * self.n_kernels  # said: no traces have no size to guess it from
-        return torch.matmul(pool, h).transpose(0, 1).reshape(a.size(0), n_out)
+        h = torch.bmm(self.windows(a, taps), self.kernel * self.slope).add_(self.threshold)  # (D, B*P, F)
+        h = nn.functional.hardtanh(h, 0.0, 1.0, inplace=True).view(-1, pool.size(1), self.n_kernels)  # (D*B, P, F)
+        h = torch.bmm(pool.expand(h.size(0), pool.size(0), pool.size(1)), h)  # (D*B, R, F)
+        n_out = self.n_regions * self.n_kernels  # said: no traces have no size to guess it from
+        h = h.view(self.n_dilations, a.size(0), n_out).transpose(0, 1)
+        return h.reshape(a.size(0), self.n_dilations * n_out)
 
     def windows(self, a: Tensor, taps: Tensor) -> Tensor:
         """(B, C, L) -> (D, B*P, C*9): what each place of each dilation sees, so that a convolution is a product."""
