@@ -9,6 +9,7 @@ by `state_dict`); the paper's rule learns nothing from being told. `guarantee.py
 """
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -165,10 +166,17 @@ class RadiusNeighbours(nn.Module):
         return action, lower, upper, n_success, n_failure
 
 
+_SCRIPTING = threading.Lock()
+
+
 def script(module: nn.Module) -> Any:
-    """`torch.jit.script` without its deprecation notice: it works in the supported range of torch."""
+    """`torch.jit.script` without its deprecation notice: it works in the supported range of torch.
+
+    One at a time: two threads that parse at once, as two replays or an engine and its executor may, made Python's parser
+    raise "AST constructor recursion depth mismatch".
+    """
     import warnings
 
-    with warnings.catch_warnings():
+    with _SCRIPTING, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
         return torch.jit.script(module)
