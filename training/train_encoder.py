@@ -102,7 +102,7 @@ def losses(training: EncoderTraining, X: Floats, parts: NDArray[np.int64]) -> Ro
         with torch.no_grad():
             averaged, alike = training.encoder.averaged(torch.from_numpy(X[rows])), torch.Generator().manual_seed(0)
             if len(rows) > 1:
-                everywhere = training.encoder.taps, training.encoder.pool
+                everywhere = training.encoder.thinned(0, 1)
                 loss = training.learner.loss(averaged, training.augmentations, alike, everywhere)
         found[name] = float(loss) if len(rows) > 1 else float("nan")
     return found

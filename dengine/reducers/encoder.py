@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..errors import SettingError
-from .features import Carry, Features
+from .features import CLIP, Carry, Features
 
 TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
 FRAMES = 200  # a trace is averaged to about so many samples
@@ -126,7 +126,7 @@ class ConvEncoder(Features):
 
     @torch.jit.unused
     def thinned(self, first: int, step: int) -> tuple[Tensor, Tensor]:
-        """Taps and pool of every `step`-th place of each region: what an estimate in training needs, in less time."""
+        """Taps and pool of every `step`-th place of each region, for an estimate in less time; of (0, 1): all."""
         taps = self.taps.view(self.n_dilations, self.n_regions, -1, TAPS)[:, :, first::step]
         return taps.flatten(), _pool(self.n_regions, taps.size(2))
 
@@ -170,7 +170,7 @@ class ConvEncoder(Features):
             weight = (on_pooled.double() @ back.T).float()
             return weight, bias - weight @ self.centre
 
-        g = g if len(some) == len(raw) else torch.addcmul(self.offset, raw, self.gain).clamp_(-4.0, 4.0)  # CLIP
+        g = g if len(some) == len(raw) else torch.addcmul(self.offset, raw, self.gain).clamp_(-CLIP, CLIP)
         return torch.addmm(self.centre, g, self.basis), carried
 
 

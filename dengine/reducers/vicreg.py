@@ -215,8 +215,8 @@ class EncoderTraining:
     def held_out_loss(self, learner: _Learner) -> float:
         """Of the held-out traces, always distorted alike."""
         with torch.no_grad():
-            places = self.encoder.taps, self.encoder.pool
-            return float(learner.loss(self.held_out, self.augmentations, self._generator(-1), places))
+            everywhere = self.encoder.thinned(0, 1)
+            return float(learner.loss(self.held_out, self.augmentations, self._generator(-1), everywhere))
 
     def _generator(self, step: int) -> torch.Generator:
         # Of the step and the seed alone: a training that was stored goes on as it would have.
@@ -230,8 +230,7 @@ class EncoderTraining:
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> EncoderTraining:
         """Go on from what `get_state` gave."""
-        own = {name[5:]: value for name, value in state.items() if name.startswith("adam.")}
-        self.adam.set_state(own)
+        self.adam.set_state({name[5:]: value for name, value in state.items() if name.startswith("adam.")})
         names = self.learner.state_dict()
         self.learner.load_state_dict({name: torch.from_numpy(np.array(state[name])) for name in names})
         self.released.load_state_dict(self.learner.state_dict())
