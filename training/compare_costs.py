@@ -21,8 +21,8 @@ from joblib import Parallel, delayed
 
 from dengine import Dataset, Policy, Recipe, load_dataset, replay
 from dengine.reducers import ConvReducer
+from dengine.reducers.embedding import FeatureEmbedding
 from dengine.reducers.logistic import CrossFittedScores
-from dengine.reducers.scored import FeatureEmbedding
 
 
 class DishonestScores(CrossFittedScores):
@@ -36,8 +36,9 @@ class DishonestReducer(ConvReducer):
     """conv with such heads."""
 
     def _build(self, channels: int, samples: int) -> None:
-        features = self.make_features(channels, samples)
-        heads = DishonestScores(len(features.gain), self.folds, self.n_components)
+        super()._build(channels, samples)
+        features = self.net_.features
+        heads = DishonestScores(features.n_out, self.folds, self.n_components)
         self.net_ = FeatureEmbedding(features, heads).eval()
 
 

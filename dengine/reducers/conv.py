@@ -25,17 +25,18 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ..errors import SettingError
 from .base import Floats, Ints, StopRule, seed_of
 from .encoder import ConvEncoder, averaging, start_from
 from .features import ConvFeatures, Features
-from .kept_features import KeptFeatures
+from .kept_features import KeptFeatures, keys_of
 from .scored import FeatureReducer, in_chunks
 from .vicreg import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
-AT_ONCE = 1000  # traces that a retrain embeds anew, so that it ends in time however many references there are
+AT_ONCE = 300  # traces that a retrain embeds anew, so that it ends in time however many references there are
 HELD_OUT = 8  # one trace in so many is never trained on, by the hash of its part
 
 
@@ -136,18 +137,24 @@ class ConvReducer(FeatureReducer):
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
         """Take over what the encoder has learned since, then fit the heads; see `Reducer.train`."""
-        with torch.no_grad():
-            told = self._take_over(X)
+        self._told = ""
         points = super().train(X, y, folds, stop)
-        self.note_ = "; ".join(filter(None, (told, self.note_)))
+        self.note_ = "; ".join(filter(None, (self._told, self.note_)))
         return points
 
-    def _take_over(self, traces: Floats) -> str:
+    def _features_to_train_on(self, traces: Floats) -> Tensor:
+        if not self.kernels:
+            return super()._features_to_train_on(traces)
+        keys = keys_of(traces)
+        self._told = self._take_over(traces, keys)
+        return self.kept_.of(traces, self._computed, keys)
+
+    def _take_over(self, traces: Floats, keys: list[bytes]) -> str:
         """Let the encoder that was trained answer from now on; what is to be said of it, "" where nothing was trained.
 
         Every reference moves with it. Where there are many, some are embedded at each retrain until none is left.
         """
-        training = vars(self).get("training_")
+        training = self.training_
         if training is None:
             return ""
         if self.next_ is None and training.waits:
@@ -159,7 +166,7 @@ class ConvReducer(FeatureReducer):
         if self.next_ is None:
             return ""
         encoder, kept, said = self.next_
-        left = kept.add(traces, AT_ONCE, partial(in_chunks, encoder.raw))
+        left = kept.add(traces, keys, AT_ONCE, partial(in_chunks, encoder.raw))
         if left:
             return f"an encoder waits until {left} more traces are embedded with it, {said}"
         for own, trained in zip(self.net_.features.parameters(), encoder.parameters(), strict=True):

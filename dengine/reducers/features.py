@@ -52,9 +52,18 @@ class Features(nn.Module):
         return len(self.gain)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, P), standardised."""
+        return self.clipped(x)
+
+    def clipped(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
         f = torch.addcmul(self.offset, self.raw(x), self.gain)
-        return f.clamp(-4.0, 4.0)  # CLIP: a scripted method reads no global
+        return f.clamp_(-4.0, 4.0)  # CLIP: a scripted method reads no global
+
+    @torch.jit.unused
+    def folded(self, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights (m, n_out), biases (m,) of scores on these features -> (m, P), (m,) on the clipped ones."""
+        return weight, bias
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P), not standardised."""

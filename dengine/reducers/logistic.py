@@ -38,8 +38,11 @@ class CrossFittedScores(nn.Module):
 
     def forward(self, g: Tensor) -> Tensor:
         """(B, P) -> (B, K, d)."""
-        z = torch.sigmoid(F.linear(g, self.weight, self.bias)).mul_(self.unit)  # (B, K*d)
-        return z.view(-1, self.folds, self.dim)
+        return self.places(F.linear(g, self.weight, self.bias))
+
+    def places(self, scores: Tensor) -> Tensor:
+        """(B, K*d) -> (B, K, d)."""
+        return torch.sigmoid(scores).mul_(self.unit).view(-1, self.folds, self.dim)
 
     def carry_over(self, carry: Carry) -> None:
         """Give the scores they had, on features that are standardised anew."""

@@ -17,26 +17,13 @@ from torch import Tensor, nn
 from ..errors import SettingError
 from ..folds import content_fold
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, own_places, seed_of
+from .embedding import FeatureEmbedding
 from .features import Features
 from .kept_features import KeptFeatures
 from .logistic import CrossFittedScores
 
 MIN_TRACES = 20  # that an engine's first model is trained on
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
-
-
-class FeatureEmbedding(nn.Module):
-    """(B, C, T) raw traces -> (B, K, d): what answers in the engine, and what export saves."""
-
-    def __init__(self, features: Features, head: CrossFittedScores) -> None:
-        super().__init__()
-        self.features = features
-        self.head = head
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) float32 -> (B, K, d) float32."""
-        out: Tensor = self.head(self.features(x))
-        return out
 
 
 class FeatureReducer(Reducer):
@@ -109,11 +96,12 @@ class FeatureReducer(Reducer):
             raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
         head = self.net_.head
         with torch.no_grad():
-            g, carry = self.net_.features.standardise(self.raw_features(traces))
+            g, carry = self.net_.features.standardise(self._features_to_train_on(traces))
             head.carry_over(carry)  # a warm start begins where the last fit ended
             rows = torch.from_numpy(self._sample(len(g)))
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
             self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
+            self.net_.fold()
         self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
         self.n_fits_ += 1
         return g
@@ -121,6 +109,10 @@ class FeatureReducer(Reducer):
     def raw_features(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P), not standardised; where a kind keeps them, computed once a trace."""
         return self.kept_.of(traces, self._computed) if self.keeps_features else self._computed(torch.from_numpy(traces))
+
+    def _features_to_train_on(self, traces: Floats) -> Tensor:
+        """`raw_features`; a kind whose features are trained takes over here what they have learned."""
+        return self.raw_features(traces)
 
     def _computed(self, traces: Tensor) -> Tensor:
         return in_chunks(self.net_.features.raw, traces)
@@ -180,6 +172,7 @@ class FeatureReducer(Reducer):
         self._build(channels, samples)
         net = {name[4:]: torch.from_numpy(np.array(value)) for name, value in state.items() if name.startswith("net.")}
         self.net_.load_state_dict(net)
+        self.net_.fold()
         self.n_fits_, self.n_iter_ = int(state["n_fits"]), int(state["n_steps"])
         self._tell(state["holdout_losses"], [])
         return self
