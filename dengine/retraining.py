@@ -128,14 +128,14 @@ class Slice:
 class EncoderTime:
     """The time in which the encoder may train: so much a cycle on average, saved up and taken in slices.
 
-    per_cycle : seconds, and `MOST_SECONDS` to begin with.
+    per_cycle : seconds.
     in_steps : whether a step counts as `STEP_SECONDS`, whatever it took.
     steps : taken so far.  seconds : that they counted as.  longest : seconds by the clock of the longest slice in line.
     """
 
     def __init__(self, per_cycle: float, in_steps: bool) -> None:
         self.per_cycle, self.in_steps = per_cycle, in_steps
-        self.saved = MOST_SECONDS if per_cycle else 0.0  # a cell begins slowly: every part is verified
+        self.saved = 0.0
         self.steps, self.seconds, self.longest = 0, 0.0, 0.0
 
     def earn(self) -> None:

@@ -241,9 +241,6 @@ def test_an_encoder_of_no_traces_and_of_one_trains_nothing() -> None:
 
 def test_time_is_saved_up_cycle_by_cycle_and_taken_in_slices() -> None:
     time = EncoderTime(0.01, in_steps=True)
-    assert time.saved == 2.0  # a cell begins slowly
-    time.spend(round(2.0 / STEP_SECONDS), seconds=99.0)
-    time.seconds = 0.0
     assert time.take(0.2, 0.2) is None
     for _ in range(20):
         time.earn()
@@ -313,8 +310,8 @@ def test_an_encoder_that_fails_at_training_costs_no_decision(monkeypatch, caplog
 
 
 def test_where_there_are_many_references_an_encoder_waits_until_all_are_embedded_with_it(monkeypatch) -> None:
-    monkeypatch.setattr("dengine.reducers.conv.AT_ONCE", 70)
     reducer, X, y = fitted()
+    monkeypatch.setattr("dengine.reducers.conv.AT_ONCE", 70 * reducer.net_.features.n_places)
     kernel = reducer.net_.features.kernel.clone()
     improved(reducer, X, 4)
     for left in (90, 20):

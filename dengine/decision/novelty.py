@@ -78,7 +78,8 @@ class NoveltyGate(nn.Module):
     def features(self, x: Tensor) -> Tensor:
         """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of roughness."""
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
-        rough = torch.linalg.vector_norm(torch.diff(pieces), dim=-1)  # the steps from sample to sample
+        steps = torch.diff(x).unfold(-1, self.length - 1, self.stride)  # from sample to sample, (..., C, S, L - 1)
+        rough = torch.linalg.vector_norm(steps, dim=-1)
         lowest, highest = torch.aminmax(pieces, dim=-1)
         return torch.cat([lowest, highest, rough.add_(self.quiet).log_()], -1).flatten(-2)
 

@@ -36,7 +36,7 @@ from .scored import FeatureReducer, in_chunks
 from .vicreg import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
-AT_ONCE = 300  # traces that a retrain embeds anew, so that it ends in time however many references there are
+AT_ONCE = 60_000  # places of traces that a retrain looks at anew, so that it ends in time however many references there are
 HELD_OUT = 8  # one trace in so many is never trained on, by the hash of its part
 
 
@@ -166,7 +166,7 @@ class ConvReducer(FeatureReducer):
         if self.next_ is None:
             return ""
         encoder, kept, said = self.next_
-        left = kept.add(traces, keys, AT_ONCE, partial(in_chunks, encoder.raw))
+        left = kept.add(traces, keys, max(1, AT_ONCE // encoder.n_places), partial(in_chunks, encoder.raw))
         if left:
             return f"an encoder waits until {left} more traces are embedded with it, {said}"
         for own, trained in zip(self.net_.features.parameters(), encoder.parameters(), strict=True):

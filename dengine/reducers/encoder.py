@@ -31,7 +31,7 @@ from .features import CLIP, Carry, Features
 TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
 FRAMES = 200  # a trace is averaged to about so many samples
 KEPT = 0.8  # share of the traces' variance that averaging must leave, or less is averaged
-PLACES = 198  # of each kernel and dilation: on traces that oscillate half of them are certain of less
+PLACES = 600  # of each kernel and dilation, at most; else one at each frame: on traces that oscillate fewer say less
 WHOLE = 2.0  # weight of the mean over the whole trace beside that over a region: where it does not matter when
 RAMP = 2.0  # deviations of a kernel's output from 0 to 1
 SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
@@ -63,13 +63,13 @@ class ConvEncoder(Features):
         if samples < 2:
             raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         frames = samples // average
-        places = PLACES // regions * regions
+        places = max(1, min(frames, PLACES) // regions) * regions
         taps = _taps(frames, dilations, places)
         n_pooled = len(taps) * regions * kernels
         super().__init__(channels, n_pooled)
         self.average, self.frames = average, frames
         self.head = samples - frames * average  # left out at the start: the end of an insertion tells most
-        self.n_dilations, self.n_regions, self.n_kernels = len(taps), regions, kernels
+        self.n_dilations, self.n_regions, self.n_kernels, self.n_places = len(taps), regions, kernels, places
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
         self.register_buffer("pool", _pool(regions, places // regions))
         # Trained by a copy of this module (`vicreg.py`); the one that answers takes the values over.

@@ -29,7 +29,7 @@ from .base import StopRule
 from .encoder import ConvEncoder
 
 BATCH = 64
-THIN = 6  # one in so many places of a kernel is looked at in a step, others in the next
+PLACES = 33  # of a kernel, about, are looked at in a step, others in the next
 PROJECTED = 128  # dimensions of the projector
 RATE = 1e-3  # of Adam
 KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
@@ -174,12 +174,12 @@ class EncoderTraining:
             return 0
         with torch.no_grad():
             averaged, self.held_out = self.encoder.averaged(traces), self.encoder.averaged(held_out)
-        step = 0
+        step, thin = 0, max(1, self.encoder.n_places // PLACES)
         while not stop.exhausted(step):
             g = self._generator(self.steps)
             drawn = torch.randperm(len(averaged), generator=g)[:BATCH]
-            thinned = self.encoder.thinned(self.steps % THIN, THIN)
-            loss = self.learner.loss(averaged[drawn], self.augmentations, g, thinned)
+            places = self.encoder.thinned(self.steps % thin, thin)
+            loss = self.learner.loss(averaged[drawn], self.augmentations, g, places)
             loss.backward()  # type: ignore[no-untyped-call]  # torch's own
             self.adam.step()
             step, self.steps = step + 1, self.steps + 1
