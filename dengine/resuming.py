@@ -14,6 +14,8 @@ from .retraining import Window
 from .store.base import Store
 from .store.records import Labelled, ModelVersion
 
+MANY = 500  # labels and no retrain yet: they were imported
+
 
 @dataclass(frozen=True)
 class Resumed:
@@ -30,10 +32,13 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     window.extend(labelled)
     version = store.last_version()
     if version is None:
+        if len(labelled.seq) >= MANY:
+            template.look_ahead_safely(labelled.traces)
         _tell(template, store, 0)
         return Resumed(None, 0, len(labelled.seq))
     model = _restored(store, template, version.state, window.newest_seq)
     model.prepare_safely(template)
+    model.look_ahead_safely(labelled.traces)
     trained_to = int(version.state["trained_on"][-1])
     # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
     known_to = version.last_seq if "points" in version.state else trained_to

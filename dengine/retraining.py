@@ -110,7 +110,7 @@ class Limits:
 
     budget: float | None = None
     max_steps: int | None = None
-    reserve: float = 0.25
+    reserve: float = 0.3
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import ConvReducer, DataEngine, Recipe
+from dengine import ConvReducer, DataEngine, Dataset, Recipe
 from dengine.decision.rule import script
 from dengine.folds import content_fold, content_hash
+from dengine.importing import import_labelled
 from dengine.reducers.adam import Adam
 from dengine.reducers.base import StopRule
 from dengine.reducers.encoder import ConvEncoder, averaging
@@ -296,6 +297,22 @@ def test_a_reopened_engine_answers_the_same_and_goes_on_training(tmp_path) -> No
         assert [again.decide(x).lower for x in X] == asked
         kept = again.model.spaces.training_.steps
         assert 0 < kept <= steps  # what was trained since the last version was not stored
+
+
+@pytest.mark.parametrize("retrained_before", [True, False])
+def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path, monkeypatch, retrained_before) -> None:
+    url, (X, y) = str(tmp_path / "cell.sqlite"), resonances(120 if retrained_before else 520)
+    if retrained_before:
+        engine_after(len(X), store=url, replaying=True).close()
+    else:
+        import_labelled(url, Dataset(X[:, 0], y), Recipe("conv", params=SMALL, radius=0.05))
+
+    def too_late(*_: object) -> torch.Tensor:
+        raise AssertionError("computed in the retrain")
+
+    with DataEngine.open(url, replaying=True) as engine:
+        monkeypatch.setattr(ConvReducer, "_computed", too_late)
+        assert engine.retrain().accepted
 
 
 def test_an_encoder_that_fails_at_training_costs_no_decision(monkeypatch, caplog) -> None:

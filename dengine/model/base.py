@@ -118,6 +118,10 @@ class EngineModel(ABC):
         """Train what reads no label further, apart from what answers; see `Reducer.improve`."""
         return 0
 
+    def look_ahead(self, X: NDArray[np.float32]) -> int:
+        """Begin with a training on traces (n, C, T) as far as no label is read; see `Reducer.look_ahead`."""
+        return 0
+
     @abstractmethod
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
@@ -178,7 +182,7 @@ class EngineModel(ABC):
         """What an exporter starts from; ExportError where there is nothing that can be exported."""
         raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
 
-    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
+    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these six.
 
     def improve_safely(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
         """`improve`; one that fails at it goes on with what it has."""
@@ -187,6 +191,13 @@ class EngineModel(ABC):
         except Exception:
             log.exception("the encoder cannot be trained further; it goes on as it is")
             return 0
+
+    def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
+        """`look_ahead`; what fails at it will say so when it is trained."""
+        try:
+            self.look_ahead(X)
+        except Exception:
+            log.exception("the traces of the store could not be looked at ahead of a retrain")
 
     def tell_safely(self, told: Told) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""

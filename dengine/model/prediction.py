@@ -147,6 +147,9 @@ class ModelPrediction(EngineModel):
         """Train the reducer's encoder further, apart from what answers."""
         return self.spaces.improve(as_traces(X), hashes, stop)
 
+    def look_ahead(self, X: NDArray[np.float32]) -> int:
+        return self.spaces.look_ahead(X)
+
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
         if isinstance(previous, ModelPrediction):

@@ -110,6 +110,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         return 0
 
+    def look_ahead(self, X: Floats) -> int:
+        """Do now what `train` on traces X (n, C, T) would begin with, as far as no label is read; of how many traces."""
+        return 0
+
     def embed(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, K, d) float32, every trace in every space."""
         return as_points(self.transform(X))[:, None, :]

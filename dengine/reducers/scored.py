@@ -83,6 +83,16 @@ class FeatureReducer(Reducer):
         with torch.inference_mode():
             return own_places(in_chunks(self.net_.head, g).numpy(), folds)
 
+    def look_ahead(self, X: Floats) -> int:
+        """Compute the features of traces that a store brings: in the first retrain it would take too long."""
+        if not self.keeps_features or len(X) < MIN_TRACES:
+            return 0
+        if "net_" not in vars(self):
+            self.check()
+            self._start(self.check_traces(X, reset=True))
+        with torch.no_grad():
+            return len(self.raw_features(self.check_traces(X)))
+
     def _start(self, traces: Floats) -> None:
         """Learn what stays where it is from now on: the scales of the channels and the filters. No label is read."""
         self._build(*self.trace_shape_)
