@@ -298,3 +298,12 @@ def test_features_standardised_anew_leave_the_scores_of_a_warm_start_where_they_
         head.carry_over(carry)
         reducer.net_.fold()
     assert np.abs(reducer.embed(X)[..., 0] - before[..., 0]).max() < 0.02  # but for what is clipped
+
+
+@pytest.mark.parametrize("kernels", [0, 28])
+def test_what_answers_is_the_features_and_then_the_heads(kernels: int) -> None:
+    X, y = traces(100)
+    reducer = ConvReducer(folds=3, kernels=kernels).fit(X, y)
+    with torch.no_grad():
+        apart = reducer.net_.head(reducer.net_.features(torch.from_numpy(X[:, None] if X.ndim == 2 else X)))
+    np.testing.assert_allclose(reducer.embed(X), apart, atol=2e-6)
