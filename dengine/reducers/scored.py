@@ -23,6 +23,7 @@ from .kept_features import KeptFeatures
 from .logistic import CrossFittedScores
 
 MIN_TRACES = 20  # that an engine's first model is trained on
+FIRST_STEPS = 3  # of the heads, however late: without any, a first model would hold all parts for alike
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
 
 
@@ -110,6 +111,8 @@ class FeatureReducer(Reducer):
             head.carry_over(carry)  # a warm start begins where the last fit ended
             rows = torch.from_numpy(self._sample(len(g)))
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
+            if stop is not None and not self.n_fits_:
+                stop.least = FIRST_STEPS
             self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
             self.net_.fold()
         self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
