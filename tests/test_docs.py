@@ -23,6 +23,7 @@ REPO = Path(__file__).resolve().parents[1]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
 
 ONE_REPLAY = "--seeds 100:101 --cycles 60 --policies 0.2:0.8 --n-jobs 1"
+SMALL = "--data small.npz --samples 100"
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
     "dengine replay --data screw_driving.npz": "--cycles 60",
@@ -44,7 +45,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/check_noise.py": "--data screw_driving.npz --samples 100 --seeds 100:101",
     "python training/show_scenarios.py": "--cycles 12 --n-jobs 1",
     "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
-    "python training/compare_ablations.py": "--data small.npz --samples 100 --only length --seeds 100:101 --cycles 60 --n-jobs 1",
+    "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
     "cmake -S tests/cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0",  # test_cpp.py builds it as it is meant
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
