@@ -39,21 +39,19 @@ class StopRule:
     deadline : reading of `clock` after which no step may begin; None: time decides nothing, so that a seed repeats exactly.
     max_steps : steps at most; None: no limit.
     asked_at : reading of `clock` when last asked; after the fit, the end of its last step.
-    least : steps that may begin after the deadline too.
     """
 
     deadline: float | None = None
     max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
     asked_at: float | None = None
-    least: int = 0
 
-    def exhausted(self, step: int) -> bool:
-        """Whether step number `step`, from 0, may no longer begin."""
+    def exhausted(self, step: int, least: int = 0) -> bool:
+        """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
         self.asked_at = self.clock()
         if self.max_steps is not None and step >= self.max_steps:
             return True
-        return self.deadline is not None and step >= self.least and self.asked_at >= self.deadline
+        return self.deadline is not None and step >= least and self.asked_at >= self.deadline
 
 
 @dataclass(frozen=True, slots=True)

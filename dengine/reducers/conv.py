@@ -166,7 +166,7 @@ class ConvReducer(FeatureReducer):
         if self.next_ is None:
             return ""
         encoder, kept, said = self.next_
-        left = kept.add(traces, keys, max(1, AT_ONCE // encoder.n_places), partial(in_chunks, encoder.raw))
+        left = kept.add(traces, keys, AT_ONCE // encoder.n_places, partial(in_chunks, encoder.raw))
         if left:
             return f"an encoder waits until {left} more traces are embedded with it, {said}"
         for own, trained in zip(self.net_.features.parameters(), encoder.parameters(), strict=True):

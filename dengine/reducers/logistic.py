@@ -50,8 +50,10 @@ class CrossFittedScores(nn.Module):
         self.weight.copy_(weight)
         self.bias.copy_(bias)
 
-    def train_on(self, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: StopRule | None) -> int:
-        """At most `max_iter` Newton steps from the present weights; returns how many.
+    def train_on(
+        self, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: StopRule | None, least: int = 0
+    ) -> int:
+        """At most `max_iter` Newton steps from the present weights, the first `least` however late; returns how many.
 
         Sets `losses` (K,), each head's leave-one-out log loss. A head that says held-out labels worse than their base rate
         does, and worse than its earlier weights, keeps those (`kept` names it): its own gate, outside fold k, since a
@@ -59,7 +61,7 @@ class CrossFittedScores(nn.Module):
         """
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
         heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
-        steps = _interleave(heads, max_iter, stop)
+        steps = _interleave(heads, max_iter, stop, least)
         for k, head in enumerate(heads):
             self.losses[k] = head.leave_one_out_loss()
             self.kept[k] = bool(self.losses[k] > max(head.first_loss, head.base_rate_loss()))
@@ -134,11 +136,11 @@ class _NewtonHead:
         return float(F.binary_cross_entropy_with_logits(left_out, self.y))
 
 
-def _interleave(heads: Sequence[_NewtonHead], max_iter: int, stop: StopRule | None) -> int:
+def _interleave(heads: Sequence[_NewtonHead], max_iter: int, stop: StopRule | None, least: int) -> int:
     """A step of every head in turn, so that a deadline finds them all equally far."""
     step = 0
     while step < max_iter and not all(h.done for h in heads):
-        if stop is not None and stop.exhausted(step):
+        if stop is not None and stop.exhausted(step, least):
             break
         for head in heads:
             if not head.done:

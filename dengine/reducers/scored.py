@@ -77,10 +77,7 @@ class FeatureReducer(Reducer):
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
         if len(X) < MIN_TRACES:
             raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
-        if "net_" not in vars(self):
-            self.check()
-            self._start(self.check_traces(X, reset=True))
-        g = self._fit_heads(self.check_traces(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
+        g = self._fit_heads(self._begun(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
         with torch.inference_mode():
             return own_places(in_chunks(self.net_.head, g).numpy(), folds)
 
@@ -88,11 +85,15 @@ class FeatureReducer(Reducer):
         """Compute the features of traces that a store brings: in the first retrain it would take too long."""
         if not self.keeps_features or len(X) < MIN_TRACES:
             return 0
+        with torch.no_grad():
+            return len(self.raw_features(self._begun(X)))
+
+    def _begun(self, X: Floats) -> Floats:
+        """The traces, checked, once there are features for them: the first ones that come set these."""
         if "net_" not in vars(self):
             self.check()
             self._start(self.check_traces(X, reset=True))
-        with torch.no_grad():
-            return len(self.raw_features(self.check_traces(X)))
+        return self.check_traces(X)
 
     def _start(self, traces: Floats) -> None:
         """Learn what stays where it is from now on: the scales of the channels and the filters. No label is read."""
@@ -111,9 +112,8 @@ class FeatureReducer(Reducer):
             head.carry_over(carry)  # a warm start begins where the last fit ended
             rows = torch.from_numpy(self._sample(len(g)))
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
-            if stop is not None and not self.n_fits_:
-                stop.least = FIRST_STEPS
-            self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop)
+            least = 0 if self.n_fits_ else FIRST_STEPS
+            self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop, least)
             self.net_.fold()
         self._tell(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
         self.n_fits_ += 1

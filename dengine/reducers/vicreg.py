@@ -29,7 +29,7 @@ from .base import StopRule
 from .encoder import ConvEncoder
 
 BATCH = 64
-PLACES = 33  # of a kernel, about, are looked at in a step, others in the next
+LOOKED_AT = 33  # places of a kernel, about, in a step; others in the next
 PROJECTED = 128  # dimensions of the projector
 RATE = 1e-3  # of Adam
 KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
@@ -174,7 +174,7 @@ class EncoderTraining:
             return 0
         with torch.no_grad():
             averaged, self.held_out = self.encoder.averaged(traces), self.encoder.averaged(held_out)
-        step, thin = 0, max(1, self.encoder.n_places // PLACES)
+        step, thin = 0, max(1, self.encoder.n_places // LOOKED_AT)
         while not stop.exhausted(step):
             g = self._generator(self.steps)
             drawn = torch.randperm(len(averaged), generator=g)[:BATCH]
