@@ -37,11 +37,16 @@ class DecisionMaker:
         """Set the contract that the gate checks."""
         self._gate = script(TraceGate(trace))
 
-    def decide(self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int) -> DecidedTrace:
-        """(C, T) of a part with this number -> what goes into the store."""
+    def decide(
+        self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int, away: bool = False
+    ) -> DecidedTrace:
+        """(C, T) of a part with this number -> what goes into the store; away : the store cannot be written."""
         fault, content = self._gate(torch.from_numpy(x))
         hash_ = own_hash(content, part)
-        prediction = replace(NOTHING_KNOWN, reason=REASONS[fault]) if fault else _predict(x, hash_, model)
+        if fault or away:
+            prediction = replace(NOTHING_KNOWN, reason=REASONS[fault] if fault else Reason.NO_STORE)
+        else:
+            prediction = _predict(x, hash_, model)
         decision = self._record(prediction, part, content, version)
         return DecidedTrace(decision, x, hash_, bool(fault), 0.0, part)
 

@@ -7,10 +7,13 @@ for cycle in engine.run(cell, cycles=1503):
 
 from __future__ import annotations
 
+import logging
 import os
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Self
 
@@ -20,27 +23,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
 from .deciding import DecisionMaker, as_part
-from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
 from .errors import StoreError
 from .feedback import Feedback, unknown_stop
+from .interrupts import uninterrupted
+from .keeping import CLOSE, Keeper
 from .loop import drive
-from .model.base import EngineModel, Exportable, Model
+from .model.base import EngineModel, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
 from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
+from .standing import EngineStanding
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .traces import as_trace, spec_of
 from .versions import ModelVersions
 
+log = logging.getLogger("dengine")
 OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
 OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine:
+class DataEngine(EngineStanding):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -88,7 +94,8 @@ class DataEngine:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
             self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
-            self.store.save_settings(self._settings.to_store())
+            with self._closed_on_failure():
+                self.store.save_settings(self._settings.to_store())
 
     def _start(
         self,
@@ -99,17 +106,29 @@ class DataEngine:
         replaying: bool = False,
         clock: Clock = time.perf_counter,
         on_safe_mode: OnSafeMode = None,
+        reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
-        self._versions = ModelVersions(template, retrainer, store, clock)
-        self._feedback = Feedback(store, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
+        self._keeper = Keeper(store, owning=not reading, patient=replaying)
+        weakref.finalize(self, self._keeper.close)  # of a program that forgot to
+        self._versions = ModelVersions(template, retrainer, self._keeper, clock)
+        self._feedback = Feedback(self._keeper, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
         self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
         self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
+        self._settings_waiting = False
         if settings.trace is not None:
             self._maker.agree_on(settings.trace)
+
+    @contextmanager
+    def _closed_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._keeper.close()
+            raise
 
     @classmethod
     def from_recipe(cls, recipe: Recipe | str | os.PathLike[str], store: Any = None, **options: Any) -> Self:
@@ -122,16 +141,19 @@ class DataEngine:
 
         (Of a part that a stop reached too late, the first engine keeps its success too until its next retrain.)
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
-        options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them.
-        Raises StoreError where there is nothing to go on with, SettingError where an object is missing.
+        options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them; reading=True looks at a
+            store that another engine may own, to export it for one, and neither decides nor learns.
+        Raises StoreError where there is nothing to go on with or another engine owns the cell, SettingError where an object
+        is missing.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True) as store:
             name = "the store" if isinstance(url, Store) else str(url)
             settings = EngineSettings.from_store(store.settings(), name, reducer, model)
             engine._start(*settings.with_template(model), store, **options)
-            engine._versions.resume()
-            engine._feedback.resume()
+            with engine._closed_on_failure():
+                engine._versions.resume()
+                engine._feedback.resume()
         engine.resumed = True
         return engine
 
@@ -147,33 +169,39 @@ class DataEngine:
                 return cls(store=opened, seed=seed or 0, **settings)
             options = {name: settings.pop(name) for name in OPTIONS if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
-            engine._settings.must_agree_with(settings | {"seed": seed})
+            with engine._closed_on_failure():
+                engine._settings.must_agree_with(settings | {"seed": seed})
             return engine
 
     def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
-        TraceError for a wrong shape; whatever else fails becomes VERIFY.
+        TraceError for a wrong shape; whatever else fails becomes VERIFY, a store that is away too.
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
-        self._versions.collect()
-        self.encoder_time.earn()
-        x, number = self._as_trace(trace), as_part(part)
-        self._feedback.settle()
-        item = self._put(self._maker.decide(x, number, self._versions.answering, self.version))
-        if wait:
-            self.store.flush()
+        self._keeper.check()
+        with uninterrupted():
+            self._versions.collect()
+            self.encoder_time.earn()
+            x, number = self._as_trace(trace), as_part(part)
+            self._feedback.settle()
+            away = bool(self._keeper.away)
+            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, away))
+            if wait:
+                self._keeper.flush()
         return item.decision
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_trace(trace, self.trace)
         if self.trace is None:
             self.agree_on(spec_of(x, trace))
+        elif self._settings_waiting:
+            self._save_settings()
         return x
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:
-        self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
+        self._keeper.decided(item)
         self._feedback.decided(item)
         return item
 
@@ -185,12 +213,14 @@ class DataEngine:
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
         Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or a
-        report on a rejected part.
+        report on a rejected part; StoreError where neither the store nor its journal can be written: nothing was taken.
         """
-        self._versions.collect()
-        known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace, part)
-        self._feedback.report(known, bool(success))
-        return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
+        self._keeper.check()
+        with uninterrupted():
+            self._versions.collect()
+            known = self._keeper.find(decision_id) or self._lost_stop(decision_id, success, trace, part)
+            self._feedback.report(known, bool(success))
+            return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
         if trace is None or success:
@@ -199,13 +229,10 @@ class DataEngine:
         return stored_decision(self._put(item))
 
     def retrain(self) -> RetrainReport:
-        """Retrain now, in line; a candidate that fails its gate is dropped and recorded."""
-        return self._versions.retrain()
-
-    @property
-    def retraining(self) -> bool:
-        """Whether a retrain is under way in the executor, or waits to be swapped in."""
-        return self._versions.retrainer.busy
+        """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
+        self._keeper.check()
+        with uninterrupted():
+            return self._versions.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
         """Retrain in the executor while the cell goes on; without one in line, as `retrain`, which returns its report."""
@@ -217,70 +244,20 @@ class DataEngine:
 
     def settle(self) -> RetrainReport | None:
         """Do what need not wait for a report, a retrain or a slice of training; returns the newest retrain, once."""
-        self._versions.work(self.recipe.retrain_every)
-        return self._versions.take_news()
-
-    def flush(self) -> None:
-        """Return when all that is known so far is on the disk."""
-        self._feedback.store_waiting()
-        self.store.flush()
-
-    @property
-    def encoder_time(self) -> EncoderTime:
-        """What the encoder's training took so far."""
-        return self._versions.retrainer.encoder_time
-
-    @property
-    def recipe(self) -> Recipe:
-        """Every setting as it is in force; fixed once the engine is made."""
-        return self._settings.recipe
-
-    @property
-    def policy(self) -> Policy:
-        """The user's numbers as they are in force; for others make another engine."""
-        return self._settings.recipe.policy
-
-    @property
-    def trace(self) -> TraceSpec | None:
-        """The traces' contract; None before the first trace."""
-        return self._settings.trace
-
-    @property
-    def model(self) -> Any:
-        """The model that answers, a rival as its author knows it; None before the first retrain."""
-        return None if self._versions.answering is None else self._versions.answering.user_model
-
-    @property
-    def version(self) -> int:
-        """Of the model that answers; 0 before the first retrain."""
-        return self._versions.version
-
-    @property
-    def safe_mode(self) -> str:
-        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
-        return self._feedback.safe_mode
-
-    def certificate(self) -> Certificate:
-        """What can be said by now, at level 1 - alpha, of the parts that were decided without a check."""
-        self.flush()
-        return certificate_of(self.store.outcomes(), self.policy)
-
-    @property
-    def new_labels(self) -> int:
-        """Labels since the last retrain began."""
-        return self._versions.new_labels
-
-    def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
-        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
-        coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
-        return replace(own, model_version=self.version, recipe=self.recipe.to_toml(), **coin)
+        with uninterrupted():
+            self._versions.work(self.recipe.retrain_every)
+            return self._versions.take_news()
 
     def close(self) -> None:
-        """Finish a retrain under way, write everything, and let the store go."""
-        self._feedback.store_waiting()
-        self._versions.collect(wait=True)
-        self.store.close()
+        """Finish a retrain under way, within seconds, write everything, and let the store go; a second time does nothing.
+
+        StoreError where something is left that neither the store nor its journal takes; close again when there is room.
+        """
+        with uninterrupted():
+            if self._keeper.usable:
+                self._feedback.store_waiting()
+                self._versions.collect(CLOSE)
+            self._keeper.close()
 
     def __enter__(self) -> Self:
         return self
@@ -293,5 +270,14 @@ class DataEngine:
         if self.trace is None:
             self._settings = replace(self._settings, trace=trace)
             self._maker.agree_on(trace)
-            self.store.save_settings(self._settings.to_store())
+            self._save_settings()
         return self._settings.trace or trace
+
+    def _save_settings(self) -> None:
+        """Store the settings, or do it before the next decision, if the store is away."""
+        try:
+            self._keeper.ask(lambda: self.store.save_settings(self._settings.to_store()))
+            self._settings_waiting = False
+        except StoreError:
+            self._settings_waiting = True
+            log.exception("the settings are stored later")

@@ -12,9 +12,9 @@ import logging
 from collections.abc import Callable
 
 from .deciding import source_of
-from .errors import ReportError
+from .errors import ReportError, StoreError
+from .keeping import Keeper
 from .records import Action, Source
-from .store.base import Store
 from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
 from .versions import ModelVersions, Point
 
@@ -30,25 +30,28 @@ class Feedback:
     """
 
     def __init__(
-        self, store: Store, versions: ModelVersions, stops_all: bool, on_safe_mode: Callable[[str], object] | None = None
+        self, keeper: Keeper, versions: ModelVersions, stops_all: bool, on_safe_mode: Callable[[str], object] | None = None
     ) -> None:
-        self.store, self.versions, self.stops_all = store, versions, stops_all
+        self.keeper, self.versions, self.stops_all = keeper, versions, stops_all
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
         self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
+        self._in_journal: dict[str, tuple[StoredDecision, bool]] = {}  # labels without a number yet
         self._silent = 0
         self._mode = ""
-        versions.store_waiting = self.store_waiting
+        self._untrue = False  # whether the rule was told what did not happen
+        versions.store_waiting = self.store_all
 
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.safe_mode
-        ids = self.store.unreported_accepts()
+        store = self.keeper.store
+        ids = store.unreported_accepts()
         if not self.stops_all:
-            self._silent = len(ids) - self.store.silent_total()
+            self._silent = len(ids) - store.silent_total()
             return
         for id_ in ids:
-            known = self.store.get_decision(id_)
+            known = store.get_decision(id_)
             if known is not None:
                 self._went_on[id_] = known
 
@@ -59,6 +62,7 @@ class Feedback:
 
     def settle(self) -> None:
         """The next trace comes: accepted parts of which nothing was heard went on."""
+        self.arrive()
         if not self._went_on:
             return
         while self._went_on:
@@ -70,7 +74,10 @@ class Feedback:
             else:
                 self._silent += 1
         if len(self._waiting) >= BATCH:
-            self.store_waiting()
+            try:
+                self.store_waiting()
+            except StoreError:  # they still wait, in memory; no decision fails for it
+                log.exception("confirmed parts could not be stored")
         self._announce()
 
     def decided(self, item: DecidedTrace) -> None:
@@ -86,7 +93,7 @@ class Feedback:
         try:
             self.store_waiting()
             label, point = self._label(known, success, source, int(self._was_silent(known)))
-            (seq,) = self.store.put_labels([label])
+            (seq,) = self.keeper.labels([label])
         except Exception:
             self._waiting += late  # nothing was stored: it still waits as it did
             raise
@@ -94,20 +101,48 @@ class Feedback:
         if known.quarantined:
             return
         self._learn(known, label, point)
-        self.versions.keep(known, success, int(seq))
+        self._keep(known, success, int(seq))
         if late:  # its success stays among the references until the next retrain
             self.versions.new_labels -= 1
-            self.versions.tell_anew()
+            self._untrue = True
+        self.arrive()
         self._announce()
+
+    def arrive(self) -> None:
+        """Do what had to wait for the store: labels that it has taken by now train, and the rule is told the truth."""
+        for id_, seq in self.keeper.arrived():
+            known, success = self._in_journal.pop(id_, (None, False))
+            if known is not None:
+                self.versions.keep(known, success, seq)
+        if self._untrue and not self.keeper.fault:
+            try:
+                self.versions.tell_anew()
+                self._untrue = False
+            except StoreError:
+                log.exception("the rule is told anew when the store is back")
+
+    def _keep(self, known: StoredDecision, success: bool, seq: int) -> None:
+        """Give a label to the next retrain, once it has its number."""
+        if seq:
+            self.versions.keep(known, success, seq)
+        else:
+            self._in_journal[known.id] = known, success
 
     def store_waiting(self) -> None:
         """Commit the labels of confirmed parts, and give them to the next retrain."""
         if not self._waiting:
             return
-        seqs = self.store.put_labels([label for _, label in self._waiting])
+        seqs = self.keeper.labels([label for _, label in self._waiting])
         waiting, self._waiting = self._waiting, []
         for (known, _), seq in zip(waiting, seqs, strict=True):
-            self.versions.keep(known, True, int(seq))
+            self._keep(known, True, int(seq))
+
+    def store_all(self) -> None:
+        """Have every label in the store; StoreError while some wait in its journal."""
+        self.store_waiting()
+        self.arrive()
+        if self._in_journal:
+            raise StoreError(f"{len(self._in_journal)} labels wait in the journal until the store is back.")
 
     def _was_silent(self, known: StoredDecision) -> bool:
         """Whether an accepted part was counted among the silent ones before its label came."""
@@ -130,7 +165,7 @@ class Feedback:
             return
         self._mode = now
         try:
-            self.store.put_event("safe mode", now or "ended: fresh evidence keeps the tolerance")
+            self.keeper.event("safe mode", now or "ended: fresh evidence keeps the tolerance")
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
         except Exception:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .model.base import EngineModel, Told
 from .retraining import Window
 from .store.base import Store
-from .store.records import Labelled, ModelVersion
+from .store.records import Evidence, Labelled, ModelVersion
 
 MANY = 500  # labels and no retrain yet: they were imported
 
@@ -34,7 +34,7 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     if version is None:
         if len(labelled.seq) >= MANY:
             template.look_ahead_safely(labelled.traces)
-        _tell(template, store, 0)
+        _tell(template, store.evidence_since(0))
         return Resumed(None, 0, len(labelled.seq))
     model = _restored(store, template, version.state, window.newest_seq)
     model.prepare_safely(template)
@@ -43,7 +43,7 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
     known_to = version.last_seq if "points" in version.state else trained_to
     _add_since(model, store, version, labelled, known_to)
-    _tell(model, store, 0 if "untold" in version.state else version.last_seq)
+    _tell(model, store.evidence_since(0 if "untold" in version.state else version.last_seq))
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
@@ -67,13 +67,12 @@ def _add_since(model: EngineModel, store: Store, version: ModelVersion, labelled
         model.add_safely(point, int(labelled.labels[i]), hash_)
 
 
-def tell_all(model: EngineModel, store: Store) -> None:
-    """Let a model's rule forget, and tell it all that the store knows."""
+def tell_all(model: EngineModel, known: Evidence) -> None:
+    """Let a model's rule forget, and tell it all that is known."""
     model.forget()
-    _tell(model, store, 0)
+    _tell(model, known)
 
 
-def _tell(model: EngineModel, store: Store, last_seq: int) -> None:
-    known = store.evidence_since(last_seq)
+def _tell(model: EngineModel, known: Evidence) -> None:
     for row in zip(known.lower, known.upper, known.success, known.novel, known.silent, strict=True):
         model.tell_safely(Told(float(row[0]), float(row[1]), bool(row[2]), bool(row[3]), int(row[4])))

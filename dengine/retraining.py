@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from .errors import DengineError, SettingError
 from .model.base import EngineModel
+from .pending import Pending
 from .reducers.base import StopRule
 from .store.records import Labelled
 
 log = logging.getLogger("dengine")
 SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
 MARGIN = 1.2  # the tail grows a little with each retrain
-STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
 SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
+STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
 MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
 DRAWN = 1024  # traces that a slice trains on
 
@@ -164,7 +165,7 @@ class Candidate:
     """The outcome of a training.
 
     model : to swap in; None: dropped.  reason : why, in words.
-    seconds : of the whole.  tail : of what followed the reducer's last step, the next retrain's reserve.
+    seconds : of the whole.  tail : of what followed the last step, the next retrain's reserve.
     encoder_steps, encoder_seconds : that the encoder trained before, beside the cell.
     """
 
@@ -206,7 +207,7 @@ class Retrainer:
         self.limits = limits
         self.executor = executor
         self.clock = clock
-        self._pending: tuple[Future[Candidate], NDArray[np.int64]] | None = None
+        self._pending: Pending[Candidate] | None = None
 
     @property
     def busy(self) -> bool:
@@ -230,26 +231,29 @@ class Retrainer:
         candidate = train_candidate(current.successor(), data, self.limits, self.clock)
         return self._note(Trained(candidate, data.seq, begin))
 
-    def start(self, current: EngineModel) -> None:
-        """Train a successor of the current model beside the cell."""
+    def start(self, current: EngineModel) -> bool:
+        """Train a successor of the current model beside the cell; False where the executor takes no more work."""
         assert self.executor is not None  # the caller asked; for the type checker
-        data = self.window.snapshot()
-        piece = self.encoder_time.take()
-        future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
-        self._pending = (future, data.seq)
+        data, piece = self.window.snapshot(), self.encoder_time.take()
+        work = (current.successor(), data, self.limits, self.clock, piece)
+        self._pending = Pending.submit(self.executor, _train_beside, work, data.seq)
+        self.executor = self.executor if self.busy else None
+        return self.busy
 
-    def collect(self, wait: bool = False) -> Trained | None:
-        """What was trained beside the cell, once it is done; its time without the time that it waited for the cell."""
-        if self._pending is None or not (wait or self._pending[0].done()):
+    def collect(self, wait: float = 0.0) -> Trained | None:
+        """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
+        pending = self._pending
+        if pending is None or not pending.due(wait):
             return None
-        (future, seq), self._pending = self._pending, None
+        self._pending = None
         try:
-            candidate = future.result()
-        except Exception as error:  # the worker died: recorded, and the old version goes on answering
+            candidate = pending.result(wait)
+        except Exception as error:  # recorded, and the old version goes on answering
             log.exception("a retrain in the executor failed")
             candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
+            self.executor = None if pending.gave_up else self.executor
         self.encoder_time.spend(candidate.encoder_steps, candidate.encoder_seconds)
-        return self._note(Trained(candidate, seq, self.clock() - candidate.seconds))
+        return self._note(Trained(candidate, pending.seq, self.clock() - candidate.seconds))
 
     def _note(self, trained: Trained) -> Trained:
         if trained.candidate.model is not None:

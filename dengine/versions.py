@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .errors import StoreError
+from .keeping import Keeper
 from .model.base import EngineModel, Told
+from .pending import HUNG
 from .records import Reason, RetrainReport
 from .resuming import resume, tell_all
 from .retraining import Retrainer, Trained
-from .store.base import Store
 from .store.records import StoredDecision
+
+log = logging.getLogger("dengine")
 
 Point = NDArray[np.float32]
 
@@ -23,14 +29,15 @@ class ModelVersions:
     template : untrained; what the first version is trained from.
     answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
     new_labels : since the last retrain began.
-    store_waiting : stores what the rule was told of and the store not yet; called before any training or swap, since a
-        version is stored after all that its rule was told of.
+    keeper : asks the store.
+    store_waiting : stores what the rule was told of and the store not yet, StoreError where it cannot; called before any
+        training or swap, since a version is stored after all that its rule was told of.
     """
 
-    def __init__(self, template: EngineModel, retrainer: Retrainer, store: Store, clock: Callable[[], float]) -> None:
+    def __init__(self, template: EngineModel, retrainer: Retrainer, keeper: Keeper, clock: Callable[[], float]) -> None:
         self.template = template
         self.retrainer = retrainer
-        self.store = store
+        self.keeper = keeper
         self.clock = clock
         self.answering: EngineModel | None = None
         self.version, self.new_labels = 0, 0
@@ -44,7 +51,7 @@ class ModelVersions:
 
     def resume(self) -> None:
         """Go on from the store."""
-        resumed = resume(self.store, self.template, self.retrainer.window)
+        resumed = resume(self.keeper.store, self.template, self.retrainer.window)
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
 
     def reference_point(self, known: StoredDecision) -> Point | None:
@@ -67,60 +74,85 @@ class ModelVersions:
         self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
 
     def tell_anew(self) -> None:
-        """Tell the rule everything again: what it was told was not what happened."""
-        tell_all(self.newest, self.store)
+        """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
+        tell_all(self.newest, self.keeper.ask(lambda: self.keeper.store.evidence_since(0)))
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
-        self.collect(wait=True)
+        self.collect(HUNG)
         self.store_waiting()
         self.new_labels = 0
         return self._swap(self.retrainer.train(self.newest))
 
     def work(self, retrain_every: int) -> RetrainReport | None:
-        """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training."""
-        if self.new_labels >= retrain_every:
+        """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training.
+
+        While the store is away nothing is retrained: a version answers only once it is stored.
+        """
+        if self.new_labels >= retrain_every and self._ready():
             return self.start_retrain()
         if self.answering is not None:
             self.retrainer.improve(self.answering)
         return None
 
+    def _ready(self) -> bool:
+        try:
+            self.store_waiting()
+        except StoreError:  # told by the keeper; the labels wait in its journal
+            return False
+        return not self.keeper.fault
+
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
-        if self.retrainer.executor is None:
-            return self.retrain()
         self.collect()
-        if not self.retrainer.busy:
+        if self.retrainer.busy:
+            return None
+        if self.retrainer.executor is not None:
             self.store_waiting()
-            self.new_labels = 0
-            self.retrainer.start(self.newest)
-        return None
+            if self.retrainer.start(self.newest):
+                self.new_labels = 0
+                return None
+        return self.retrain()
 
-    def collect(self, wait: bool = False) -> None:
-        """Swap in what an executor has finished."""
+    def collect(self, wait: float = 0.0) -> None:
+        """Swap in what an executor has finished, within so many seconds."""
         trained = self.retrainer.collect(wait)
         if trained is not None:
-            self.store_waiting()
             self._swap(trained)
 
     def _swap(self, trained: Trained) -> RetrainReport:
-        model, seq = trained.candidate.model, trained.seq
+        model, seq, reason = trained.candidate.model, trained.seq, trained.candidate.reason
+        report = RetrainReport(self.version, 0.0, len(seq), trained.candidate.n_steps, False, reason)
+        try:
+            self.store_waiting()
+            report = self._store(report, trained)
+        except (
+            StoreError
+        ) as error:  # a version that is not stored would be gone with the process, and its decisions with it
+            return self._not_stored(report, error)
+        if model is not None:
+            self.answering, self.version = model, report.version  # one reference is swapped
+        self._news = report
+        return report
+
+    def _store(self, report: RetrainReport, trained: Trained) -> RetrainReport:
+        model, seq, state = trained.candidate.model, trained.seq, None
         if model is not None:
             model.prepare_safely(self.newest)
             self.retrainer.window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
-            self.answering, self.version = model, self.version + 1  # one reference is swapped
-        report = RetrainReport(
-            version=self.version,
-            seconds=self.clock() - trained.begin,  # until the version answers; storing it comes on top
-            n_traces=len(seq),
-            n_steps=trained.candidate.n_steps,
-            accepted=model is not None,
-            reason=trained.candidate.reason,
-        )
-        state = None if model is None else model.get_state() | {"trained_on": seq}
-        self.store.put_version(report, self.retrainer.window.newest_seq, state)
-        self._news = report
+            report = replace(report, version=self.version + 1, accepted=True)
+            state = model.get_state() | {"trained_on": seq}
+        # Until the version could answer; storing it comes on top.
+        report = replace(report, seconds=self.clock() - trained.begin)
+        self.keeper.version(report, self.retrainer.window.newest_seq, state)
         return report
+
+    def _not_stored(self, report: RetrainReport, error: StoreError) -> RetrainReport:
+        """Drop a version with its reason; its labels are as many new ones, so that the next retrain is soon."""
+        log.warning("a retrain was dropped, for it could not be stored: %s", error)
+        self.new_labels += report.n_traces
+        self._news = replace(report, reason=f"dropped: not stored: {error}")
+        return self._news
 
     def take_news(self) -> RetrainReport | None:
         """The newest retrain, once."""

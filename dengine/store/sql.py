@@ -42,17 +42,19 @@ from .records import (
     stored_decision,
     summary,
 )
+from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
 from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
 from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
 
 
-class SqlStore:
+class SqlStore(SqlOwning):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
+    wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may
     open one cell: label numbers stay unique and increasing. Their labels then mix, and neither engine learns of
@@ -63,12 +65,16 @@ class SqlStore:
     The queue holds 64 MB of traces; beyond that `put_decision` writes them itself, or says that it cannot.
     """
 
-    def __init__(self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time, *, wait: float = WAIT
+    ) -> None:
         """Open or create the store, and start its writer thread."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
-        self._clock = clock
+        if not wait > 0.0:
+            raise StoreError(f"Expected a wait above 0 seconds, got {wait!r}; 0.4 is the default.")
+        self._clock, self.wait = clock, wait
         self._database = SqlDatabase(str(url), cell_id)
 
     # Settings
@@ -287,10 +293,6 @@ class SqlStore:
             self.events(STATUS_EVENTS),
             self._database.failures,
         )
-
-    def close(self) -> None:
-        """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""
-        self._database.close()
 
     def __enter__(self) -> Self:
         return self

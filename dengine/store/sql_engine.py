@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,14 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 
+# Of a server that answers no more, libpq says so after some seconds, not hours.
+PATIENCE = {
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10000,
+}
 BUSY = 10.0  # seconds to wait for another process that writes to the same SQLite file
 
 
@@ -26,7 +35,7 @@ def make_engine(url: str) -> sa.Engine:
                 "for a store that forgets use store=None."
             )
         if backend == "postgresql":
-            return sa.create_engine(parsed, pool_pre_ping=True)
+            return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
         engine = sa.create_engine(parsed, connect_args={"timeout": BUSY})
     except (sa.exc.ArgumentError, ImportError, ValueError) as error:
         raise StoreError(
@@ -36,6 +45,27 @@ def make_engine(url: str) -> sa.Engine:
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
     return engine
+
+
+class WatchedFile:
+    """The file of an SQLite database, by device and inode: a deleted or replaced one still takes writes, for nobody."""
+
+    def __init__(self, url: sa.URL) -> None:
+        self.path = Path(str(url.database)) if url.get_backend_name() == "sqlite" else None
+        if self.path is not None and not self.path.is_file():
+            self.path = None  # named by an URI of SQLite's own
+        self._opened = None if self.path is None else self.path.stat()
+
+    def check(self) -> None:
+        """Raise an OSError where the file at the path is no longer the one that was opened."""
+        if self.path is None or self._opened is None:
+            return
+        try:
+            same = os.path.samestat(self.path.stat(), self._opened)
+        except OSError:
+            same = False
+        if not same:
+            raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:
@@ -59,6 +89,7 @@ def advice(error: BaseException) -> str:
         ("readonly", "Make the file and its directory writable."),
         ("full", "Free some space on the disk."),
         ("locked", "Another process holds the database; close it, or wait."),
+        ("while it was open", "Put it back, or close this store and open the new one."),
         ("malformed", "The file is damaged; restore it from a copy."),
     ):
         if text in said:

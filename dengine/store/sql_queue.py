@@ -1,23 +1,25 @@
-"""A database that one cell writes to: transactions, the queue of decisions, and the thread that writes it."""
+"""A database that one cell writes to: the queue of decisions, the thread that writes it, and rows set aside."""
 
 from __future__ import annotations
 
 import atexit
-import sqlite3
+import logging
+import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .checks import duplicate_id
+from .checks import as_text, duplicate_id
 from .records import DecidedTrace
-from .sql_engine import advice, make_engine
+from .sql_connections import OF_A_ROW, SqlConnections
 from .sql_rows import chunks, decision_row, trace_row
-from .sql_tables import DECISION, SCHEMA_KEY, SETTING, TRACE, prepare_tables
+from .sql_tables import DECISION, EVENT, SCHEMA_KEY, SETTING, TRACE
 
+log = logging.getLogger("dengine")
 LINGER = 0.05  # seconds that a decision waits for company before it is committed
 RETRY = 1.0  # seconds before the writer tries again after a failure
 QUEUE_BYTES = 64 << 20  # of traces that may wait in memory
@@ -25,72 +27,74 @@ QUEUE_BYTES = 64 << 20  # of traces that may wait in memory
 T = TypeVar("T")
 
 
-class SqlDatabase:
-    """An open database, and the decisions on their way to it.
-
-    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
-    cell_id : whose decisions these are.
-    name : the URL without its password, for errors.
-    failures : how many writes failed so far.
-    """
+class SqlDatabase(SqlConnections):
+    """An open database, and the decisions on their way to it."""
 
     def __init__(self, url: str, cell_id: str) -> None:
         """Open or create the database, and start its writer thread."""
-        self.cell_id = cell_id
-        self.failures = 0
-        self._engine = make_engine(url)
-        self.name = self._engine.url.render_as_string(hide_password=True)
         self._queue: dict[str, DecidedTrace] = {}
+        super().__init__(url, cell_id)
         self._queue_bytes = 0
-        self._doubtful = False  # the last write failed, and may have been committed all the same
         self._clash: StoreError | None = None
-        self._closed = False
         self._lock = threading.Condition()  # guards the queue
-        self._writing = threading.RLock()  # one write transaction at a time in this process
         self._stop = threading.Event()
-        self._open()
         self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
         self._writer.start()
         atexit.register(self._close_at_exit)
-
-    # Transactions
-
-    @contextmanager
-    def _told(self, doing: str, write: bool = False) -> Iterator[None]:
-        """Turn what a database raises into a StoreError that says what to do."""
-        try:
-            yield
-        except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
-            self.failures += write
-            self._doubtful |= write
-            raise StoreError(
-                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}{self._waiting()}"
-            ) from error
-
-    def _waiting(self) -> str:
-        n = len(self._queue)
-        return f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
-
-    @contextmanager
-    def transaction(self, write: bool) -> Iterator[sa.Connection]:
-        """Begin a transaction that is committed at its end, or rolled back by an error."""
-        self._check_open()
-        with self._told("write to" if write else "read", write), self._engine.connect() as plain:
-            connection = plain.execution_options(dengine_write=write)
-            with connection.begin():
-                yield connection
 
     def write(self, work: Callable[[sa.Connection], T]) -> T:
         """Commit the queued decisions and `work` in one transaction."""
         with self._writing:
             with self._lock:
                 batch = list(self._queue.values())
-            with self.transaction(write=True) as connection:
-                self.insert(connection, self._not_yet_stored(connection, batch) if self._doubtful else batch)
-                result = work(connection)
-            self._doubtful = False
-            self._forget(batch)
-            return result
+            try:
+                return self._commit(work, batch)
+            except StoreError as error:
+                bad = self._unstorable(batch) if isinstance(error.__cause__, OF_A_ROW) else {}
+                if not bad:
+                    raise
+                self._set_aside(bad)
+                return self._commit(work, [item for item in batch if item.decision.id not in bad])
+
+    def _commit(self, work: Callable[[sa.Connection], T], batch: Sequence[DecidedTrace]) -> T:
+        with self.transaction(write=True) as connection:
+            self.insert(connection, self._not_yet_stored(connection, batch) if self._doubtful else batch)
+            result = work(connection)
+        self._doubtful = False
+        self._forget(batch)
+        return result
+
+    def _unstorable(self, batch: Sequence[DecidedTrace]) -> dict[str, str]:
+        """Return which rows the database refuses for what they hold, each with the reason; nothing is written."""
+        refused: dict[str, str] = {}
+        with self._told("write to"), self._connected(write=True) as plain:
+            connection = plain.execution_options(dengine_write=True)
+            with connection.begin() as tried:
+                for item in self._not_yet_stored(connection, batch):
+                    try:
+                        with connection.begin_nested():
+                            self.insert(connection, [item])
+                    except OF_A_ROW as error:
+                        refused[item.decision.id] = str(getattr(error, "orig", None) or error)
+                tried.rollback()
+        return refused
+
+    def _set_aside(self, refused: dict[str, str]) -> None:
+        """Take rows out of the queue that would keep all others from being written; they become events."""
+        now = time.time()
+        with self._lock:
+            bad = [self._queue[name] for name in refused]
+        self._forget(bad)
+
+        def record(connection: sa.Connection) -> None:
+            first = self.next_number(connection, EVENT.c.number)
+            for number, (name, reason) in enumerate(refused.items(), first):
+                text = as_text(f"a decision that the database refused, {name!r}: {reason}")
+                row = {"cell_id": self.cell_id, "number": number, "time": now, "kind": "set aside", "text": text}
+                connection.execute(sa.insert(EVENT), row)
+                log.error("%s", text)
+
+        self._commit(record, [])
 
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Lock the cell (PostgreSQL; SQLite's BEGIN IMMEDIATE did it already), then number the next row of a table."""
@@ -98,6 +102,10 @@ class SqlDatabase:
         connection.execute(sa.select(SETTING).where(mine).with_for_update())
         newest = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
         return (connection.execute(newest).scalar() or 0) + 1
+
+    def _waiting(self) -> str:
+        n = len(self._queue)
+        return f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
 
     # The queue
 
@@ -124,10 +132,15 @@ class SqlDatabase:
             connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
             connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
 
+    def insert_new(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> None:
+        """Add those decisions of a batch that are not stored yet."""
+        self.insert(connection, self._not_yet_stored(connection, batch))
+
     def _forget(self, batch: Sequence[DecidedTrace]) -> None:
         with self._lock:
             for item in batch:
-                del self._queue[item.decision.id]
+                if self._queue.pop(item.decision.id, None) is None:
+                    continue
                 self._queue_bytes -= item.trace.nbytes
 
     def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> list[DecidedTrace]:
@@ -169,20 +182,6 @@ class SqlDatabase:
 
     # Opening and closing
 
-    def _open(self) -> None:
-        try:
-            with self._told("open"), self._engine.connect() as plain:
-                connection = plain.execution_options(dengine_write=True)
-                with connection.begin():
-                    prepare_tables(connection, self.cell_id, self.name)
-        except StoreError:
-            self._engine.dispose()
-            raise
-
-    def _check_open(self) -> None:
-        if self._closed:
-            raise StoreError(f"Expected an open store, got {self.name} after close(); open it again.")
-
     def close(self) -> None:
         """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""
         if self._closed:
@@ -195,12 +194,13 @@ class SqlDatabase:
         with self._writing:
             self.flush()  # of what other threads put meanwhile
             self._closed = True
-        self._engine.dispose()
+        self.disconnect()
         atexit.unregister(self._close_at_exit)
 
     def _close_at_exit(self) -> None:
-        """Write what a program that forgot to close has queued."""
-        self.close()
+        """Write what a program that forgot to close has queued; a fork of it has nothing of its own."""
+        if os.getpid() == self._pid:
+            self.close()
 
 
 def _nothing(connection: sa.Connection) -> None:

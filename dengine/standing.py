@@ -1,0 +1,90 @@
+"""What an engine says of itself: its settings in force, its model, what it can certify, what an exporter takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from .decision.certificate import Certificate, certificate_of
+from .decision.policy import Policy
+from .feedback import Feedback
+from .keeping import Keeper
+from .model.base import Exportable
+from .recipe import Recipe
+from .records import TraceSpec
+from .retraining import EncoderTime
+from .settings import EngineSettings
+from .store.base import Store
+from .versions import ModelVersions
+
+
+class EngineStanding:
+    """How an engine stands; nothing here changes it."""
+
+    seed: int
+    store: Store
+    _settings: EngineSettings
+    _keeper: Keeper
+    _versions: ModelVersions
+    _feedback: Feedback
+
+    def flush(self) -> None:
+        """Return when all that is known so far is on the disk."""
+        self._feedback.store_waiting()
+        self._keeper.flush()
+
+    @property
+    def retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or waits to be swapped in."""
+        return self._versions.retrainer.busy
+
+    @property
+    def encoder_time(self) -> EncoderTime:
+        """What the encoder's training took so far."""
+        return self._versions.retrainer.encoder_time
+
+    @property
+    def recipe(self) -> Recipe:
+        """Every setting as it is in force; fixed once the engine is made."""
+        return self._settings.recipe
+
+    @property
+    def policy(self) -> Policy:
+        """The user's numbers as they are in force; for others make another engine."""
+        return self._settings.recipe.policy
+
+    @property
+    def trace(self) -> TraceSpec | None:
+        """The traces' contract; None before the first trace."""
+        return self._settings.trace
+
+    @property
+    def model(self) -> Any:
+        """The model that answers, a rival as its author knows it; None before the first retrain."""
+        return None if self._versions.answering is None else self._versions.answering.user_model
+
+    @property
+    def version(self) -> int:
+        """Of the model that answers; 0 before the first retrain."""
+        return self._versions.version
+
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
+        return self._feedback.safe_mode
+
+    def certificate(self) -> Certificate:
+        """What can be said by now, at level 1 - alpha, of the parts that were decided without a check."""
+        self.flush()
+        return certificate_of(self.store.outcomes(), self.policy)
+
+    @property
+    def new_labels(self) -> int:
+        """Labels since the last retrain began."""
+        return self._versions.new_labels
+
+    def exported(self, trace: TraceSpec | None = None) -> Exportable:
+        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
+        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
+        coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
+        return replace(own, model_version=self.version, recipe=self.recipe.to_toml(), **coin)
