@@ -34,6 +34,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "resuming": 8,
     "deciding": 8,
     "interrupts": 1,
+    "backlog": 8,
     "keeping": 8,
     "pending": 8,
     "standing": 8,

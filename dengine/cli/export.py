@@ -37,7 +37,7 @@ def export(store: str, out: Path, form: str, as_json: bool) -> None:
     from ..export import export_onnx, export_torchscript
 
     write = {"torchscript": export_torchscript, "onnx": export_onnx}[form]
-    with DataEngine.open(store) as engine:
+    with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
         path = write(engine, out)
         version, references = engine.version, len(engine.model.index)
     n_bytes = path.stat().st_size

@@ -3,9 +3,8 @@
     store = SqlStore("engine.db", cell_id="cell-7")
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
 
-What a returned call promises, given a disk that keeps what it synced: all that is put is committed, but for
-`put_decision`: its row is queued, and committed within about 50 ms by a writer thread, by `flush`, or in the same
-transaction as the next label, whichever comes first.
+What a returned call promises, given a disk that keeps what it synced: all that is put is committed, but for `put_decision`:
+its row is queued, and committed within about 50 ms by a writer thread, by `flush`, or together with the next label.
 """
 
 from __future__ import annotations

@@ -134,7 +134,8 @@ class SqlDatabase(SqlConnections):
 
     def insert_new(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> None:
         """Add those decisions of a batch that are not stored yet."""
-        self.insert(connection, self._not_yet_stored(connection, batch))
+        stored = self._stored(connection, batch)
+        self.insert(connection, [item for item in batch if item.decision.id not in stored])
 
     def _forget(self, batch: Sequence[DecidedTrace]) -> None:
         with self._lock:
@@ -145,16 +146,19 @@ class SqlDatabase(SqlConnections):
 
     def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> list[DecidedTrace]:
         """After a failure: leave out what was committed although the answer got lost, and ids that were taken."""
-        columns = (DECISION.c.id, DECISION.c.content_hash, DECISION.c.action, DECISION.c.time)
-        query = sa.select(*columns).where(DECISION.c.cell_id == self.cell_id)
-        stored: dict[str, tuple[int, str, float]] = {}
-        for part in chunks([item.decision.id for item in batch]):
-            stored |= {row[0]: (row[1], row[2], row[3]) for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
+        stored = self._stored(connection, batch)
         for item in batch:
             same = (item.content_hash, item.decision.action.value, item.time)
             if stored.get(item.decision.id, same) != same:
                 self._clash = duplicate_id(item.decision.id)  # raised by the next flush; the queue must go on
         return [item for item in batch if item.decision.id not in stored]
+
+    def _stored(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> dict[str, tuple[int, str, float]]:
+        columns = (DECISION.c.id, DECISION.c.content_hash, DECISION.c.action, DECISION.c.time)
+        query = sa.select(*columns).where(DECISION.c.cell_id == self.cell_id)
+        parts = chunks([item.decision.id for item in batch])
+        rows = [row for part in parts for row in connection.execute(query.where(DECISION.c.id.in_(part)))]
+        return {row.id: (row.content_hash, row.action, row.time) for row in rows}
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
