@@ -1,13 +1,17 @@
 """What is PostgreSQL's alone; the contract itself runs on it in test_store.py. Needs DENGINE_TEST_POSTGRES."""
 
 import os
+import signal
 import threading
+import time
 import uuid
+from pathlib import Path
 
 import numpy as np
 import pytest
 import sqlalchemy as sa
 
+from dengine import DataEngine, Policy, Recipe, ReplayCell
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
 from dengine.store import SqlStore
@@ -69,3 +73,90 @@ def test_other_programs_tables_may_stand_beside_ours() -> None:
         connection.execute(sa.text("CREATE TABLE IF NOT EXISTS someone_elses (id int)"))
     admin.dispose()
     SqlStore(URL, uuid.uuid4().hex).close()
+
+
+# ---------------------------------------------------------------------------------------------- an engine on a server
+
+
+@pytest.fixture
+def cell() -> str:
+    return f"cell-{uuid.uuid4().hex[:8]}"
+
+
+@pytest.fixture(autouse=True)
+def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
+def engine_of(cell: str) -> DataEngine:
+    recipe = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
+    return DataEngine(recipe=recipe, store=SqlStore(URL, cell, wait=0.3))
+
+
+def until_back(engine: DataEngine) -> None:
+    end = time.monotonic() + 30
+    while engine._keeper.fault:
+        assert time.monotonic() < end, engine._keeper.fault
+        time.sleep(0.05)
+
+
+def backend_of(engine: DataEngine) -> int:
+    """The server's process that the engine writes through."""
+    database = engine.store._database
+    with database._writing, database._connected(write=True) as connection:
+        pid = connection.execute(sa.text("SELECT pg_backend_pid()")).scalar()
+        connection.rollback()
+    return int(pid)
+
+
+def test_one_engine_owns_a_cell_on_a_server_also_without_its_journal(cell: str, tmp_path: Path) -> None:
+    with engine_of(cell):
+        with pytest.raises(StoreError, match="owns"):
+            DataEngine.open(SqlStore(URL, cell))
+        os.environ["XDG_STATE_HOME"] = str(tmp_path / "another machine")
+        with pytest.raises(StoreError, match=f"dengine process {os.getpid()} .*owns cell '{cell}'"):
+            DataEngine.open(SqlStore(URL, cell))
+        with engine_of(cell + "-2"):
+            pass
+    DataEngine.open(SqlStore(URL, cell)).close()
+
+
+def test_a_frozen_server_makes_nobody_wait_and_each_cell_goes_on_deciding(make_data, cell: str) -> None:
+    data = make_data(400, samples=60, seed=3)
+    with engine_of(cell) as engine:
+        list(engine.run(ReplayCell(data, np.arange(200)), 200))
+        pid = backend_of(engine)
+        try:
+            os.kill(pid, signal.SIGSTOP)
+        except PermissionError:
+            pytest.skip("the server's processes are somebody else's")
+        try:
+            begin = time.monotonic()
+            cycles = list(engine.run(ReplayCell(data, np.arange(200, 260)), 60))
+            seconds = time.monotonic() - begin
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        assert seconds < 10  # without a limit: for ever
+        assert any(cycle.decision.action is Action.ACCEPT for cycle in cycles)
+        until_back(engine)
+        for each in cycles:
+            if each.success is not None:
+                assert engine.store.get_decision(each.decision.id).success is each.success
+
+
+def test_a_lost_connection_is_made_again_with_its_lease_and_loses_no_label(make_data, cell: str) -> None:
+    data = make_data(400, samples=60, seed=3)
+    with engine_of(cell) as engine:
+        cycles = list(engine.run(ReplayCell(data, np.arange(100)), 100))
+        for first in range(100, 200, 25):
+            admin = sa.create_engine(URL)
+            with admin.connect() as connection:
+                connection.execute(sa.text("SELECT pg_terminate_backend(:pid)"), {"pid": backend_of(engine)})
+            admin.dispose()
+            cycles += engine.run(ReplayCell(data, np.arange(first, first + 25)), 25)
+            until_back(engine)
+        expected = [engine.decide(x).lower for x in data.X[-20:]]
+    with DataEngine.open(SqlStore(URL, cell)) as again:
+        assert [again.decide(x).lower for x in data.X[-20:]] == expected
+        said = {each.decision.id: each.success for each in cycles if each.success is not None}
+        assert {name: again.store.get_decision(name).success for name in said} == said
