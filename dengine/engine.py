@@ -24,6 +24,7 @@ from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
 from .errors import StoreError
 from .feedback import Feedback, unknown_stop
+from .labels import as_id, as_success
 from .loop import drive
 from .model.base import EngineModel, Exportable, Model
 from .recipe import Recipe
@@ -184,12 +185,13 @@ class DataEngine:
 
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
-        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or a
-        report on a rejected part.
+        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a report
+        on a rejected part, or a label that is neither a bool nor exactly 1 or 0: nothing is written then.
         """
+        said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._versions.collect()
-        known = self.store.get_decision(decision_id) or self._lost_stop(decision_id, success, trace, part)
-        self._feedback.report(known, bool(success))
+        known = self.store.get_decision(id_) or self._lost_stop(id_, said, trace, part)
+        self._feedback.report(known, said)
         return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:

@@ -19,6 +19,8 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "_lazy": 0,
     "errors": 0,
     "records": 0,
+    "wording": 0,
+    "labels": 1,
     "folds": 1,
     "traces": 1,
     "decision": 2,

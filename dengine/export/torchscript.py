@@ -22,6 +22,7 @@ from ..deciding import as_part
 from ..decision.rule import SAFE_MODE, script
 from ..errors import ExportError
 from ..folds import part_hash
+from ..labels import as_success
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..traces import as_trace, as_traces
 from .file import METADATA, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
@@ -103,7 +104,7 @@ class ExportedModel:
 
         The trace becomes a reference, and the rule is told. A faulty trace is not learned from.
         """
-        return self._tell(self._asked.learn, trace, bool(success), _hash_of(part))
+        return self._tell(self._asked.learn, trace, as_success(success), _hash_of(part))
 
     def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
         """Tell that an accepted part was bad and stopped the system; as `learn`."""

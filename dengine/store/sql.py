@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from . import sql_queries as ask
-from .checks import as_channels, as_hash, as_part, as_text, check_import, check_parts, check_state, duplicate_id
+from .checks import as_hash, as_text, check_import, check_parts, check_state, duplicate_id
+from .intake import check_decision, decided_trace
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -103,8 +104,7 @@ class SqlStore:
         part: str | None = None,
     ) -> None:
         """Queue a decision and its trace for the writer thread."""
-        values, hash_, number = as_channels(trace), as_hash(content_hash), as_part(part)
-        self._database.put(DecidedTrace(decision, values, hash_, bool(quarantined), self._clock(), number))
+        self._database.put(decided_trace(decision, trace, content_hash, quarantined, self._clock(), part))
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
@@ -168,6 +168,7 @@ class SqlStore:
         traces, now = check_import(decisions, traces, hashes, labels), self._clock()
         numbers, given = check_parts(parts, len(decisions)), imported_labels(decisions, labels, source)
         for decision in decisions:
+            check_decision(decision)
             if self._database.queued(decision.id) is not None:
                 raise duplicate_id(decision.id)
 

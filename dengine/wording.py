@@ -1,0 +1,26 @@
+"""What errors and screens may say of a value: so much of it as a line holds, and never a password."""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from typing import Any
+
+HIDDEN = "***"
+URL = re.compile(r"(\w[\w+.-]*://[^\s:/@'\"]*):\S*@")  # up to the last @, for a password may hold one that is not escaped
+NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
+SHORT = reprlib.Repr()
+SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60
+
+
+def without_password(text: str) -> str:
+    """A text with *** in the place of every password in a database URL: `scheme://user:***@host`, `password=***`."""
+    return NAMED.sub(rf"\1={HIDDEN}", URL.sub(rf"\1:{HIDDEN}@", text))
+
+
+def shortened(value: Any) -> str:
+    """A value as `repr` shows it, at most some 60 characters of it: an error must not hold a megabyte."""
+    try:
+        return SHORT.repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return f"a number of {value.bit_length()} bits" if isinstance(value, int) else f"a {type(value).__name__}"
