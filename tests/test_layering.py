@@ -21,6 +21,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "records": 0,
     "wording": 0,
     "labels": 1,
+    "outputs": 1,
     "folds": 1,
     "traces": 1,
     "decision": 2,
