@@ -7,7 +7,8 @@ import reprlib
 from typing import Any
 
 HIDDEN = "***"
-URL = re.compile(r"(\w[\w+.-]*://[^\s:/@'\"]*):\S*@")  # up to the last @, for a password may hold one that is not escaped
+# Up to the last @: a password may hold one that is not escaped, or a blank. A path writes // as /.
+URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
 SHORT = reprlib.Repr()
 SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60

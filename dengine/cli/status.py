@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..wording import without_password
 from .options import example, json_option
 from .output import certificate_record, duration, show, write_json
 
@@ -128,11 +129,11 @@ def _share(some: int, of: int) -> float | None:
 def _table(store: str, rows: list[tuple[str, str]]) -> Any:
     from rich.table import Table
 
-    table = Table(title=store, show_header=False, title_justify="left")
+    table = Table(title=without_password(store), show_header=False, title_justify="left")
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(without_password, row))
     return table
 
 
