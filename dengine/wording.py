@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Iterable
 from typing import Any
 
 HIDDEN = "***"
@@ -25,3 +26,10 @@ def shortened(value: Any) -> str:
         return SHORT.repr(value)
     except ValueError:  # an integer of more digits than Python prints
         return f"a number of {value.bit_length()} bits" if isinstance(value, int) else f"a {type(value).__name__}"
+
+
+def listed(names: Iterable[Any]) -> str:
+    """The first few of some names, and how many more there are."""
+    names = list(names)
+    few = ", ".join(str(name)[:100] for name in names[:8])
+    return f"{few} and {len(names) - 8} more" if len(names) > 8 else few

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -148,7 +147,7 @@ def _settings_rows(held: Held) -> Iterator[tuple[str, str]]:
         "retrain",
         (f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}, on the newest {recipe.window:,}"),
     )
-    yield "trace", _contract(settings.get("trace"))
+    yield "trace", _contract(settings)
 
 
 def _own_rows(recipe: Recipe, seed: str) -> Iterator[tuple[str, str]]:
@@ -167,12 +166,12 @@ def _neighbours(recipe: Recipe) -> str:
     return f"the nearest {100 * recipe.fraction:g} % of the references{judged}"
 
 
-def _contract(trace: str | None) -> str:
-    from ..records import TraceSpec
+def _contract(settings: dict[str, str]) -> str:
+    from ..settings import trace_in
 
-    if trace is None:
+    spec = trace_in(settings)
+    if spec is None:
         return "none yet: the first trace sets it"
-    spec = TraceSpec(**json.loads(trace))
     channels = "" if spec.channels == 1 else f"{spec.channels} channels of "
     limit = "" if spec.limit is None else f", sensor limit {spec.limit:g} {spec.unit}"
     seconds = duration(spec.samples / spec.rate_hz)
