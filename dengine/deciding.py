@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .contracts import first_contract
 from .decision.rule import script
 from .errors import ReportError, TraceError
 from .folds import audited, own_hash
@@ -38,6 +39,12 @@ class DecisionMaker:
     def agree_on(self, trace: TraceSpec) -> None:
         """Set the contract that the gate checks."""
         self._gate = script(TraceGate(trace))
+
+    def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
+        """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
+        spec, fit = first_contract(x, trace)
+        self._gate = TraceGate(spec)  # a bad one needs it as well: to say what is bad
+        return spec if fit else None
 
     def decide(self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int) -> DecidedTrace:
         """(C, T) of a part with this number -> what goes into the store."""

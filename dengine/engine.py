@@ -19,6 +19,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
+from .contracts import as_agreed
 from .deciding import DecisionMaker, as_part
 from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
@@ -33,7 +34,6 @@ from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
-from .traces import as_trace, spec_of
 from .versions import ModelVersions
 
 OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
@@ -45,7 +45,7 @@ class DataEngine:
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
-    policy : the user's two numbers.  trace : the traces' contract; None: the first trace sets it.
+    policy : the user's two numbers.  trace : the traces' contract; None: the first sound trace sets it.
     radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides.
     store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
@@ -154,7 +154,7 @@ class DataEngine:
     def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
-        TraceError for a wrong shape; whatever else fails becomes VERIFY.
+        TraceError for a wrong shape, and for a first trace of less than 10 samples; whatever else fails becomes VERIFY.
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
@@ -168,9 +168,9 @@ class DataEngine:
         return item.decision
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        x = as_trace(trace, self.trace)
-        if self.trace is None:
-            self.agree_on(spec_of(x, trace))
+        x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
+        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
+            self.agree_on(spec, inferred=True)
         return x
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:
@@ -244,7 +244,7 @@ class DataEngine:
 
     @property
     def trace(self) -> TraceSpec | None:
-        """The traces' contract; None before the first trace."""
+        """The traces' contract; None before the first sound trace."""
         return self._settings.trace
 
     @property
@@ -290,10 +290,10 @@ class DataEngine:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def agree_on(self, trace: TraceSpec) -> TraceSpec:
-        """Set the traces' contract, where none is set yet; returns the one in force."""
+    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
         if self.trace is None:
-            self._settings = replace(self._settings, trace=trace)
+            self._settings = replace(self._settings, trace=trace, inferred=inferred)
             self._maker.agree_on(trace)
             self.store.save_settings(self._settings.to_store())
         return self._settings.trace or trace

@@ -39,7 +39,7 @@ class EngineSettings:
     recipe : as it is in force.  seed : of the reducer and of the audits' coin, 0 or more.
     model : what a model that was handed in is called; None: the recipe describes the model.
     described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
-    trace : the traces' contract; None until the first trace.
+    trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
     """
 
     recipe: Recipe
@@ -47,6 +47,7 @@ class EngineSettings:
     model: str | None = None
     described: str | None = None
     trace: TraceSpec | None = None
+    inferred: bool = False
 
     def __post_init__(self) -> None:
         if not is_whole(self.seed, 0, SEEDS):
@@ -60,6 +61,8 @@ class EngineSettings:
         known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
         if self.trace is not None:
             known["trace"] = json.dumps(asdict(self.trace))
+        if self.inferred:
+            known["inferred"] = "true"
         return known
 
     @classmethod
@@ -93,7 +96,8 @@ class EngineSettings:
                 raise SettingError(
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
-        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known))
+        inferred = "inferred" in known
+        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known), inferred)
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""

@@ -37,6 +37,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "settings": 8,
     "retraining": 8,
     "resuming": 8,
+    "contracts": 8,
     "deciding": 8,
     "versions": 8,
     "feedback": 8,
