@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import Any
 
 from .errors import SettingError
+from .wording import shortened
 
 
 def lazy_names(package: str, where: Mapping[str, Sequence[str]]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -32,10 +33,10 @@ def find_class(where: str) -> type:
     module, _, name = where.partition(":")
     try:
         found = getattr(import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:  # whatever a module of the user's raises while it is imported
         raise SettingError(
-            f"Expected module:Class of something that can be imported here, got {where!r}: {error}."
+            f"Expected module:Class of something that can be imported here, got {shortened(where)}: {error}."
         ) from error
     if not isinstance(found, type):
-        raise SettingError(f"Expected module:Class, {where!r} is a {type(found).__name__} and no class.")
+        raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
     return found

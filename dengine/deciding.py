@@ -11,13 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .contracts import first_contract
 from .decision.rule import script
 from .errors import ReportError, TraceError
 from .folds import audited, own_hash
-from .model.base import NOTHING_KNOWN, EngineModel, Prediction
+from .labels import LONGEST, is_name
+from .model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
 from .records import REASONS, Action, Decision, Reason, Source, TraceSpec
 from .store.records import DecidedTrace
 from .traces import TraceGate
+from .wording import shortened
 
 log = logging.getLogger("dengine")
 
@@ -36,6 +39,12 @@ class DecisionMaker:
     def agree_on(self, trace: TraceSpec) -> None:
         """Set the contract that the gate checks."""
         self._gate = script(TraceGate(trace))
+
+    def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
+        """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
+        spec, fit = first_contract(x, trace)
+        self._gate = TraceGate(spec)  # a bad one needs it as well: to say what is bad
+        return spec if fit else None
 
     def decide(
         self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int, away: bool = False
@@ -84,22 +93,24 @@ def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> P
     if model is None:
         return NOTHING_KNOWN
     try:
-        return model.predict_one(x, hash_)
+        return checked(model.predict_one(x, hash_))
     except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
         log.exception("the model failed on a trace; the part is verified")
         return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
 
 
 def as_part(part: Any) -> str | None:
-    """A part's number as text; TraceError for what is neither a text nor a whole number."""
+    """A part's number as text; TraceError for what is neither a text nor a whole number, or does not fit a line."""
     if part is None:
         return None
-    if isinstance(part, bool | float | np.floating) or not isinstance(part, str | int | np.integer) or part == "":
-        raise TraceError(f"Expected a part's number, a text or a whole number, got {part!r}.")
-    text = str(part)
-    if "\0" in text or not text.isprintable():
-        raise TraceError(f"Expected a part's number of printable characters, got {text!r}.")
-    return text
+    whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
+    text = str(part) if whole and abs(int(part)) < 10**LONGEST else part
+    if not is_name(text):
+        raise TraceError(
+            f"Expected a part's number, a whole number or a text of 1 to {LONGEST} characters that print, got "
+            f"{shortened(part)}; strip what a scanner added, or pass None."
+        )
+    return str(text)
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:

@@ -22,22 +22,23 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
+from .contracts import as_agreed
 from .deciding import DecisionMaker, as_part
 from .decision.policy import Policy
 from .errors import StoreError
+from .facts import EngineFacts
 from .feedback import Feedback, unknown_stop
 from .interrupts import uninterrupted
 from .keeping import CLOSE, Keeper
+from .labels import as_id, as_success
 from .loop import drive
 from .model.base import EngineModel, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
 from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
-from .standing import EngineStanding
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
-from .traces import as_trace, spec_of
 from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
@@ -46,11 +47,11 @@ OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine(EngineStanding):
+class DataEngine(EngineFacts):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
-    policy : the user's two numbers.  trace : the traces' contract; None: the first trace sets it.
+    policy : the user's two numbers.  trace : the traces' contract; None: the first sound trace sets it.
     radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides.
     store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
@@ -176,7 +177,8 @@ class DataEngine(EngineStanding):
     def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
-        TraceError for a wrong shape; whatever else fails becomes VERIFY, a store that is away too.
+        TraceError for a wrong shape, and for a first trace of less than 10 samples; whatever else fails becomes VERIFY, a
+        store that is away too.
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
         wait : return only when the decision is on the disk; by default it is there before any report on it returns.
         """
@@ -193,9 +195,9 @@ class DataEngine(EngineStanding):
         return item.decision
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        x = as_trace(trace, self.trace)
-        if self.trace is None:
-            self.agree_on(spec_of(x, trace))
+        x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
+        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
+            self.agree_on(spec, inferred=True)
         elif self._settings_waiting:
             self._save_settings()
         return x
@@ -212,14 +214,16 @@ class DataEngine(EngineStanding):
 
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
-        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, or a
-        report on a rejected part; StoreError where neither the store nor its journal can be written: nothing was taken.
+        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a report
+        on a rejected part, or a label that is neither a bool nor exactly 1 or 0; StoreError where neither the store nor its
+        journal can be written: nothing is taken then.
         """
+        said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._keeper.check()
         with uninterrupted():
             self._versions.collect()
-            known = self._keeper.find(decision_id) or self._lost_stop(decision_id, success, trace, part)
-            self._feedback.report(known, bool(success))
+            known = self._keeper.find(id_) or self._lost_stop(id_, said, trace, part)
+            self._feedback.report(known, said)
             return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
@@ -265,10 +269,10 @@ class DataEngine(EngineStanding):
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def agree_on(self, trace: TraceSpec) -> TraceSpec:
-        """Set the traces' contract, where none is set yet; returns the one in force."""
+    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
         if self.trace is None:
-            self._settings = replace(self._settings, trace=trace)
+            self._settings = replace(self._settings, trace=trace, inferred=inferred)
             self._maker.agree_on(trace)
             self._save_settings()
         return self._settings.trace or trace

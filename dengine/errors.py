@@ -1,8 +1,13 @@
 """The exception tree: everything dengine raises on purpose derives from `DengineError`."""
 
+from .wording import without_password
+
 
 class DengineError(Exception):
-    """Base of every error that dengine raises on purpose."""
+    """Base of every error that dengine raises on purpose; the passwords of database URLs in its text are masked."""
+
+    def __init__(self, *said: object) -> None:
+        super().__init__(*(without_password(each) if isinstance(each, str) else each for each in said))
 
 
 class TraceError(DengineError, ValueError):
@@ -18,7 +23,7 @@ class DataError(DengineError, ValueError):
 
 
 class ReportError(DengineError, ValueError):
-    """A report on an unknown decision, a second report, or one that contradicts the first."""
+    """A report that says nothing (no label, no id), on an unknown decision, a second one, or one against the first."""
 
 
 class StoreError(DengineError, RuntimeError):
@@ -27,3 +32,7 @@ class StoreError(DengineError, RuntimeError):
 
 class ExportError(DengineError, RuntimeError):
     """A model that cannot be exported, or an exported file that must not be used."""
+
+
+class OutputError(DengineError, RuntimeError):
+    """A file that cannot be written, or that holds something else than an earlier output of the same kind."""

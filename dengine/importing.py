@@ -10,7 +10,6 @@ the same file twice counts no label twice. Traces that a cell recorded itself ha
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -31,6 +30,7 @@ from .folds import content_hash, own_hash
 from .forms import form_in, must_agree
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
+from .settings import trace_in
 from .store.base import NewLabel, Store, opening
 from .traces import TraceGate, as_trace, as_traces
 
@@ -178,11 +178,12 @@ def import_journal(
     """
     with opening(store, must_exist=True) as opened:
         known = opened.settings()
-        if "trace" not in known:
+        spec = trace_in(known)
+        if spec is None or "recipe" not in known:
             raise StoreError(
                 f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
             )
-        spec, policy = TraceSpec(**json.loads(known["trace"])), Recipe.from_toml(known["recipe"]).policy
+        policy = Recipe.from_toml(known["recipe"]).policy
         lines = _with_known_outcomes(read_journal(path, spec), policy.stops)
         report = _import_lines(opened, lines, spec, policy, on_traces)
     opened.close()

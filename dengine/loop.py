@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from .cells.base import Cell
 from .deciding import source_of
+from .labels import as_outcome, as_success
 from .records import Action, Cycle, Outcome
 
 if TYPE_CHECKING:
@@ -34,9 +35,9 @@ def _cycle(engine: DataEngine, cell: Cell, index: int) -> Cycle:
     seconds = engine.clock() - begin
     outcome, success, source = None, None, None
     if decision.action is Action.VERIFY:
-        success = bool(cell.verify())
+        success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
     elif decision.action is Action.ACCEPT:
-        outcome = cell.proceed()
+        outcome = as_outcome(cell.proceed(), f"decision {decision.id}, by proceed()")
         success = KNOWN.get(outcome)
     else:
         cell.reject()

@@ -14,7 +14,6 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
-from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,21 @@ import numpy as np
 
 from .decision.policy import Neighbourhood, Policy
 from .errors import SettingError
+from .values import is_number, is_whole
+from .wording import listed, shortened
 
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
 NOVELTY = 1.5
+LARGEST = 2**20  # bytes of a recipe's file
+WHOLE = {  # the least and the most; beyond the latter no machine goes, and an error now is better than one at each retrain
+    "folds": (2, 1000),
+    "retrain_every": (1, 10**9),
+    "max_steps": (0, 10**9),
+    "window": (10, 10**8),
+}
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
 RENAMED = {"dim": "n_components"}  # parameters of reducers as dengine 0.1 wrote them
 GONE = (("objective", "supervised"),)  # what went without saying then
@@ -68,27 +76,30 @@ class Recipe:
     novelty: float = NOVELTY
 
     def __post_init__(self) -> None:
-        for name, least in (("folds", 2), ("retrain_every", 1), ("max_steps", 0), ("window", 10)):
+        for name, (least, most) in WHOLE.items():
             value = getattr(self, name)
-            if name == "max_steps" and value is None:
-                continue
-            if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-                raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
-        if not (isinstance(self.budget, Real) and self.budget > 0.0):
-            raise SettingError(f"Expected budget > 0 seconds, got {self.budget!r}.")
-        if not (isinstance(self.encoder_budget, Real) and 0.0 <= self.encoder_budget < float("inf")):
-            raise SettingError(f"Expected encoder_budget >= 0 seconds a cycle, got {self.encoder_budget!r}.")
-        if not (isinstance(self.novelty, Real) and 0.0 <= self.novelty < float("inf")):
-            raise SettingError(f"Expected a finite novelty of 0 or more, got {self.novelty!r}; 0 turns it off.")
+            if not (is_whole(value, least, most) or (name == "max_steps" and value is None)):
+                raise SettingError(
+                    f"Expected {name} to be an integer of at least {least} and at most {most}, got {shortened(value)}."
+                )
+        if not (is_number(self.budget) and self.budget > 0.0):
+            raise SettingError(f"Expected budget > 0 seconds, got {shortened(self.budget)}.")
+        if not (is_number(self.encoder_budget) and 0.0 <= self.encoder_budget < float("inf")):
+            raise SettingError(f"Expected encoder_budget >= 0 seconds a cycle, got {shortened(self.encoder_budget)}.")
+        if not (is_number(self.novelty) and 0.0 <= self.novelty < float("inf")):
+            raise SettingError(f"Expected a finite novelty of 0 or more, got {shortened(self.novelty)}; 0 turns it off.")
         if not isinstance(self.params, Mapping):
-            raise SettingError(f"Expected params to be a table of the reducer's settings, got {self.params!r}.")
+            raise SettingError(f"Expected params to be a table of the reducer's settings, got {shortened(self.params)}.")
         for name, value in self.params.items():
             if not (value is None or isinstance(value, PLAIN)) or not BARE.fullmatch(str(name)):
                 raise SettingError(
-                    f"Expected params of plain names and values, got {name!r}: {value!r}; hand an object in."
+                    f"Expected params of plain names and values, got {shortened(name)}: "
+                    f"{shortened(value)}; hand an object in."
                 )
+        if not isinstance(self.reducer, str) and not callable(getattr(self.reducer, "fit", None)):
+            raise SettingError(f"Expected a reducer's name, or a scikit-learn transformer, got {shortened(self.reducer)}.")
         if not isinstance(self.policy, Policy):
-            raise SettingError(f"Expected a Policy, got {self.policy!r}.")
+            raise SettingError(f"Expected policy to be a Policy, got {shortened(self.policy)}.")
         Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
         if self.reject_fraction is not None and self.policy.guarantee == "pooled":
             raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
@@ -114,13 +125,14 @@ class Recipe:
             return replace(base, reducer=recipe, params={})
         if str(recipe) in RECIPES:
             return RECIPES[str(recipe)]
-        path = Path(recipe)
-        if path.is_file():
-            return cls.from_toml(path.read_text(encoding="utf-8"), where=str(path))
+        text = _text_of(Path(recipe))
+        if text is not None:
+            return cls.from_toml(text, where=str(recipe))
         if OWN.fullmatch(str(recipe)):
             return cls(str(recipe))
         raise SettingError(
-            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; {recipe} is none."
+            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; "
+            f"{str(recipe)[:200]} is none."
         )
 
     @classmethod
@@ -128,21 +140,23 @@ class Recipe:
         """Parse `to_toml`'s form; SettingError names an unknown key or a value out of range."""
         try:
             table = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:  # the former of an integer with thousands of digits, too
             raise SettingError(f"{where} is not TOML: {error}.") from error
-        known = {f.name for f in fields(cls)}
-        unknown = sorted(set(table) - known)
-        if unknown:
-            raise SettingError(f"{where} has an unknown key {', '.join(unknown)}; known are {', '.join(sorted(known))}.")
-        base = RECIPES.get(str(table.get("reducer", "conv")), cls())
-        policy = table.pop("policy", {})
+        _must_be_known(table, cls, where)
+        reducer, policy = table.get("reducer", "conv"), table.pop("policy", {})
+        if not isinstance(reducer, str):
+            raise SettingError(f"{where}: expected reducer to be a name, or module:Class, got {shortened(reducer)}.")
+        if not isinstance(policy, Mapping):
+            raise SettingError(f"{where}: expected policy to be a table, [policy], got {shortened(policy)}.")
+        _must_be_known(policy, Policy, f"{where}, policy,")
+        base = RECIPES.get(reducer, cls())
         if isinstance(table.get("params"), Mapping):
             kept = {name: value for name, value in table["params"].items() if (name, value) not in GONE}
             table["params"] = _without_none({RENAMED.get(name, name): value for name, value in kept.items()})
         try:
             return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
-        except TypeError as error:
-            raise SettingError(f"{where}: {error}.") from error
+        except (TypeError, SettingError) as error:
+            raise SettingError(f"{where}: {str(error).rstrip('.')}.") from error
 
     def to_toml(self) -> str:
         """The recipe as TOML; None is written as "none".
@@ -167,6 +181,28 @@ class Recipe:
     def with_policy(self, **changes: Any) -> Recipe:
         """The same with another alpha, lower_bound, interval or audit_rate."""
         return replace(self, policy=replace(self.policy, **changes))
+
+
+def _must_be_known(table: Mapping[str, Any], of: Any, where: str) -> None:
+    """SettingError for a key that is no field of this record."""
+    known = {f.name for f in fields(of)}
+    unknown = sorted(set(table) - known)
+    if unknown:
+        raise SettingError(f"{where} has an unknown key {listed(unknown)}; known are {', '.join(sorted(known))}.")
+
+
+def _text_of(path: Path) -> str | None:
+    """The text of a recipe's file; None where there is none. SettingError for what is no text, or cannot be read."""
+    try:
+        if not path.is_file():
+            return None
+        if path.stat().st_size > LARGEST:
+            raise SettingError(f"Expected a recipe of at most {LARGEST // 2**20} MB, {path} is larger.")
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise SettingError(f"{path} is not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8.") from error
+    except OSError as error:  # a name that is too long among them
+        raise SettingError(f"Cannot read the recipe {str(path)[:200]}: {error.strerror}.") from error
 
 
 def _named(reducer: Any, params: Params) -> tuple[str, Params]:

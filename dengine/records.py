@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from .errors import SettingError
+from .values import is_number, is_whole
+from .wording import shortened
 
 
 class Action(StrEnum):
@@ -52,6 +54,7 @@ class Outcome(StrEnum):
     UNKNOWN = "unknown"  # silence is not a success
 
 
+MOST = 10**9  # samples, or channels
 FITS = ("strict", "cut", "pad", "resample")  # in exported files the position here is the integer
 
 
@@ -79,14 +82,25 @@ class TraceSpec:
     columns: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "columns", (self.columns,) if isinstance(self.columns, str) else tuple(self.columns))
-        if not (self.samples >= 1 and self.channels >= 1 and self.rate_hz > 0):
+        try:
+            columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
+        except TypeError as error:
+            raise SettingError(f"Expected the names of columns, got {shortened(self.columns)}.") from error
+        object.__setattr__(self, "columns", columns)
+        whole = all(is_whole(n, 1, MOST) for n in (self.samples, self.channels))
+        if not (whole and is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")):
             raise SettingError(
-                f"Expected a trace of at least 1 sample and 1 channel at a rate above 0, got {self.samples} samples, "
-                f"{self.channels} channels, {self.rate_hz} Hz."
+                f"Expected a trace of at least 1 sample and 1 channel at a rate above 0, got {shortened(self.samples)} "
+                f"samples, {shortened(self.channels)} channels, {shortened(self.rate_hz)} Hz."
             )
+        if not (isinstance(self.unit, str) and all(isinstance(name, str) for name in self.columns)):
+            raise SettingError(
+                f"Expected a unit and columns of text, got {shortened(self.unit)}, {shortened(self.columns)}."
+            )
+        if self.limit is not None and not (is_number(self.limit) and self.limit > 0):
+            raise SettingError(f"Expected a limit above 0 in the trace's unit, or None, got {shortened(self.limit)}.")
         if self.fit not in FITS:
-            raise SettingError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
+            raise SettingError(f"Expected fit to be one of {', '.join(FITS)}, got {shortened(self.fit)}.")
         if self.columns and len(set(self.columns)) != self.channels:
             raise SettingError(
                 f"Expected {self.channels} different columns, a name a channel, got {', '.join(self.columns)}."

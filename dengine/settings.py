@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
-import numpy as np
-
 from . import __version__
 from .decision.policy import Policy
 from .errors import SettingError, StoreError
@@ -17,7 +15,10 @@ from .model.prediction import ModelPrediction
 from .model.rival import as_engine_model
 from .recipe import OBJECT, Recipe, described
 from .records import TraceSpec
+from .values import is_whole
+from .wording import shortened
 
+SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 LOOP = (
     "seed",
     "trace",
@@ -38,7 +39,7 @@ class EngineSettings:
     recipe : as it is in force.  seed : of the reducer and of the audits' coin, 0 or more.
     model : what a model that was handed in is called; None: the recipe describes the model.
     described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
-    trace : the traces' contract; None until the first trace.
+    trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
     """
 
     recipe: Recipe
@@ -46,10 +47,11 @@ class EngineSettings:
     model: str | None = None
     described: str | None = None
     trace: TraceSpec | None = None
+    inferred: bool = False
 
     def __post_init__(self) -> None:
-        if not isinstance(self.seed, int | np.integer) or isinstance(self.seed, bool) or self.seed < 0:
-            raise SettingError(f"Expected a seed of 0 or more, an integer, got {self.seed!r}.")
+        if not is_whole(self.seed, 0, SEEDS):
+            raise SettingError(f"Expected a seed of 0 or more, an integer of at most {SEEDS}, got {shortened(self.seed)}.")
         if not (self.trace is None or isinstance(self.trace, TraceSpec)):
             raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
 
@@ -59,6 +61,8 @@ class EngineSettings:
         known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
         if self.trace is not None:
             known["trace"] = json.dumps(asdict(self.trace))
+        if self.inferred:
+            known["inferred"] = "true"
         return known
 
     @classmethod
@@ -92,7 +96,8 @@ class EngineSettings:
                 raise SettingError(
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
-        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace_in(known))
+        inferred = "inferred" in known
+        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known), inferred)
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
@@ -156,8 +161,24 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
-    """The traces' contract among a store's settings; None before the first trace."""
-    return TraceSpec(**json.loads(known["trace"])) if "trace" in known else None
+    """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
+    if "trace" not in known:
+        return None
+    try:
+        return TraceSpec(**json.loads(known["trace"]))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(
+            f"Expected the contract of traces in the store's settings, got {shortened(known['trace'])}: {error}; restore "
+            "the store from a copy."
+        ) from error
+
+
+def seed_in(known: Mapping[str, str]) -> int:
+    """The seed among a store's settings. StoreError for what is none."""
+    seed = known.get("seed", "0")
+    if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
+        raise StoreError(f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy.")
+    return int(seed)
 
 
 def flat(recipe: Recipe) -> dict[str, Any]:

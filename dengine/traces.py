@@ -5,7 +5,6 @@ reason, the part is verified, and the cell goes on. So is a wrong length, where 
 """
 
 import re
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from .errors import TraceError
 from .folds import CLAMP, QUANTUM, hash_weights
 from .records import FITS, REASONS, Reason, TraceSpec
+from .wording import listed
 
 TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit)([ _\-.(\[].*)?", re.IGNORECASE)  # names of no channel
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
@@ -131,13 +131,6 @@ def _channels(frame: Any) -> list[Any]:
     """The columns of a DataFrame that are not of time."""
     dated = {name for name in frame.columns if str(frame[name].dtype).lower().startswith(("date", "time"))}
     return [name for name in frame.columns if name not in dated and not is_time(str(name))]
-
-
-def listed(names: Iterable[Any]) -> str:
-    """The first few of some names, and how many more there are."""
-    names = list(names)
-    few = ", ".join(map(str, names[:8]))
-    return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
 
 
 def _as_real(values: ArrayLike) -> NDArray[np.float32]:

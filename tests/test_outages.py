@@ -295,23 +295,28 @@ def test_ctrl_c_at_any_moment_leaves_engine_and_store_agreed(stream: Dataset, tm
     file, interrupted, rng = tmp_path / "engine.db", 0, np.random.default_rng(0)
     engine = engine_on(file)
     acknowledged: dict[str, bool] = {}
-    before = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
-    try:
-        for x, y in zip(stream.X[:300], stream.y[:300], strict=True):
-            try:
-                signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-4, 4e-3)))
-                decision = engine.decide(x)
-                if decision.action is Action.VERIFY:
-                    engine.report(decision.id, bool(y))
-                    acknowledged[decision.id] = bool(y)
-            except KeyboardInterrupt:
-                interrupted += 1
-            finally:
-                while signal.getitimer(signal.ITIMER_REAL)[0]:
-                    with contextlib.suppress(KeyboardInterrupt):
-                        signal.setitimer(signal.ITIMER_REAL, 0.0)
-    finally:
-        signal.signal(signal.SIGALRM, before)
+    armed = False
+
+    def interrupt(*_: object) -> None:
+        nonlocal armed
+        if armed:
+            armed = False
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    for x, y in zip(stream.X[:300], stream.y[:300], strict=True):
+        try:
+            armed = True
+            signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-4, 4e-3)))
+            decision = engine.decide(x)
+            if decision.action is Action.VERIFY:
+                engine.report(decision.id, bool(y))
+                acknowledged[decision.id] = bool(y)
+            armed = False
+        except KeyboardInterrupt:
+            interrupted += 1
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
     assert interrupted > 50
     expected = bounds(engine, stream)
     engine.close()

@@ -15,6 +15,7 @@ import click
 
 from .. import __version__
 from ..errors import DengineError
+from ..wording import without_password
 from .data import data
 from .export import export, import_labels
 from .interrupting import end_interrupted
@@ -37,7 +38,11 @@ class Verbs(click.Group):
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
         except (DengineError, OSError) as error:
-            raise click.ClickException(" ".join(str(error).split())) from error
+            raise click.ClickException(without_password(" ".join(str(error).split()))) from error
+        except click.ClickException as error:
+            # click repeats the words that it was called with.
+            error.message = without_password(error.message)  # type: ignore[misc]  # final for click, not for us
+            raise
         except KeyboardInterrupt:
             end_interrupted("Interrupted.")
 

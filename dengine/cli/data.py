@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import DataChoice, example, json_option, out_option, reading_options
+from .options import DataChoice, OutFolder, example, json_option, out_option, reading_options
 from .output import duration, show, write_json
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ FITTED = {
 @reading_options
 @out_option
 @json_option
-def data(source: DataChoice, out: Path | None, as_json: bool) -> None:
+def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     """Say what a data set is, and what is wrong with it.
 
     A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz or .h5
@@ -46,7 +45,7 @@ def data(source: DataChoice, out: Path | None, as_json: bool) -> None:
         from ..experiments.look import save
         from ..experiments.survey_picture import data_picture
 
-        files = [save(data_picture(dataset, found.name), out / "data.png")]
+        files = [save(data_picture(dataset, found.name), out.path / "data.png", force=out.force)]
     if as_json:
         write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
         return

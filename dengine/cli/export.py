@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from .options import example, json_option
+from .options import example, force_option, json_option
 from .output import imported_line, show, size, write_json
 
 
@@ -27,8 +27,9 @@ from .output import imported_line, show, size, write_json
     show_default=True,
     help="torchscript decides, audits and learns in the cell; onnx only decides.",
 )
+@force_option
 @json_option
-def export(store: str, out: Path, form: str, as_json: bool) -> None:
+def export(store: str, out: Path, form: str, force: bool, as_json: bool) -> None:
     """Write an engine's decision to a file for the controller.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`.
@@ -38,7 +39,7 @@ def export(store: str, out: Path, form: str, as_json: bool) -> None:
 
     write = {"torchscript": export_torchscript, "onnx": export_onnx}[form]
     with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
-        path = write(engine, out)
+        path = write(engine, out, force=force)
         version, references = engine.version, len(engine.model.index)
     n_bytes = path.stat().st_size
     if as_json:

@@ -11,6 +11,8 @@ from typing import NoReturn
 
 import click
 
+from ..wording import without_password
+
 INTERRUPTED = 130  # as shells have it: 128 + SIGINT
 
 Asked = Callable[[], bool]
@@ -47,5 +49,5 @@ def interruptible() -> Iterator[Asked]:
 def end_interrupted(*lines: str) -> NoReturn:
     """Say on stderr what was kept, and end with exit code 130."""
     for line in lines:
-        click.echo(line, err=True)
+        click.echo(without_password(line), err=True)
     click.get_current_context().exit(INTERRUPTED)

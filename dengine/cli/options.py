@@ -244,9 +244,31 @@ def must_have_mujoco() -> None:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-out_option = click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the CSV and the pictures; made if need be."
+force_option = click.option(
+    "--force", is_flag=True, help="Replace whatever files are there; by default only earlier ones of the same kind."
 )
+
+
+@dataclass(frozen=True)
+class OutFolder:
+    """Where a verb's CSV and pictures go. force : whether they replace whatever file is there."""
+
+    path: Path
+    force: bool = False
+
+
+def out_option(command: Command) -> Command:
+    """`--out` and `--force`, handed on as one `OutFolder`, `out`; None where no folder was named."""
+
+    @wraps(command)
+    def placed(out: Path | None, force: bool, **others: Any) -> Any:
+        return command(out=None if out is None else OutFolder(out, force), **others)
+
+    folder = click.Path(file_okay=False, path_type=Path)
+    option = click.option("--out", type=folder, help="Folder for the CSV and the pictures; made if need be.")
+    return option(force_option(placed))
+
+
 seed_option = click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="An integer; the same seed, the same run."
 )

@@ -8,10 +8,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from ..errors import DengineError
+from ..wording import without_password
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,10 +27,11 @@ WIDE = 80  # columns where no terminal says otherwise; every table fits them
 
 
 def show(*parts: Any) -> None:
-    """Print tables and lines to stdout; lines are broken between words, and a long path never."""
+    """Print tables and lines to stdout; lines are broken between words, a long path never, and passwords are masked."""
     out = console()
     for part in parts:
-        lines = fill(part, out.width, break_long_words=False, break_on_hyphens=False) if isinstance(part, str) else part
+        text = without_password(part) if isinstance(part, str) else ""
+        lines = fill(text, out.width, break_long_words=False, break_on_hyphens=False) if isinstance(part, str) else part
         out.print(lines, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
@@ -43,20 +48,22 @@ def write_json(result: Mapping[str, Any]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None."""
+    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None, no passwords."""
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [plain(each) for each in value]
-    if isinstance(value, bool | int | str) or value is None:
+    if isinstance(value, str):
+        return without_password(value)
+    if isinstance(value, bool | int) or value is None:
         return value
     if hasattr(value, "item"):  # a NumPy scalar
         return plain(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return str(value)
+    return without_password(str(value))
 
 
 def duration(seconds: float) -> str:
@@ -83,6 +90,23 @@ def imported_line(report: ImportReport, store: str) -> str:
     bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
     known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
     return f"Imported {report.imported} labelled traces into {store}.{bad}{known}"
+
+
+@contextmanager
+def refusals_last() -> Iterator[Callable[[Callable[[], list[Path]]], list[Path]]]:
+    """Gives a function that writes files; where they are refused, that is raised once what was computed has been shown."""
+    refusals: list[DengineError] = []
+
+    def attempt(write: Callable[[], list[Path]]) -> list[Path]:
+        try:
+            return write()
+        except DengineError as error:
+            refusals.append(error)
+            return []
+
+    yield attempt
+    for error in refusals:
+        raise error
 
 
 def certificate_record(certificate: Certificate) -> dict[str, Any]:
@@ -127,5 +151,5 @@ def progress(label: str, total: int, quiet: bool, left: Callable[[], str] | None
         TimeRemainingColumn() if left is None else Said(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(label, total=total)
+        task = bar.add_task(without_password(label), total=total)
         yield lambda step: bar.advance(task, step)

@@ -16,6 +16,7 @@ from .options import (
     GUARANTEE,
     LOWER_BOUND,
     DataChoice,
+    OutFolder,
     RecipeChoice,
     data_options,
     example,
@@ -82,7 +83,7 @@ def stream_options(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
 @stream_options
 def replay(
-    choice: RecipeChoice, confirm: bool, source: DataChoice, stream: Stream, out: Path | None, as_json: bool
+    choice: RecipeChoice, confirm: bool, source: DataChoice, stream: Stream, out: OutFolder | None, as_json: bool
 ) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
@@ -172,7 +173,7 @@ def compare(
     grid: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
-    out: Path | None,
+    out: OutFolder | None,
     as_json: bool,
 ) -> None:
     """Replay the same streams through several methods.
@@ -209,7 +210,7 @@ def _play(
     grid: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
-    out: Path | None,
+    out: OutFolder | None,
     as_json: bool,
 ) -> None:
     from ..experiments.grid import grid_tasks

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .output import duration, show, write_json
+from .options import OutFolder
+from .output import duration, refusals_last, show, write_json
 from .playing import Finished, Stream
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 MANY_CORES = 1000
 
 
-def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: Path | None, as_json: bool) -> None:
+def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: OutFolder | None, as_json: bool) -> None:
     """Print the tables, or one JSON document; write CSV, tables and pictures to `out`."""
     from ..experiments.paper import finding_lines
     from ..experiments.tables import (
@@ -38,24 +39,30 @@ def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out:
     frame = frame_of(replays)
     rows = [row | {"promise_kept": promise_kept(row)} for row in pool(frame, replays)]
     title = _title(dataset.name, by_name, not stream.shuffle)
-    files = _save(frame, replays, title, out) if out is not None else []
-    retrains = {name: [r for each in some for r in each.retrains] for name, some in by_name.items()}
-    found = _findings(frame)
-    if as_json:
-        dropped = [sum(not r.accepted for r in each.retrains) for each in replays]
-        sums = frame.assign(dropped=dropped).groupby(CONDITION, sort=False)["dropped"].sum()
-        rows = [row | {"retrains_dropped": int(n)} for row, n in zip(rows, sums, strict=True)]
-        about = {"verb": verb, "data": dataset.name, "in_order": not stream.shuffle, "interrupted": finished.interrupted}
-        about |= {"faults": dataset.faults}
-        costs = _costs(finished) | {"found": finished.found}
-        write_json(about | {"rows": rows, "findings": found, "costs": costs, "files": files})
-        return
-    show(pooled_table(rows, title))
-    show(*promise_lines(rows))
-    show(*(f"{name}: {retrain_line(reports)}{encoder_line(by_name[name])}" for name, reports in retrains.items()))
-    show(*finding_lines(found))
-    show(_cost_line(finished))
-    show(*(f"Wrote {path}" for path in files))
+    with refusals_last() as attempt:
+        files = [] if out is None else attempt(lambda: _save(frame, replays, title, out))
+        retrains = {name: [r for each in some for r in each.retrains] for name, some in by_name.items()}
+        found = _findings(frame)
+        if as_json:
+            dropped = [sum(not r.accepted for r in each.retrains) for each in replays]
+            sums = frame.assign(dropped=dropped).groupby(CONDITION, sort=False)["dropped"].sum()
+            rows = [row | {"retrains_dropped": int(n)} for row, n in zip(rows, sums, strict=True)]
+            about = {
+                "verb": verb,
+                "data": dataset.name,
+                "in_order": not stream.shuffle,
+                "interrupted": finished.interrupted,
+            }
+            about |= {"faults": dataset.faults}
+            costs = _costs(finished) | {"found": finished.found}
+            write_json(about | {"rows": rows, "findings": found, "costs": costs, "files": files})
+            return
+        show(pooled_table(rows, title))
+        show(*promise_lines(rows))
+        show(*(f"{name}: {retrain_line(reports)}{encoder_line(by_name[name])}" for name, reports in retrains.items()))
+        show(*finding_lines(found))
+        show(_cost_line(finished))
+        show(*(f"Wrote {path}" for path in files))
 
 
 def _grouped(replays: Sequence[Replay], key: Any) -> dict[Any, list[Replay]]:
@@ -90,34 +97,33 @@ def _findings(frame: pd.DataFrame) -> list[Any]:
     return findings(frame) if alike and _is_grid(frame) else []
 
 
-def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: Path) -> list[Path]:
+def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: OutFolder) -> list[Path]:
     from ..experiments.figures import curves, embedding_map, save
     from ..experiments.tables import write_csv
 
-    files = [write_csv(frame, out / "replays.csv")]
+    files = [write_csv(frame, out.path / "replays.csv", out.force)]
     if _is_grid(frame):
         files += _save_grid(frame, replays, out)
     else:
         by_row = _grouped(replays, lambda each: _row_name(each, frame))
-        files.append(save(curves(by_row, title), out / "curves.png"))
+        files.append(save(curves(by_row, title), out.path / "curves.png", force=out.force))
     for name, some in _grouped(replays, lambda each: each.name).items():
         if some[0].embedded:
             picture = embedding_map(some[0], title=f"{name}, newest parts of one replay (seed {some[0].seed})")
-            files.append(save(picture, out / f"map_{_slug(name)}.png"))
+            files.append(save(picture, out.path / f"map_{_slug(name)}.png", force=out.force))
     return files
 
 
-def _save_grid(frame: pd.DataFrame, replays: Sequence[Replay], out: Path) -> list[Path]:
+def _save_grid(frame: pd.DataFrame, replays: Sequence[Replay], out: OutFolder) -> list[Path]:
     from ..experiments.figures import save
     from ..experiments.grid_figure import grid_figure
     from ..experiments.paper import grid_lines
+    from ..outputs import TABLES, write_output
 
-    page = out / "tables.md"
-    page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text("\n".join(grid_lines(frame)) + "\n", encoding="utf-8")
-    files = [page]
+    page = "\n".join(grid_lines(frame)) + "\n"
+    files = [write_output(out.path / "tables.md", page.encode("utf-8"), TABLES, out.force, make_folder=True)]
     for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
-        files.append(save(grid_figure(some, name), out / f"grid_{_slug(name)}.png"))
+        files.append(save(grid_figure(some, name), out.path / f"grid_{_slug(name)}.png", force=out.force))
     return files
 
 

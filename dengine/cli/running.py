@@ -12,6 +12,7 @@ import click
 from .interrupting import EndAskedError, end_interrupted, interruptible
 from .options import (
     DataChoice,
+    OutFolder,
     RecipeChoice,
     data_options,
     example,
@@ -22,7 +23,7 @@ from .options import (
     scenario_option,
     short_name,
 )
-from .output import certificate_record, progress, show, write_json
+from .output import certificate_record, progress, refusals_last, show, write_json
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
@@ -62,7 +63,7 @@ def run(
     cycles: int,
     store: str | None,
     seed: int | None,
-    out: Path | None,
+    out: OutFolder | None,
     as_json: bool,
 ) -> None:
     """Drive a cell: verify, learn, and verify less.
@@ -178,26 +179,27 @@ CELLS = {"simulated": _simulated, "replay": _recorded}
 
 
 def _report(
-    log: RunLog, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: Path | None, as_json: bool
+    log: RunLog, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: OutFolder | None, as_json: bool
 ) -> None:
     from ..experiments.tables import retrain_line
 
     total, stretches = log.summary(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst = max((r.seconds for r in log.retrains), default=None)
-    files = _save(log, title, out) if out is not None else []
-    if as_json:
-        about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
-        counts = {"total": total, "stretches": stretches, "cell": clock}
-        said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
-        said |= {"certificate": certificate_record(told.certificate)}
-        write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
-        return
-    show(_table([*stretches, total], title, clock is not None))
-    if clock is not None:
-        show(_clock_line(clock))
-    show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
-    show(*(f"Wrote {path}" for path in files))
+    with refusals_last() as attempt:
+        files = [] if out is None else attempt(lambda: _save(log, title, out))
+        if as_json:
+            about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
+            counts = {"total": total, "stretches": stretches, "cell": clock}
+            said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
+            said |= {"certificate": certificate_record(told.certificate)}
+            write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
+            return
+        show(_table([*stretches, total], title, clock is not None))
+        if clock is not None:
+            show(_clock_line(clock))
+        show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
+        show(*(f"Wrote {path}" for path in files))
 
 
 def _clock_line(clock: dict[str, Any]) -> str:
@@ -246,8 +248,9 @@ def _cells(row: dict[str, Any], timed: bool) -> list[str]:
     ]
 
 
-def _save(log: RunLog, title: str, out: Path) -> list[Path]:
+def _save(log: RunLog, title: str, out: OutFolder) -> list[Path]:
     from ..experiments.figures import run_picture, save
     from ..experiments.tables import write_csv
 
-    return [write_csv(log.to_frame().reset_index(), out / "run.csv"), save(run_picture(log, title), out / "run.png")]
+    table = write_csv(log.to_frame().reset_index(), out.path / "run.csv", out.force)
+    return [table, save(run_picture(log, title), out.path / "run.png", force=out.force)]

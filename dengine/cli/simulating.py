@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .options import example, json_option, must_have_mujoco, n_jobs_option, scenario_option, seed_option
+from .options import example, force_option, json_option, must_have_mujoco, n_jobs_option, scenario_option, seed_option
 from .output import progress, show, write_json
 
 
@@ -21,16 +21,20 @@ from .output import progress, show, write_json
 @scenario_option
 @seed_option
 @n_jobs_option(-1, "Processes; -1: one a core.")
+@force_option
 @json_option
-def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, as_json: bool) -> None:
+def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool, as_json: bool) -> None:
     """Simulate insertions and write their forces and labels."""
+    from ..outputs import TRACES, check_output
+
     must_have_mujoco()
+    check_output(out, TRACES, force)  # before minutes of physics
     from ..cells.simulation.generate import save_traces
     from ..cells.simulation.generate import simulate as simulate_traces
 
     with progress(f"simulating {scenario}", n, as_json) as advance:
         traces = simulate_traces(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
-    path = save_traces(out, traces)
+    path = save_traces(out, traces, force)
     good = int(traces.y.sum())
     if as_json:
         write_json({"verb": "simulate", "simulated": True, "scenario": scenario, "n": n, "successes": good, "file": path})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..wording import without_password
 from .options import example, json_option
 from .output import certificate_record, duration, show, write_json
 
@@ -128,11 +128,11 @@ def _share(some: int, of: int) -> float | None:
 def _table(store: str, rows: list[tuple[str, str]]) -> Any:
     from rich.table import Table
 
-    table = Table(title=store, show_header=False, title_justify="left")
+    table = Table(title=without_password(store), show_header=False, title_justify="left")
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(without_password, row))
     return table
 
 
@@ -147,7 +147,7 @@ def _settings_rows(held: Held) -> Iterator[tuple[str, str]]:
         "retrain",
         (f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}, on the newest {recipe.window:,}"),
     )
-    yield "trace", _contract(settings.get("trace"))
+    yield "trace", _contract(settings)
 
 
 def _own_rows(recipe: Recipe, seed: str) -> Iterator[tuple[str, str]]:
@@ -166,12 +166,12 @@ def _neighbours(recipe: Recipe) -> str:
     return f"the nearest {100 * recipe.fraction:g} % of the references{judged}"
 
 
-def _contract(trace: str | None) -> str:
-    from ..records import TraceSpec
+def _contract(settings: dict[str, str]) -> str:
+    from ..settings import trace_in
 
-    if trace is None:
+    spec = trace_in(settings)
+    if spec is None:
         return "none yet: the first trace sets it"
-    spec = TraceSpec(**json.loads(trace))
     channels = "" if spec.channels == 1 else f"{spec.channels} channels of "
     limit = "" if spec.limit is None else f", sensor limit {spec.limit:g} {spec.unit}"
     seconds = duration(spec.samples / spec.rate_hz)

@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 def normal_quantile(alpha: float) -> float:
     """Z of a two-sided interval: the 1 - alpha/2 quantile of the standard normal distribution."""
-    if not 0.0 < alpha < 1.0:
+    if not 0.0 < alpha / 2.0 < 1.0 - alpha / 2.0 < 1.0:  # one that is too small to be told from 0 is none either
         raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for a 95 % interval.")
     return NormalDist().inv_cdf(1.0 - alpha / 2.0)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Real
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -13,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from .._lazy import find_class
 from ..errors import SettingError
 from ..records import ACTIONS, Action
+from ..values import is_number
+from ..wording import shortened
 from .bounds import INTERVALS, Bounds, normal_quantile
 from .certificate import Stops
 
@@ -51,22 +52,24 @@ class Policy:
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
-            if not isinstance(getattr(self, name), Real):
-                raise SettingError(f"Expected a number as {name}, got {getattr(self, name)!r}.")
+            if not is_number(getattr(self, name)):
+                raise SettingError(f"Expected a number as {name}, got {shortened(getattr(self, name))}.")
         if not isinstance(self.guarantee, str):
-            raise SettingError(f"Expected a guarantee's name, or module:Class as text, got {self.guarantee!r}.")
+            raise SettingError(f"Expected a guarantee's name, or module:Class as text, got {shortened(self.guarantee)}.")
         normal_quantile(self.alpha)
         if not 0.5 < self.lower_bound < 1.0:
             raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
         if not isinstance(self.interval, str) or self.interval not in INTERVALS:
-            raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {self.interval!r}.")
+            raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {shortened(self.interval)}.")
         if not 0.0 <= self.audit_rate < 1.0:
             raise SettingError(f"Expected 0 <= audit_rate < 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
         if ":" not in self.guarantee and self.guarantee not in RULES:
-            raise SettingError(f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {self.guarantee!r}.")
+            raise SettingError(
+                f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {shortened(self.guarantee)}."
+            )
 
         if self.stops not in get_args(Stops):
-            raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {self.stops!r}.")
+            raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
 
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
@@ -111,11 +114,11 @@ class Neighbourhood:
     reject_fraction: float | None = None
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.radius, Real) and self.radius > 0.0 and math.isfinite(self.radius)):
-            raise SettingError(f"Expected a finite radius > 0, got {self.radius!r}.")
+        if not (is_number(self.radius) and 0.0 < self.radius < math.inf):
+            raise SettingError(f"Expected a finite radius > 0, got {shortened(self.radius)}.")
         for name in ("fraction", "reject_fraction"):
             value = getattr(self, name)
-            if value is not None and not (isinstance(value, Real) and 0.0 < value <= 1.0):
-                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {value!r}.")
+            if value is not None and not (is_number(value) and 0.0 < value <= 1.0):
+                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {shortened(value)}.")
         if self.reject_fraction is not None and self.fraction is None:
             raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")

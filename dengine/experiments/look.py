@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import OutputError
+from ..outputs import PICTURE, write_output
 from ..records import Action
 
 if TYPE_CHECKING:
@@ -98,9 +101,11 @@ def draw_verified(
     axes.set(ylim=(0, 104))
 
 
-def save(figure: Figure, path: str | Path, dpi: int = 120) -> Path:
-    """Write a figure as its suffix says; makes the folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
-    return path
+def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
+    """Write a figure as its suffix says; makes the folder. OutputError where the file there is no picture, or `force`."""
+    buffer = BytesIO()
+    try:
+        figure.savefig(buffer, dpi=dpi, format=Path(path).suffix.removeprefix(".") or "png")
+    except ValueError as error:
+        raise OutputError(f"Cannot draw {path}: {error}; name it .png, .pdf or .svg.") from error
+    return write_output(path, buffer.getvalue(), PICTURE, force, make_folder=True)

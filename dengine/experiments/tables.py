@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..outputs import table_of, write_output
 from ..records import RetrainReport
 from .rates import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
 from .replay import Replay
@@ -206,9 +207,7 @@ def encoder_line(replays: Sequence[Replay]) -> str:
     return f" {seconds:.1f} s of the encoder's training assumed a replay, the longest slice in {longest:.3f} s."
 
 
-def write_csv(frame: pd.DataFrame, path: str | Path) -> Path:
-    """The frame as CSV; makes the folder."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    frame.to_csv(path, index=False)
-    return path
+def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:
+    """The frame as CSV; makes the folder. OutputError where the file there is no earlier table of its kind, or `force`."""
+    text = frame.to_csv(index=False, lineterminator="\n")
+    return write_output(path, text.encode("utf-8"), table_of(map(str, frame.columns)), force, make_folder=True)

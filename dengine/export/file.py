@@ -9,9 +9,12 @@ import hashlib
 import io
 import json
 import os
+import re
 import time
 import zipfile
-from collections.abc import Callable
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,14 +24,19 @@ import torch
 from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS
-from ..errors import ExportError
+from ..errors import ExportError, OutputError
 from ..model.base import Exportable
+from ..outputs import SUMS, Kind, check_output, write_output
 from ..records import Action, Reason, TraceSpec
 from .module import FIELDS, DecisionModule
 
 SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
 METADATA = "dengine.json"
 SCRIPTABLE = "conv, pca or rocket"
+SHA256 = re.compile(r"[0-9a-f]{64}")
+SUM_BYTES = 2**16
+TRIES = 3
+UNREADABLE = (zipfile.BadZipFile, zlib.error, StopIteration, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 
 def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
@@ -98,22 +106,50 @@ def _guarantee_of(rule: Any) -> str:
     return next((name for name, rules in RULES.items() if own in rules.values()), own)
 
 
-def write_checked(target: Path, write: Callable[[Path], None]) -> Path:
-    """Write a file beside its name, sum it, and move both into place, so that a killed export leaves no half file."""
-    partial = target.with_name(target.name + ".partial")
-    try:
-        partial.touch()  # torch names an unwritable place in words of its own
-        write(partial)
-        digest = hashlib.sha256(partial.read_bytes()).hexdigest()
-        sum_file(target).write_text(f"{digest}  {target.name}\n", encoding="utf-8")
-        partial.replace(target)
-    except OSError as error:
-        raise ExportError(
-            f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
-        ) from error
-    finally:
-        partial.unlink(missing_ok=True)
+def check_target(path: str | os.PathLike[str], kind: Kind, force: bool) -> None:
+    """ExportError where a file and its sum must not be written: before the work of an export."""
+    with _as_export_error():
+        check_output(path, kind, force)
+        check_output(sum_file(Path(path)), SUMS, force)
+
+
+def write_checked(path: str | os.PathLike[str], content: bytes, kind: Kind, force: bool = False) -> Path:
+    """Write a file and its checksum; ExportError where they must not or cannot be written.
+
+    A file and its sum are two renames, and a kill may come between: so until both are done the sum file lists the new sum
+    and that of the file that is there, a line each, and whichever file is there is accepted.
+    """
+    target, digest = Path(path), hashlib.sha256(content).hexdigest()
+    check_target(target, kind, force)
+    with _as_export_error():
+        sums = [digest, *_accepted(target, digest)]
+        write_output(sum_file(target), _sum_lines(sums, target), SUMS, force)
+        write_output(target, content, kind, force)
+        if len(sums) > 1:
+            write_output(sum_file(target), _sum_lines([digest], target), SUMS, force)
     return target
+
+
+def _sum_lines(sums: Sequence[str], target: Path) -> bytes:
+    return "".join(f"{digest}  {target.name}\n" for digest in sums).encode()
+
+
+def _accepted(target: Path, new: str) -> list[str]:
+    """The sum of the file that is there, where its sum file lists it and it is another one."""
+    try:
+        checked_bytes(target)
+    except ExportError:
+        return []  # it was not accepted before
+    old = hashlib.sha256(target.read_bytes()).hexdigest()
+    return [old] if old != new else []
+
+
+@contextmanager
+def _as_export_error() -> Iterator[None]:
+    try:
+        yield
+    except OutputError as error:
+        raise ExportError(str(error)) from error
 
 
 def sum_file(path: Path) -> Path:
@@ -127,22 +163,37 @@ def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def checked_bytes(path: Path) -> bytes:
-    """A file's content; ExportError unless its sum is right. libtorch itself does not notice flipped bits."""
+    """A file's content; ExportError unless its sum file lists its sum. libtorch itself does not notice flipped bits."""
+    _read(path, most=0)  # of the two it is the file itself that is named where both are missing
+    for _ in range(TRIES):  # an export may replace file and sums between the two looks
+        sums = _sums_of(path)
+        content = _read(path)
+        found = hashlib.sha256(content).hexdigest()
+        if found in sums:
+            return content
+        if _sums_of(path) == sums:
+            break
+    expected = " or ".join(f"{digest[:12]}…" for digest in sums)
+    raise ExportError(f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {expected}; copy it again.")
+
+
+def _sums_of(path: Path) -> list[str]:
+    """The sums that a sum file lists: one, or two where an export was killed between its two renames."""
+    lines = _read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace").split("\n")
+    sums = [line.split()[0] for line in lines if line.strip()]
+    if not sums or any(not SHA256.fullmatch(each) for each in sums):
+        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum; copy it again together with {path.name}.")
+    return sums
+
+
+def _read(path: Path, most: int = -1) -> bytes:
     try:
-        content = path.read_bytes()
-        words = sum_file(path).read_text(encoding="utf-8").split()
+        with path.open("rb") as file:
+            return file.read(most)
     except FileNotFoundError as error:
         raise ExportError(f"{error.filename} is missing; an export is a file and its .sha256, copied together.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ExportError(f"{path} or its .sha256 cannot be read: {error}.") from error
-    if not words or len(words[0]) != 64:
-        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum; copy it again together with {path.name}.")
-    found = hashlib.sha256(content).hexdigest()
-    if found != words[0]:
-        raise ExportError(
-            f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {words[0][:12]}…; copy it again."
-        )
-    return content
+    except (OSError, ValueError) as error:
+        raise ExportError(f"{path} cannot be read: {error}.") from error
 
 
 def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
@@ -151,7 +202,7 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             name = next(n for n in archive.namelist() if n.endswith(f"extra/{METADATA}"))
             metadata = json.loads(archive.read(name))
-    except (zipfile.BadZipFile, StopIteration, ValueError) as error:
+    except UNREADABLE as error:
         raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error
     return checked_schema(metadata, path)
 

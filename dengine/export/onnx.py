@@ -32,9 +32,10 @@ from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
 from ..model.module import NOVEL
+from ..outputs import ONNX
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
-from .file import METADATA, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
+from .file import METADATA, check_target, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
 from .module import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision
 
@@ -46,27 +47,27 @@ BOUND_TOLERANCE = 1e-6
 EDGE = 2  # another runtime adds in another order: a reference on the ball's very surface may fall on either side
 
 
-def export_onnx(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:
+def export_onnx(
+    engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None, force: bool = False
+) -> Path:
     """Write `path` and `path`.sha256: the decision of a `DataEngine` or a fitted `ModelPrediction` as ONNX.
 
     Raises ExportError where the engine audits, its rule learns, a part came again, nothing was trained yet, the reducer or
-    the interval has no module, a package is missing, or onnxruntime does not decide as the model does.
+    the interval has no module, a package is missing, onnxruntime does not decide as the model does, or `path` cannot be
+    written. force : as of `export_torchscript`.
     """
+    check_target(path, ONNX, force)
     onnx = _package("onnx")
     source = source_of(engine_or_model, trace)
     decision_module(source)  # the same refusals as for TorchScript
     _refuse_what_changes(source)
     twin = Twin(source).eval()
     metadata = describe(source) | {"format": "onnx", "learns": False}
-
-    def write(partial: Path) -> None:
-        program = _to_onnx(twin, source.trace)
-        onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata)})
-        content = program.SerializeToString()
-        _check(OnnxModel(content, metadata), source.model, source.trace)
-        partial.write_bytes(content)
-
-    return write_checked(Path(path), write)
+    program = _to_onnx(twin, source.trace)
+    onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata)})
+    content = program.SerializeToString()
+    _check(OnnxModel(content, metadata), source.model, source.trace)
+    return write_checked(path, content, ONNX, force)
 
 
 def load_onnx(path: str | os.PathLike[str]) -> OnnxModel:

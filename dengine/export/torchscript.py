@@ -22,34 +22,43 @@ from ..deciding import as_part
 from ..decision.rule import SAFE_MODE, script
 from ..errors import ExportError
 from ..folds import part_hash
+from ..labels import as_success
+from ..outputs import TORCHSCRIPT
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..traces import as_trace, as_traces
-from .file import METADATA, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
+from .file import METADATA, check_target, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
 from .module import METHODS
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
 
 
-def export_torchscript(engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None) -> Path:
+def export_torchscript(
+    engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None, force: bool = False
+) -> Path:
     """Write `path` and `path`.sha256: a `DataEngine`'s decision, or a fitted `ModelPrediction`'s (without audits).
 
     An accepted part of which nothing is known yet stays with the engine: export when none is under way.
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
-    Raises ExportError where nothing was trained yet, or the reducer, the interval or the rule cannot be scripted.
+    force : replace whatever file is there; by default only an earlier export is, and never a database, a folder or a link.
+    Raises ExportError where nothing was trained yet, the reducer, the interval or the rule cannot be scripted, or `path`
+    cannot be written: what was there is then as it was.
     """
+    check_target(path, TORCHSCRIPT, force)
     source = source_of(engine_or_model, trace)
     try:
         frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=list(METHODS))
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
-    return write_checked(Path(path), lambda partial: _save(frozen, partial, metadata))
+    return write_checked(path, _content(frozen, metadata), TORCHSCRIPT, force)
 
 
-def _save(module: Any, path: Path, metadata: dict[str, Any]) -> None:
-    """One file with its description inside."""
-    torch.jit.save(module, str(path), _extra_files={METADATA: json.dumps(metadata).encode()})
+def _content(module: Any, metadata: dict[str, Any]) -> bytes:
+    """One file with its description inside, in memory: libtorch ends the whole process where a disk is full."""
+    buffer = io.BytesIO()
+    torch.jit.save(module, buffer, _extra_files={METADATA: json.dumps(metadata).encode()})
+    return buffer.getvalue()
 
 
 def _golden(module: Any, spec: TraceSpec) -> dict[str, Any]:
@@ -103,7 +112,7 @@ class ExportedModel:
 
         The trace becomes a reference, and the rule is told. A faulty trace is not learned from.
         """
-        return self._tell(self._asked.learn, trace, bool(success), _hash_of(part))
+        return self._tell(self._asked.learn, trace, as_success(success), _hash_of(part))
 
     def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
         """Tell that an accepted part was bad and stopped the system; as `learn`."""
@@ -120,10 +129,13 @@ class ExportedModel:
         """Why everything is verified at present, in words; "" where it is not."""
         return SAFE_MODE[self._asked.safe_mode()]
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum."""
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum.
+
+        force : as of `export_torchscript`.
+        """
         now = {"references": self._asked.n_references(), "references_sha256": None}  # the sum is that of the first export
-        return write_checked(Path(path), lambda partial: _save(self.module, partial, self.metadata | now))
+        return write_checked(path, _content(self.module, self.metadata | now), TORCHSCRIPT, force)
 
 
 class FirstSchema:

@@ -22,6 +22,7 @@ from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.rule import SAFE_MODE, DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
+from ..labels import as_labels, as_success
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..reducers import make_reducer, reducer_of
@@ -94,9 +95,8 @@ class ModelPrediction(EngineModel):
     @property
     def description(self) -> str:
         """Its reducer, its classifier and its folds, with their settings."""
-        return (
-            f"{described(self.reducer)} under {described(self.classifier)}, {self.folds} folds, {type(self.rule).__name__}"
-        )
+        own = described(self.reducer), described(self.classifier)
+        return f"{own[0]} under {own[1]}, {self.folds} folds, {type(self.rule).__name__}"
 
     def in_force(self, recipe: Recipe) -> Recipe:
         """The recipe with the classifier's numbers."""
@@ -128,7 +128,7 @@ class ModelPrediction(EngineModel):
         their content.
         Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
         """
-        X, y = as_traces(X), np.asarray(y, dtype=np.int64)
+        X, y = as_traces(X), as_labels(y)
         parts = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
         folds = fold_of(parts, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop)
@@ -175,7 +175,7 @@ class ModelPrediction(EngineModel):
         """Take in one labelled trace, (T,) or (C, T), as a reference."""
         X = as_traces(np.asarray(x)[None])
         hash_ = int(content_hash(X)[0])
-        self.add_reference(self.reference_point(X[0], hash_), int(np.asarray(y)), hash_)
+        self.add_reference(self.reference_point(X[0], hash_), int(as_success(np.asarray(y))), hash_)
         return self
 
     def reference_point(

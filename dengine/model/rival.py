@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import SettingError
 from ..records import Action, Reason
 from ..reducers.base import Floats, Ints, StopRule
-from .base import EngineModel, Model, Prediction
+from ..wording import shortened
+from .base import EngineModel, Model, Prediction, checked
 
 
 def as_engine_model(model: Model) -> EngineModel:
@@ -58,7 +59,8 @@ class RivalAdapter(EngineModel):
         (n_success,), (n_failure,) = self.model.count(X)
         action = Action(self.model.decide(X)[0])
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
-        return Prediction(action, float(lower), float(upper), int(n_success), int(n_failure), None, reason)
+        counts = _whole(n_success), _whole(n_failure)
+        return checked(Prediction(action, float(lower), float(upper), *counts, None, reason))
 
     def reference_point(
         self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
@@ -73,3 +75,11 @@ class RivalAdapter(EngineModel):
     def successor(self) -> RivalAdapter:
         """A deep copy, to train while this one answers."""
         return RivalAdapter(copy.deepcopy(self.model))
+
+
+def _whole(count: Any) -> int:
+    """A rival's count as an integer; ValueError for one that is not whole."""
+    whole = int(count)
+    if whole != count:
+        raise ValueError(f"Expected a whole number of labels, got {shortened(count)}.")
+    return whole

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..archives import UNREADABLE, must_fit, read_archive
 from ..errors import DataError, TraceError
 from ..traces import as_trace, is_time, spec_of
 from .asked import Asked
@@ -19,23 +19,18 @@ from .labels import label_of
 from .lengths import Collected, as_dataset, refit
 from .recording import rate_of, seconds_of
 
-LARGEST = 8 * 2**30  # bytes of an archive's arrays, unpacked
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")
 
 
 def read_npz(path: Path, name: str, asked: Asked) -> Dataset:
     """`X`, `y`, and what is known beside them: `scale`, `rate_hz`, `unit`, `cause`, `channels`, and the parts' numbers."""
+    found, have = read_archive(path, (*USED, asked.part))
     try:
-        with zipfile.ZipFile(path) as archive:
-            _must_be_small(sum(each.file_size for each in archive.infolist()), path)
-        with np.load(path, allow_pickle=False) as file:
-            found = {key: file[key] for key in file.files if key in (*USED, asked.part)}
-            return _from_arrays(found, file.files, path, name, asked)
-    except (OSError, ValueError, TypeError, MemoryError, zipfile.BadZipFile, EOFError) as error:
+        return _from_arrays(found, have, path, name, asked)
+    except (ValueError, TypeError) as error:
         if isinstance(error, DataError):
             raise
-        said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
-        raise DataError(f"Cannot read {path} as an .npz file of plain arrays: {said}.") from error
+        raise DataError(f"Cannot read {path} as an .npz file of plain arrays: {error}.") from error
 
 
 def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
@@ -48,18 +43,14 @@ def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
         with h5py.File(path, "r") as file:
             have: list[str] = []
             file.visititems(lambda key, item: have.append(key) if isinstance(item, h5py.Dataset) else None)
-            _must_be_small(sum(file[key].nbytes for key in have), path)
-            found = {key: _plain(file[key]) for key in have if key in (*USED, asked.part)}
+            wanted = [key for key in have if key in (*USED, asked.part)]
+            must_fit(sum(float(file[key].nbytes) for key in wanted), path)
+            found = {key: _plain(file[key]) for key in wanted}
             return _from_arrays(found, have, path, name, asked)
-    except (OSError, TypeError, ValueError) as error:
+    except UNREADABLE as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"Cannot read {path} as an HDF5 file: {error}.") from error
-
-
-def _must_be_small(size: int, path: Path) -> None:
-    if size > LARGEST:
-        raise DataError(f"Expected at most {LARGEST // 2**30} GB of arrays in {path}, got {size / 2**30:.0f} GB.")
 
 
 def _plain(dataset: Any) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..archives import UNREADABLE, must_fit
 from ..errors import DataError
-from ..traces import is_time, listed
+from ..traces import is_time
+from ..wording import listed
 from .asked import Asked
 from .dataset import Dataset, Fault, UnreadableError
 from .folder import FORCE
@@ -59,7 +62,7 @@ def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
     how: dict[str, Any] = {"sep": delimiter, "decimal": "," if comma else ".", "float_precision": "round_trip"}
     try:
         frame = pd.read_csv(body, header=None, names=header, index_col=False, low_memory=False, **how)
-    except (ValueError, pd.errors.ParserError) as error:
+    except (ValueError, OverflowError, pd.errors.ParserError) as error:
         raise DataError(f"Cannot read {path} as CSV: {' '.join(str(error).split())}.") from error
     return from_frame(frame, asked, name, path.name, faults, [number for number, _ in rows])
 
@@ -71,10 +74,22 @@ def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
     if find_spec("pyarrow") is None:
         raise DataError('Expected pyarrow for Parquet files, it is not installed: pip install "dengine[files]".')
     try:
+        _must_fit(path)
         frame = pd.read_parquet(path)
-    except (OSError, ValueError) as error:
+    except UNREADABLE as error:
+        if isinstance(error, DataError):
+            raise
         raise DataError(f"Cannot read {path} as a Parquet file: {error}.") from error
     return from_frame(frame, asked, name, path.name)
+
+
+def _must_fit(path: Path) -> None:
+    """DataError for a Parquet file that claims, or whose cells alone are, more than memory holds."""
+    parquet: Any = import_module("pyarrow.parquet")  # untyped
+    with parquet.ParquetFile(path) as file:
+        about = file.metadata
+    groups = (about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+    must_fit(max(float(sum(groups)), 8.0 * about.num_rows * about.num_columns), path)
 
 
 def from_frame(

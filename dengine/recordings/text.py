@@ -33,15 +33,21 @@ def read_text(path: Path) -> str:
 def read_lines(path: Path) -> tuple[list[str], Lines, str]:
     """A file's header, its other lines with their numbers, without blank ones, and its delimiter."""
     lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
-    delimiter = delimiter_of(lines[0][1])
-    return named_columns(lines[0][1], delimiter), lines[1:], delimiter
+    delimiter = delimiter_of(lines[0][1] if lines else "")
+    names = named_columns(lines[0][1], delimiter) if lines else []
+    if not names:
+        raise UnreadableError("Expected a header, the first line names no column", 1)
+    return names, lines[1:], delimiter
 
 
 def read_header(path: Path) -> list[str]:
     """The names in a file's first line; none where it has no such line."""
     with path.open("rb") as file:
         line = file.readline(2**20).decode("utf-8-sig", errors="replace")
-    return named_columns(line, delimiter_of(line)) if line.strip() else []
+    try:
+        return named_columns(line, delimiter_of(line)) if line.strip() else []
+    except UnreadableError:  # said when the whole file is read
+        return []
 
 
 def delimiter_of(line: str) -> str:
@@ -51,7 +57,10 @@ def delimiter_of(line: str) -> str:
 
 def split_line(line: str, delimiter: str) -> list[str]:
     """Its words, without blanks and quotes around them; a delimiter between quotes is part of a word."""
-    words = next(csv.reader([line.rstrip("\r\n").replace("\0", "")], delimiter=delimiter, skipinitialspace=True), [])
+    try:
+        words = next(csv.reader([line.rstrip("\r\n").replace("\0", "")], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error as error:  # a field of megabytes
+        raise UnreadableError(f"Expected separated values, got a line of {len(line)} characters: {error}") from error
     return [word.strip().strip('"') for word in words]
 
 

@@ -7,9 +7,13 @@ from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from .._lazy import find_class, lazy_names
 from ..errors import SettingError
 from ..recipe import Recipe
+from ..values import is_number, is_whole
+from ..wording import shortened
 
 if TYPE_CHECKING:
     from .base import Reducer
@@ -37,6 +41,8 @@ _CLASSES = {
     "plane": "dengine.reducers.plane:PlaneReducer",
 }
 
+MOST = 2**31 - 1  # of a parameter that is an integer
+
 __all__ = [
     "REDUCERS",
     "ConvReducer",
@@ -54,7 +60,9 @@ __all__ = [
 def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for: UMAP alone takes seconds."""
     if name not in _CLASSES and ":" not in name:
-        raise SettingError(f"Expected a reducer among {', '.join(_CLASSES)}, or module:Class of your own, got {name!r}.")
+        raise SettingError(
+            f"Expected a reducer among {', '.join(_CLASSES)}, or module:Class of your own, got {shortened(name)}."
+        )
     found = find_class(_CLASSES.get(name, name))
     if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
         raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")
@@ -68,7 +76,23 @@ def make_reducer(name: str, **params: Any) -> Any:
     unknown = sorted(set(params) - set(allowed))
     if unknown:
         raise SettingError(f"{found.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}.")
+    if name in _CLASSES:
+        for key, value in params.items():
+            _must_be_like(allowed[key].default, key, value)
     return found(**params)
+
+
+def _must_be_like(default: Any, key: str, value: Any) -> None:
+    """SettingError for a parameter of another type than its default: or every retrain would fail by it, one by one."""
+    what = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}.get(type(default))
+    fits = {
+        bool: isinstance(value, bool | np.bool_),
+        str: isinstance(value, str),
+        int: is_whole(value, 2 if key == "folds" else -MOST, 1000 if key == "folds" else MOST),
+        float: is_number(value),
+    }
+    if what is not None and not fits[type(default)]:
+        raise SettingError(f"Expected {what} as the reducer's {key}, as {default!r}, got {shortened(value)}.")
 
 
 def reducer_of(recipe: Recipe, seed: int) -> Any:

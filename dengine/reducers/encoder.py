@@ -15,8 +15,6 @@ Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, f
 Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36, for several channels.
 """
 
-import zipfile
-import zlib
 from itertools import combinations
 from typing import Any
 
@@ -25,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..archives import read_archive
 from ..errors import SettingError
 from .features import CLIP, Carry, Features
 
@@ -39,7 +38,6 @@ START = 4.0  # size of the trained directions before they are trained: outputs o
 SCALE_TRACES = 2000  # that set scales and centres
 BASIS_TRACES = 1000  # that set the principal components
 LEARNED = ("kernel", "threshold", "slope", "unit", "middle", "mix")  # what a start from another encoder takes over
-UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 class ConvEncoder(Features):
@@ -196,12 +194,11 @@ def start_from(encoder: ConvEncoder, path: str) -> None:
     """Set what an encoder learned from an .npz of `weights_of`; SettingError where it cannot be read, or sizes differ."""
     own = _sizes(encoder)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            found = {name: stored[name] for name in LEARNED}
-            sizes = {name: int(stored[name]) for name in own}
-    except UNREADABLE as error:
-        said = "it holds something else" if "pickle" in str(error) else error  # NumPy advises to load pickles: never
-        raise SettingError(f"Cannot read start {path!r} as an .npz of an encoder's weights: {said}.") from error
+        stored, _ = read_archive(path, (*LEARNED, *own))
+        found = {name: stored[name] for name in LEARNED}
+        sizes = {name: int(stored[name]) for name in own}
+    except (ValueError, KeyError, TypeError) as error:
+        raise SettingError(f"Cannot read start {path!r} as an .npz of an encoder's weights: {error}.") from error
     if own["channels"] != 1:
         raise SettingError(f"Expected traces of 1 channel to start from weights, got {own['channels']}; leave start out.")
     differing = ", ".join(f"{name} {sizes[name]} instead of {size}" for name, size in own.items() if sizes[name] != size)

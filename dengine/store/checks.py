@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ReportError, StoreError
+from ..labels import LONGEST
 from ..records import Decision, RetrainReport, Source
+from ..wording import shortened
 
 
 def unknown_decision(decision_id: str, hint: str = "") -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
     return ReportError(
-        f"Expected the id of a stored decision, got {decision_id!r}, which this cell's store does not hold; "
+        f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's store does not hold; "
         f"report the `Decision.id` that `decide` returned, to the same store and cell_id.{hint}"
     )
 
@@ -62,8 +64,11 @@ def as_part(part: str | None) -> str | None:
     """Return a part's number as every database can hold it; a StoreError before it is queued, not at the next write."""
     if part is None:
         return None
-    if not isinstance(part, str) or part != as_text(part):
-        raise StoreError(f"Expected a part's number as plain text, or None, got {part!r}; strip what a scanner added.")
+    if not isinstance(part, str) or len(part) > LONGEST or part != as_text(part):
+        raise StoreError(
+            f"Expected a part's number as plain text of at most {LONGEST} characters, or None, got {shortened(part)}; "
+            "strip what a scanner added."
+        )
     return str(part)
 
 

@@ -13,16 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Action, Decision, Reason, RetrainReport, Source
-from .checks import (
-    as_channels,
-    as_hash,
-    as_part,
-    as_text,
-    check_import,
-    check_parts,
-    check_state,
-    duplicate_id,
-)
+from .checks import as_text, check_import, check_parts, check_state, duplicate_id
+from .intake import check_decision, decided_trace
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -94,10 +86,9 @@ class MemoryStore:
         part: str | None = None,
     ) -> None:
         """Keep a decision with a copy of its trace."""
+        item = decided_trace(decision, trace, content_hash, quarantined, self._clock(), part)
         if self._holds(decision.id):
             raise duplicate_id(decision.id)
-        values, hash_, number = as_channels(trace), as_hash(content_hash), as_part(part)
-        item = DecidedTrace(decision, values, hash_, bool(quarantined), self._clock(), number)
         self._open[decision.id] = item
         self._kinds[decision.action, decision.reason, item.quarantined] += 1
         self._became[decision.action, decision.predicted, decision.audit, None] += 1
@@ -165,6 +156,7 @@ class MemoryStore:
     ) -> NDArray[np.int64]:
         traces, numbers = check_import(decisions, traces, hashes, labels), check_parts(parts, len(decisions))
         for decision in decisions:
+            check_decision(decision)
             if self._holds(decision.id):
                 raise duplicate_id(decision.id)
         first, given = len(self._labels) + 1, imported_labels(decisions, labels, source)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..labels import as_id, as_success
 from ..records import Action, Decision, Reason, RetrainReport, Source
 from .checks import already_reported, as_point, as_silent, mixed_shapes, unknown_decision
 
@@ -189,8 +190,8 @@ def stored_decision(item: DecidedTrace, success: bool | None = None, source: Sou
 def checked_label(label: NewLabel) -> NewLabel:
     """Return a label in the store's own types, with a point of its own."""
     return NewLabel(
-        decision_id=label.decision_id,
-        success=bool(label.success),
+        decision_id=as_id(label.decision_id),
+        success=as_success(label.success),
         source=label.source,
         model_version=int(label.model_version),
         point=as_point(label.point),
@@ -200,8 +201,8 @@ def checked_label(label: NewLabel) -> NewLabel:
 
 def imported_labels(decisions: Sequence[Decision], labels: NDArray[np.int8], source: Source) -> list[NewLabel]:
     """Return the labels that decisions of an import come with."""
-    pairs = zip(decisions, labels, strict=True)
-    return [NewLabel(decision.id, bool(label), source, int(decision.model_version), None) for decision, label in pairs]
+    pairs = zip(decisions, map(as_success, labels), strict=True)
+    return [NewLabel(decision.id, success, source, int(decision.model_version), None) for decision, success in pairs]
 
 
 def refuse_repeats(

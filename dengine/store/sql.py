@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from . import sql_queries as ask
-from .checks import as_channels, as_hash, as_part, as_text, check_import, check_parts, check_state, duplicate_id
+from .checks import as_hash, as_text, check_import, check_parts, check_state, duplicate_id
+from .intake import check_decision, decided_trace
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -55,9 +56,8 @@ class SqlStore(SqlOwning):
     clock : the time in seconds that rows are stamped with.
     wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
 
-    SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may
-    open one cell: label numbers stay unique and increasing. Their labels then mix, and neither engine learns of
-    the other's until it is opened anew, so give every running engine a cell_id of its own.
+    SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
+    cell: label numbers stay unique and increasing. Engines own their cell (`own`): a second one is refused.
 
     A write that fails leaves its decisions in the queue; it is tried again every second and by each following
     `flush` or report, which raises `StoreError` if it fails again. `status()["write_failures"]` counts failures.
@@ -108,8 +108,7 @@ class SqlStore(SqlOwning):
         part: str | None = None,
     ) -> None:
         """Queue a decision and its trace for the writer thread."""
-        values, hash_, number = as_channels(trace), as_hash(content_hash), as_part(part)
-        self._database.put(DecidedTrace(decision, values, hash_, bool(quarantined), self._clock(), number))
+        self._database.put(decided_trace(decision, trace, content_hash, quarantined, self._clock(), part))
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
@@ -173,6 +172,7 @@ class SqlStore(SqlOwning):
         traces, now = check_import(decisions, traces, hashes, labels), self._clock()
         numbers, given = check_parts(parts, len(decisions)), imported_labels(decisions, labels, source)
         for decision in decisions:
+            check_decision(decision)
             if self._database.queued(decision.id) is not None:
                 raise duplicate_id(decision.id)
 

@@ -37,11 +37,13 @@ def make_engine(url: str) -> sa.Engine:
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
         engine = sa.create_engine(parsed, connect_args={"timeout": BUSY})
-    except (sa.exc.ArgumentError, ImportError, ValueError) as error:
-        raise StoreError(
-            f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: {error}. "
-            "For PostgreSQL: pip install 'dengine[postgres]'."
-        ) from error
+    except (sa.exc.ArgumentError, ImportError) as error:
+        raise _unusable(url, f"{error}") from error
+    except ValueError as error:
+        if "@" not in url:
+            raise _unusable(url, f"{error}") from error
+        # What it quotes, and takes for a port, may be half of a password.
+        raise _unusable(url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F") from None
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
     return engine
@@ -66,6 +68,13 @@ class WatchedFile:
             same = False
         if not same:
             raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
+
+
+def _unusable(url: str, said: str) -> StoreError:
+    return StoreError(
+        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: {said}. "
+        "For PostgreSQL: pip install 'dengine[postgres]'."
+    )
 
 
 def _set_pragmas(connection: Any, record: Any) -> None:

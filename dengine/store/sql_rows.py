@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StoreError
+from ..archives import read_archive
+from ..errors import DataError, StoreError
 from ..records import Action, Reason, RetrainReport, Source
 from .checks import mixed_shapes
 from .records import DecidedTrace, Evidence, NewLabel, StoredDecision
@@ -170,7 +171,6 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
 def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
     """Read what `to_npz` wrote; a pickle in it is refused."""
     try:
-        with np.load(io.BytesIO(blob), allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise StoreError(f"Expected a version of plain arrays in {name}: {error}; restore it from a copy.") from error
+        return read_archive(blob, name=f"a version in {name}")[0]
+    except DataError as error:
+        raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import SettingError
+from ...outputs import TRACES, write_output
 from .insertion import Insertion, insert_once
 from .parameters import CHANNELS, RATE_HZ, CellParameters
 from .scenarios import find_scenario
@@ -135,18 +137,18 @@ def simulate_balanced(
     )
 
 
-def save_traces(path: str | Path, traces: SimulatedTraces) -> Path:
+def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) -> Path:
     """Write traces as a compressed npz that loads with `allow_pickle=False`.
 
     Keys: X int16 with `scale` (X * scale is in `unit`), y int8, cause str, height_mm float32, cycle int32, the draws
     as `conditions` (n, m) float32 with their names `condition_names`, and rate_hz, unit, seed, scenario, simulated.
+    OutputError where the file there was not written by this, or `force`.
     """
-    path = Path(path)
+    buffer = BytesIO()
     scale = _scale(traces.X)
     names, conditions = _draws(traces.insertions)
-    path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
-        path,
+        buffer,
         X=np.round(traces.X / scale).astype(np.int16),
         scale=scale.astype(np.float32),
         y=traces.y,
@@ -161,7 +163,7 @@ def save_traces(path: str | Path, traces: SimulatedTraces) -> Path:
         scenario=np.array(traces.scenario),
         simulated=np.array(True),
     )
-    return path
+    return write_output(path, buffer.getvalue(), TRACES, force, make_folder=True)
 
 
 def _scale(X: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from .store.base import Store
 from .versions import ModelVersions
 
 
-class EngineStanding:
+class EngineFacts:
     """How an engine stands; nothing here changes it."""
 
     seed: int
@@ -55,7 +55,7 @@ class EngineStanding:
 
     @property
     def trace(self) -> TraceSpec | None:
-        """The traces' contract; None before the first trace."""
+        """The traces' contract; None before the first sound trace."""
         return self._settings.trace
 
     @property
