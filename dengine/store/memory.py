@@ -23,6 +23,7 @@ from .checks import (
     check_state,
     duplicate_id,
 )
+from .memory_views import MemoryViews
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -52,7 +53,7 @@ class _Label:
     given: NewLabel
 
 
-class MemoryStore:
+class MemoryStore(MemoryViews):
     """The contract of `Store` in plain dicts, for replays and trials: nothing outlives the process.
 
     Of decisions that were never reported only the newest 10,000 are kept, trace and all; an older one is counted
@@ -72,6 +73,7 @@ class MemoryStore:
         self._label_of: dict[str, _Label] = {}
         self._train: list[_Label] = []  # not quarantined
         self._retrains: list[RetrainReport] = []
+        self._retrained: list[tuple[float, int]] = []
         self._version: ModelVersion | None = None
         self._events: list[Event] = []
         self._silent = 0
@@ -177,6 +179,7 @@ class MemoryStore:
         """Record a retrain; only the newest accepted state is kept."""
         copies = check_state(report, state)
         self._retrains.append(report)
+        self._retrained.append((self._clock(), int(last_seq)))
         if report.accepted and copies is not None:
             self._version = ModelVersion(report.version, int(last_seq), copies)
 

@@ -45,9 +45,10 @@ from .records import (
 from .sql_queue import SqlDatabase
 from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
 from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_views import SqlViews
 
 
-class SqlStore:
+class SqlStore(SqlViews):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
