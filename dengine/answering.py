@@ -122,6 +122,15 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
     return rule
 
 
+def rule_now(store: Store, policy: Policy) -> DecisionRule | None:
+    """The rule as it stands now; None before the first version, and where it is not kept."""
+    stored = store.last_version()
+    if stored is None:
+        return None
+    untold = "untold" in stored.state  # it missed something: an engine that is opened tells it all anew
+    return None if untold else _rule(stored, store.past_labels(stored.last_seq), policy)
+
+
 def _buffers(stored: ModelVersion, prefix: str) -> dict[str, torch.Tensor]:
     found = {name: value for name, value in stored.state.items() if name.startswith(prefix)}
     return {name.removeprefix(prefix): torch.from_numpy(np.array(value)) for name, value in found.items()}

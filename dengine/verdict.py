@@ -230,7 +230,7 @@ def _side(action: str, end: str, value: float, than: str, threshold: float | Non
     one, many, other = KINDS[action]
     lead = f"To {action}, {end} must be {than} {threshold:.4g} ({level}); it is {value:.3f}"
     if needed == 0:
-        return f"{lead}: it is."
+        return f"{lead}, enough."
     if needed is None:
         return f"{lead}: no number of labels would do."
     return f"{lead}: {needed} more {one if needed == 1 else many} and no {other} would do."

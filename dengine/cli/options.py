@@ -247,6 +247,9 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 out_option = click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the CSV and the pictures; made if need be."
 )
+out_file_option = click.option(
+    "--out", type=click.Path(dir_okay=False, path_type=Path), help="A picture, .png, .pdf or .svg, drawn into this file."
+)
 seed_option = click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="An integer; the same seed, the same run."
 )

@@ -106,8 +106,8 @@ def stretch_query(cell_id: str, length: int) -> Query:
         accepted,
         accepted & (LABEL.c.success == sa.false()),
     )
-    counts = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
-    query = sa.select(sa.func.count(), sa.func.max(every.c.time), *counts).select_from(every.outerjoin(LABEL, of))
+    counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
+    query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
     stretch = every.c.number - every.c.number % length
     return query.group_by(stretch).order_by(stretch)
 
