@@ -30,7 +30,7 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, as_jso
     """Say why a decision came out as it did.
 
     DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
-    were recorded; neighbours are found again by the version that answered where the store keeps it, and it is said by which.
+    were recorded; neighbours are found again by the version that answered where the store keeps it, and it says by which.
     The picture shows the trace with its neighbours and with the band that 95 % of the known successes lie in.
     """
     from ..errors import ReportError
