@@ -26,7 +26,9 @@ AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 COLUMNS = ("time (UTC)", "decision", "part", "action", "model", "bound", "good", "bad", "reason", "v", "label")
 RIGHT = ("good", "bad", "v")
 WIDEST = 120  # columns
-LONG_PART = 14  # characters of a part's number that are shown
+PART = COLUMNS.index("part")
+SHORTEST = 5  # characters of a part's number that are shown
+TOLD = {"verification": "verified"}  # in fewer columns
 
 
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
@@ -97,6 +99,11 @@ def lines(happened: Sequence[Happened]) -> list[str]:
     if not happened:
         return ["No decision of that kind."]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
+    too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
+    widths[PART] = min(widths[PART], max(SHORTEST, widths[PART] - max(0, too_wide)))
+    for row in rows:
+        row[PART] = row[PART] if len(row[PART]) <= widths[PART] else "~" + row[PART][1 - widths[PART] :]
     waiting = iter(rows)
     body = [
         _line(next(waiting), widths) if isinstance(each, PastDecision) else _told(each)[: WIDEST - 1] for each in happened
@@ -110,12 +117,11 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _cells(past: PastDecision) -> list[str]:
-    part = past.part or "-"
-    source = "" if past.source is None else f" {past.source.value}"
+    source = "" if past.source is None else f" {TOLD.get(past.source.value, past.source.value)}"
     return [
         _time(past.time),
         past.id,
-        part if len(part) <= LONG_PART else part[: LONG_PART - 1] + "~",
+        past.part or "-",
         past.action.value,
         "" if past.predicted is past.action else past.predicted.value,
         "-" if math.isnan(past.lower) else f"{past.lower:.2f}-{past.upper:.2f}",
