@@ -109,10 +109,10 @@ class Standing:
 def standing(store: Store, recipe: Recipe, last: int = 500) -> Standing:
     """How the engine of a store is doing; last : the newest so many decisions that are looked at apart."""
     retrains, policy = store.past_retrains(), recipe.policy
-    newest, ever = (_span(store.tally(n), retrains, policy) for n in (last, None))
+    every = store.tally()
+    newest, ever = _span(store.tally(last), retrains, policy), _span(every, retrains, policy)
     new_labels = sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0))
-    outcomes = store.outcomes()
-    unheard = outcomes.accepted - outcomes.stops - outcomes.confirmed
+    unheard = every.outcomes.accepted - every.outcomes.stops - every.outcomes.confirmed
     return Standing(newest, ever, Waiting(new_labels, recipe.retrain_every, ever.unlabelled, unheard))
 
 

@@ -48,7 +48,7 @@ STOPS = {
 @out_file_option
 @json_option
 def status(store: str, last: int, watch: float | None, out: Path | None, as_json: bool) -> None:
-    """Say how an engine is doing, what its store holds, and what can be certified by it.
+    """Say how an engine is doing, and what its store holds.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. The interval of bad
     accepted parts is of one look; what is certified holds however often one looks.
