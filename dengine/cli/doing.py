@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .output import when
+from .output import masked, when
 
 if TYPE_CHECKING:
     from ..recipe import Recipe
@@ -47,7 +47,7 @@ def doing_table(doing: Doing, store: str) -> Any:
     from rich.table import Table
 
     newest, ever = doing.standing.newest, doing.standing.ever
-    table = Table(title=f"{store}: how it is doing", title_justify="left")
+    table = Table(title=f"{masked(store)}: how it is doing", title_justify="left")
     table.add_column(style="bold", no_wrap=True)
     table.add_column(f"last {newest.decisions:,}", overflow="fold")
     table.add_column("since birth", overflow="fold")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .options import example, json_option, out_file_option
-from .output import show, when, write_json
+from .output import masked, show, when, write_json
 
 if TYPE_CHECKING:
     from ..envelope import Envelope, Excess
@@ -43,14 +43,14 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, as_jso
         if decision == "last":
             newest = next(history(opened, last=1), None)
             if newest is None:
-                raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
+                raise ReportError(f"Expected a decision in {masked(store)}, there is none yet; let an engine decide first.")
             decision = newest.id
         found = explain_stored(opened, decision, neighbours)
     finally:
         opened.close()
     files = [] if out is None else [_drawn(found, out)]
     if as_json:
-        write_json({"verb": "explain", "store": store} | found.record() | {"files": files})
+        write_json({"verb": "explain", "store": masked(store)} | found.record() | {"files": files})
         return
     show(*_tables(found), *(f"Wrote {path}" for path in files))
 

@@ -14,7 +14,7 @@ import click
 
 from ..records import Action, Reason
 from .options import example, json_option
-from .output import duration, write_json
+from .output import duration, masked, write_json
 
 if TYPE_CHECKING:
     from ..history import Happened
@@ -80,7 +80,7 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
         opened.close()
     if as_json:
         listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
-        write_json({"verb": "history", "store": store, "decisions": [_record(past) for past in found]} | listed)
+        write_json({"verb": "history", "store": masked(store), "decisions": [_record(past) for past in found]} | listed)
         return
     happened: Iterator[Happened] = iter(found) if others is None else interleaved(found, others)
     for line in lines(list(happened)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -72,6 +73,11 @@ def duration(seconds: float) -> str:
 def when(seconds: float | None) -> str:
     """A moment, in UTC; seconds since 1970."""
     return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def masked(store: str) -> str:
+    """A store's file or URL without its password, for screens and documents."""
+    return re.sub(r"(://[^:/@\s]*):[^@\s]*@", r"\1:***@", store)
 
 
 def size(n_bytes: float) -> str:

@@ -12,7 +12,7 @@ import click
 
 from .doing import Doing, doing_record, doing_table, drawn
 from .options import example, json_option, out_file_option
-from .output import certificate_record, duration, show, when, write_json
+from .output import certificate_record, duration, masked, show, when, write_json
 from .watching import redraw
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def status(store: str, last: int, watch: float | None, out: Path | None, as_json
     held = _read(store, last, out)
     if as_json:
         files = [] if out is None else [out]
-        write_json({"verb": "status", "store": store} | _record(held) | doing_record(held.doing) | {"files": files})
+        write_json({"verb": "status", "store": masked(store)} | _record(held) | doing_record(held.doing) | {"files": files})
         return
     show(*_tables(store, held), *([] if out is None else [f"Wrote {out}"]))
 
@@ -108,7 +108,7 @@ def _read(store: str, last: int, out: Path | None) -> Held:
     try:
         settings = opened.settings()
         if "recipe" not in settings:
-            raise StoreError(f"Expected a store that an engine has used, {store} is empty.")
+            raise StoreError(f"Expected a store that an engine has used, {masked(store)} is empty.")
         held = _held(opened, settings, last)
         if out is not None:
             drawn(opened, held.recipe, last, out)

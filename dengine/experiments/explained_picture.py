@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 MOST = 4  # channels drawn: those that leave the band farthest
-CLEAR = 0.05  # band widths below which leaving the band is not marked
+CLEAR = 0.1  # band widths below which leaving the band is not marked
 
 
 def explained_picture(found: Explanation) -> Figure:
