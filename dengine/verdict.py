@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -147,42 +147,81 @@ def _needed(policy: Policy, past: PastDecision, threshold: float, success: int) 
 
 def verdict(past: PastDecision, trace: NDArray[np.float32], bound: Bound | None, found: Circumstances) -> Iterator[str]:
     """The sentences: what was done and why, then how the bound came out."""
-    yield from _why(past, trace, found)
+    yield _why(past, trace, found)
     if bound is not None:
         yield from _bound_sentences(past, bound, found)
     if found.novelty is not None and past.reason is not Reason.NOVEL:
-        yield f"It is not novel: {_novelty(found.novelty)}."
+        yield f"It is not novel: {_scores(found.novelty)}."
     yield _outcome(past)
 
 
-def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> Iterator[str]:
+def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
     did = DID[past.action].capitalize()
-    match past.reason:
-        case Reason.NO_MODEL:
-            yield f"{did}: no model had been trained yet, so every part was."
-        case Reason.MODEL_ERROR:
-            yield f"{did}: the model raised an error, which the log of that time tells."
-        case Reason.NOT_FINITE:
-            n = int((~np.isfinite(trace)).sum())
-            yield f"{did}: {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
-        case Reason.CONSTANT:
-            yield f"{did}: every sample is {float(trace.flat[0]):g} {found.spec.unit}: a dead sensor."
-        case Reason.SATURATED:
-            yield f"{did}: {_saturation(trace, found.spec)}"
-        case Reason.NOVEL:
-            score = "" if found.novelty is None else f": {_novelty(found.novelty)}"
-            yield f"{did}: unlike all that was learned from{score}. What its neighbours say does not count then."
-        case Reason.AUDIT:
-            yield (
-                f"{did} as an audit: the model alone would have {DID[past.predicted]} it. The audits' coin fell on "
-                f"{found.coin:.4f}, below the audit rate {past.propensity:g}; it is a function of the trace and the seed."
-            )
-        case Reason.SAFE_MODE:
-            yield f"{did} in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
-        case _ if _was_lost(past):
-            yield f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
-        case _:
-            yield f"{did}: the bound {'meets' if past.action is not Action.VERIFY else 'does not meet'} the policy."
+    if _was_lost(past):
+        return f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
+    return f"{did}{WHY[past.reason](past, trace, found)}"
+
+
+Why = Callable[[PastDecision, NDArray[np.float32], Circumstances], str]
+
+
+def _certain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the bound meets the policy."
+
+
+def _uncertain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the bound does not meet the policy."
+
+
+def _no_model(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": no model had been trained yet, so every part was."
+
+
+def _audit(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return (
+        f" as an audit: the model alone would have {DID[past.predicted]} it. The audits' coin fell on {found.coin:.4f}, "
+        f"below the audit rate {past.propensity:g}; it is a function of the trace and the seed."
+    )
+
+
+def _not_finite(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    n = int((~np.isfinite(trace)).sum())
+    return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
+
+
+def _constant(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f": every sample is {float(trace.flat[0]):g} {found.spec.unit}: a dead sensor."
+
+
+def _saturated(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f": {_saturation(trace, found.spec)}"
+
+
+def _model_error(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the model raised an error, which the log of that time tells."
+
+
+def _novel(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    score = "" if found.novelty is None else f": {_scores(found.novelty)}"
+    return f": unlike all that was learned from{score}. What its neighbours say does not count then."
+
+
+def _safe(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
+
+
+WHY: dict[Reason, Why] = {
+    Reason.CERTAIN: _certain,
+    Reason.UNCERTAIN: _uncertain,
+    Reason.NO_MODEL: _no_model,
+    Reason.AUDIT: _audit,
+    Reason.NOT_FINITE: _not_finite,
+    Reason.CONSTANT: _constant,
+    Reason.SATURATED: _saturated,
+    Reason.MODEL_ERROR: _model_error,
+    Reason.NOVEL: _novel,
+    Reason.SAFE_MODE: _safe,
+}
 
 
 def _saturation(trace: NDArray[np.float32], spec: TraceSpec) -> str:
@@ -198,7 +237,7 @@ def _saturation(trace: NDArray[np.float32], spec: TraceSpec) -> str:
     )
 
 
-def _novelty(novelty: Novelty) -> str:
+def _scores(novelty: Novelty) -> str:
     both = (("level", novelty.level), ("texture", novelty.texture))
     return ", ".join(f"in {name} {value:.2f} times the limit" for name, value in both)
 

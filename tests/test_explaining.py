@@ -1,6 +1,7 @@
 """Why a decision came out so: what is found again is what was counted, and what is said is true."""
 
 import os
+import re
 import sqlite3
 import uuid
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from dengine.explaining import Explanation, explain
 from dengine.folds import content_hash
 from dengine.reviewing import explain_stored
 from dengine.store import MemoryStore, Store
-from dengine.verdict import Circumstances, bound_of
+from dengine.verdict import WHY, Circumstances, bound_of
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 STORES = [
@@ -202,6 +203,7 @@ def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., D
         assert "The trace is quarantined" in said_of(bad)
     assert "the model alone would have" in said_of(audited)
     assert "below the audit rate 0.1" in said_of(audited)
+    assert 0.0 <= float(re.search(r"coin fell on ([\d.]+),", said_of(audited)).group(1)) < 0.1
     assert audited.bound is not None
     assert "no model had been trained yet" in said_of(untrained)
     assert untrained.neighbours_version is not None
@@ -258,6 +260,10 @@ def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., 
         assert found.envelope is not None
     with SqlStore(str(tmp_path / "engine.db")) as store:  # without the rival at hand
         assert explain_stored(store, past.id).record() == found.record()
+
+
+def test_every_reason_has_words() -> None:
+    assert set(WHY) == set(Reason)
 
 
 def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset]) -> None:
