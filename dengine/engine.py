@@ -36,6 +36,7 @@ from .model.base import EngineModel, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
 from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
+from .reviewing import EngineReview
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
@@ -47,7 +48,7 @@ OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine(EngineFacts):
+class DataEngine(EngineFacts, EngineReview):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.

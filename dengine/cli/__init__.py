@@ -17,7 +17,9 @@ from .. import __version__
 from ..errors import DengineError
 from ..wording import without_password
 from .data import data
+from .explaining import explain
 from .export import export, import_labels
+from .history import history
 from .interrupting import end_interrupted
 from .options import example
 from .replaying import compare, replay
@@ -68,5 +70,5 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (data, replay, compare, train, run, simulate, status, history, explain, export, import_labels):
     main.add_command(verb)

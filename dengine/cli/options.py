@@ -269,6 +269,9 @@ def out_option(command: Command) -> Command:
     return option(force_option(placed))
 
 
+out_file_option = click.option(
+    "--out", type=click.Path(dir_okay=False, path_type=Path), help="A picture, .png, .pdf or .svg, drawn into this file."
+)
 seed_option = click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="An integer; the same seed, the same run."
 )

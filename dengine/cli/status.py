@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..wording import without_password
-from .options import example, json_option
-from .output import certificate_record, duration, show, write_json
+from .doing import Doing, doing_record, doing_table, drawn
+from .options import example, json_option, out_file_option
+from .output import certificate_record, duration, show, when, write_json
+from .watching import redraw
 
 if TYPE_CHECKING:
     from ..decision.certificate import Certificate
@@ -30,20 +32,47 @@ STOPS = {
 }
 
 
-@click.command(epilog=example("dengine status engine.db"))
+@click.command(epilog=example("dengine status engine.db --last 500"))
 @click.argument("store", metavar="STORE")
+@click.option(
+    "--last", type=click.IntRange(1), default=500, show_default=True, help="The newest so many decisions, looked at apart."
+)
+@click.option(
+    "--watch",
+    type=click.FloatRange(0.1),
+    is_flag=False,
+    flag_value=5.0,
+    metavar="[SECONDS]",
+    help="Show it again every so many seconds, 5 if none are given, until Ctrl-C; after STORE.",
+)
+@out_file_option
 @json_option
-def status(store: str, as_json: bool) -> None:
-    """Say what a store holds, and what can be certified by it.
+def status(store: str, last: int, watch: float | None, out: Path | None, as_json: bool) -> None:
+    """Say how an engine is doing, and what its store holds.
 
-    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`.
+    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. The interval of bad
+    accepted parts is of one look; what is certified holds however often one looks.
     """
-    held = _read(store)
-    if as_json:
-        write_json({"verb": "status", "store": store} | _record(held))
+    if watch is not None and as_json:
+        raise click.UsageError("--watch and --json exclude each other.")
+    if watch is not None:
+        redraw(lambda: _screen(store, last, out), watch)
         return
+    held = _read(store, last, out)
+    if as_json:
+        files = [] if out is None else [out]
+        write_json({"verb": "status", "store": store} | _record(held) | doing_record(held.doing) | {"files": files})
+        return
+    show(*_tables(store, held), *([] if out is None else [f"Wrote {out}"]))
+
+
+def _screen(store: str, last: int, out: Path | None) -> list[Any]:
+    return _tables(store, _read(store, last, out))
+
+
+def _tables(store: str, held: Held) -> list[Any]:
     groups = (_settings_rows(held), _count_rows(held), _promise_rows(held), _retrain_rows(held.retrains), _event_rows(held))
-    show(_table(store, [row for rows in groups for row in rows]))
+    return [doing_table(held.doing, store), _table("What it is", [row for rows in groups for row in rows])]
 
 
 @dataclass(frozen=True)
@@ -52,6 +81,7 @@ class Held:
 
     counts : `Store.status`.  novel, recent : traces that were novel among those that the newest labels tell of, and how
         many they tell of: verified, audited and accepted parts.  mode : the newest event of the safe mode, if any.
+    doing : over the newest decisions, and since its birth.
     """
 
     settings: dict[str, str]
@@ -62,6 +92,7 @@ class Held:
     novel: int
     recent: int
     mode: Event | None
+    doing: Doing
 
     @property
     def safe_mode(self) -> str:
@@ -69,7 +100,7 @@ class Held:
         return "" if self.mode is None or self.mode.text.startswith("ended") else self.mode.text
 
 
-def _read(store: str) -> Held:
+def _read(store: str, last: int, out: Path | None) -> Held:
     from ..errors import StoreError
     from ..store.base import open_store
 
@@ -78,14 +109,18 @@ def _read(store: str) -> Held:
         settings = opened.settings()
         if "recipe" not in settings:
             raise StoreError(f"Expected a store that an engine has used, {store} is empty.")
-        return _held(opened, settings)
+        held = _held(opened, settings, last)
+        if out is not None:
+            drawn(opened, held.recipe, last, out)
+        return held
     finally:
         opened.close()
 
 
-def _held(store: Store, settings: dict[str, str]) -> Held:
+def _held(store: Store, settings: dict[str, str], last: int) -> Held:
     from ..decision.certificate import certificate_of
     from ..recipe import Recipe
+    from ..standing import standing, watch
 
     recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
     newest = store.evidence_since(counts["labels"] - RECENT)  # labels are numbered from 1
@@ -99,6 +134,7 @@ def _held(store: Store, settings: dict[str, str]) -> Held:
         novel=int(newest.novel.sum()),
         recent=len(newest.seq) + int(newest.silent.sum()),
         mode=modes[-1] if modes else None,
+        doing=Doing(standing(store, recipe, last), watch(store, recipe), recipe.policy.alpha, last),
     )
 
 
@@ -185,7 +221,7 @@ def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
     yield "reasons", _listed(counts["reasons"])
     yield "quarantined", str(counts["quarantined"])
     yield "labels", f"{counts['labels']}: {_listed(counts['sources'])}"
-    yield "first, last", " to ".join(_when(counts[key]) for key in ("first_time", "last_time"))
+    yield "first, last", " to ".join(when(counts[key]) for key in ("first_time", "last_time"))
     if counts["write_failures"]:
         yield "write failures", str(counts["write_failures"])
 
@@ -206,13 +242,13 @@ def _percent(some: int, of: int) -> str:
 def _mode(held: Held) -> str:
     if held.mode is None:
         return "off"
-    when = _when(held.mode.time)
-    return f"on since {when}, every part is verified: {held.safe_mode}" if held.safe_mode else f"off, ended {when}"
+    since = when(held.mode.time)
+    return f"on since {since}, every part is verified: {held.safe_mode}" if held.safe_mode else f"off, ended {since}"
 
 
 def _event_rows(held: Held) -> Iterator[tuple[str, str]]:
     for i, event in enumerate(reversed(held.counts["events"])):
-        yield "newest events" if i == 0 else "", f"{_when(event['time'])} {event['kind']}: {event['text']}"
+        yield "newest events" if i == 0 else "", f"{when(event['time'])} {event['kind']}: {event['text']}"
 
 
 def _retrain_rows(retrains: list[RetrainReport]) -> Iterator[tuple[str, str]]:
@@ -230,7 +266,3 @@ def _retrain_rows(retrains: list[RetrainReport]) -> Iterator[tuple[str, str]]:
 
 def _listed(counts: dict[str, int]) -> str:
     return ", ".join(f"{n} {name}" for name, n in counts.items() if n) or "none"
-
-
-def _when(seconds: float | None) -> str:
-    return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

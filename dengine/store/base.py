@@ -20,6 +20,7 @@ from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from .memory import MemoryStore
 from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
+from .views import StoreViews
 
 __all__ = [
     "AddedPoints",
@@ -37,7 +38,7 @@ __all__ = [
 
 
 @runtime_checkable
-class Store(Protocol):
+class Store(StoreViews, Protocol):
     """What an engine needs of its memory. Everything belongs to one cell, `cell_id`."""
 
     cell_id: str

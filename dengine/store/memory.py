@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..records import Action, Decision, Reason, RetrainReport, Source
 from .checks import as_text, check_import, check_parts, check_state, duplicate_id
 from .intake import check_decision, decided_trace
+from .memory_views import MemoryViews
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -44,7 +45,7 @@ class _Label:
     given: NewLabel
 
 
-class MemoryStore:
+class MemoryStore(MemoryViews):
     """The contract of `Store` in plain dicts, for replays and trials: nothing outlives the process.
 
     Of decisions that were never reported only the newest 10,000 are kept, trace and all; an older one is counted
@@ -64,6 +65,7 @@ class MemoryStore:
         self._label_of: dict[str, _Label] = {}
         self._train: list[_Label] = []  # not quarantined
         self._retrains: list[RetrainReport] = []
+        self._retrained: list[tuple[float, int]] = []
         self._version: ModelVersion | None = None
         self._events: list[Event] = []
         self._silent = 0
@@ -169,6 +171,7 @@ class MemoryStore:
         """Record a retrain; only the newest accepted state is kept."""
         copies = check_state(report, state)
         self._retrains.append(report)
+        self._retrained.append((self._clock(), int(last_seq)))
         if report.accepted and copies is not None:
             self._version = ModelVersion(report.version, int(last_seq), copies)
 

@@ -46,9 +46,10 @@ from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
 from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
 from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_views import SqlViews
 
 
-class SqlStore(SqlOwning):
+class SqlStore(SqlOwning, SqlViews):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
@@ -75,8 +76,6 @@ class SqlStore(SqlOwning):
             raise StoreError(f"Expected a wait above 0 seconds, got {wait!r}; 0.4 is the default.")
         self._clock, self.wait = clock, wait
         self._database = SqlDatabase(str(url), cell_id)
-
-    # Settings
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""

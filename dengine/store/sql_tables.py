@@ -39,6 +39,7 @@ DECISION = sa.Table(
     sa.Column("quarantined", sa.Boolean, nullable=False),
     sa.Column("part", sa.String),  # serial number of the part that the trace was recorded on; since schema 2
 )
+HISTORY = sa.Index("decision_time", *DECISION.c["cell_id", "time", "id"])  # made where it is missing: no change of schema
 TRACE = sa.Table(  # apart from `decision`, so that counting decisions does not read traces
     "trace",
     METADATA,
@@ -106,6 +107,7 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         _bring_up_to_date(connection, found, name)
     else:
         METADATA.create_all(connection)
+    HISTORY.create(connection, checkfirst=True)
     entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
     if connection.execute(entered).first() is None:
         connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})

@@ -1,0 +1,147 @@
+"""`dengine history`: the decisions of a store, line by line, and what happened between them."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..records import Action, Reason
+from .options import example, json_option
+from .output import duration, write_json
+
+if TYPE_CHECKING:
+    from ..history import Happened
+    from ..store.records import Event
+    from ..store.views import PastDecision, PastRetrain
+
+LABELS = ("good", "bad", "none")
+AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+COLUMNS = ("time (UTC)", "decision", "part", "action", "model", "bound", "good", "bad", "reason", "v", "label")
+RIGHT = ("good", "bad", "v")
+WIDEST = 120  # columns
+PART = COLUMNS.index("part")
+SHORTEST = 5  # characters of a part's number that are shown
+TOLD = {"verification": "verified"}  # in fewer columns
+
+
+class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
+    """A time: how long ago (90s, 30m, 12h, 7d), or when (2026-03-01, 2026-03-01T14:30), in UTC if it does not say."""
+
+    name = "TIME"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Seconds since 1970."""
+        ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
+        if ago:
+            return time.time() - float(ago[1]) * AGO[ago[2]]
+        try:
+            when = datetime.fromisoformat(value)
+        except ValueError:
+            self.fail(f"expected 30m, 12h, 7d or 2026-03-01T14:30, got {value!r}.", param, ctx)
+        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+@click.command(epilog=example("dengine history engine.db --last 20 --events"))
+@click.argument("store", metavar="STORE")
+@click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
+@click.option("--action", type=click.Choice([each.value for each in Action]), help="Only what was decided so.")
+@click.option("--reason", type=click.Choice([each.value for each in Reason]), metavar="REASON", help=(
+    f"Only for this reason: {', '.join(each.value for each in Reason)}."
+))  # fmt: skip
+@click.option("--label", type=click.Choice(LABELS), help="Only what turned out so, or was never reported.")
+@click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
+@click.option("--until", type=Moment(), help="Only before then, likewise.")
+@click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
+@json_option
+def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
+    """Show the decisions of a store, newest last.
+
+    STORE is the file or URL that an engine remembers in. In the table good and bad are the labels that were counted, bound
+    is what they say of the success rate, v the model's version, and label what the part turned out to be. `dengine explain`
+    says more of one.
+    """
+    from ..history import beside, interleaved
+    from ..history import history as read
+    from ..store.base import open_store
+
+    opened = open_store(store, must_exist=True)
+    try:
+        found = list(read(opened, **asked))
+        since = asked["since"] if asked["since"] is not None or not found else found[0].time
+        others = beside(opened, since, asked["until"]) if events else None
+    finally:
+        opened.close()
+    if as_json:
+        listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
+        write_json({"verb": "history", "store": store, "decisions": [_record(past) for past in found]} | listed)
+        return
+    happened: Iterator[Happened] = iter(found) if others is None else interleaved(found, others)
+    for line in lines(list(happened)):
+        click.echo(line)
+
+
+def _record(past: PastDecision) -> dict[str, Any]:
+    return asdict(past) | {"label": past.label}
+
+
+def lines(happened: Sequence[Happened]) -> list[str]:
+    """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
+    from ..store.views import PastDecision
+
+    rows = [_cells(each) for each in happened if isinstance(each, PastDecision)]
+    if not happened:
+        return ["No decision of that kind."]
+    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
+    too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
+    widths[PART] = min(widths[PART], max(SHORTEST, widths[PART] - max(0, too_wide)))
+    for row in rows:
+        row[PART] = row[PART] if len(row[PART]) <= widths[PART] else "~" + row[PART][1 - widths[PART] :]
+    waiting = iter(rows)
+    body = [
+        _line(next(waiting), widths) if isinstance(each, PastDecision) else _told(each)[: WIDEST - 1] for each in happened
+    ]
+    return [_line(COLUMNS, widths), "  ".join("-" * width for width in widths), *body]
+
+
+def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
+    pairs = zip(COLUMNS, cells, widths, strict=True)
+    return "  ".join(text.rjust(n) if name in RIGHT else text.ljust(n) for name, text, n in pairs).rstrip()
+
+
+def _cells(past: PastDecision) -> list[str]:
+    source = "" if past.source is None else f" {TOLD.get(past.source.value, past.source.value)}"
+    return [
+        _time(past.time),
+        past.id,
+        past.part or "-",
+        past.action.value,
+        "" if past.predicted is past.action else past.predicted.value,
+        "-" if math.isnan(past.lower) else f"{past.lower:.2f}-{past.upper:.2f}",
+        str(past.n_success),
+        str(past.n_failure),
+        past.reason.value,
+        str(past.model_version),
+        "-" if past.success is None else f"{past.label}{source}",
+    ]
+
+
+def _told(each: PastRetrain | Event) -> str:
+    from ..store.records import Event
+
+    if isinstance(each, Event):
+        return f"{_time(each.time)}  * {each.kind}: {' '.join(each.text.split())}"
+    report = each.report
+    what = f"retrain to version {report.version}" if report.accepted else f"retrain {each.number}"
+    return f"{_time(each.time)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
+
+
+def _time(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%y-%m-%d %H:%M:%S")

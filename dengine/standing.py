@@ -1,0 +1,203 @@
+"""How an engine is doing, by its store: over its newest decisions, and since its birth.
+
+    doing = standing(store, recipe, last=500)
+    doing.newest.verified / doing.newest.decisions, doing.ever.bad_accepts.upper
+
+Counted by the store: no trace is read.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from .decision.bounds import wilson_interval
+from .decision.policy import Policy
+from .recipe import Recipe
+from .records import Action, Reason
+from .store.base import Store
+from .store.records import Event, Outcomes
+from .store.views import PastRetrain, Stretch, Tally
+
+STRETCHES = 120  # of a picture
+FEWEST = 20  # decisions of a stretch: a share of fewer jumps
+
+
+@dataclass(frozen=True, slots=True)
+class BadAccepts:
+    """How many parts that the model let pass were bad, as far as that is known.
+
+    n : parts it would have let pass, audited ones included.  known : those of them that the claim rests on.
+    bad : of these.  stops : bad accepted parts, whatever the claim rests on.
+    by : what tells: "every outcome", "audits", or "" where only stops do, and nothing can be bounded from above.
+    lower, upper : Wilson interval of their share at the policy's alpha, at one look; 0 and 1 where nothing is known.
+    tolerance : 1 - LB.
+    """
+
+    n: int
+    known: int
+    bad: int
+    stops: int
+    by: str
+    lower: float
+    upper: float
+    tolerance: float
+
+    @property
+    def verdict(self) -> str:
+        """kept, broken, or open, as far as the interval goes; it speaks of this one look."""
+        if self.upper <= self.tolerance:
+            return "kept"
+        return "broken" if self.lower > self.tolerance else "open"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Consecutive decisions, and what happened meanwhile.
+
+    first, last : times of the oldest and the newest; None where there is none.
+    verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
+    accepted, rejected : went on without a check.  rejected_good : audited parts that it would have rejected, and were good.
+    unlabelled : verified, of which no result was reported.
+    retrains : all.  dropped : reasons of those that were dropped, with how often.
+    """
+
+    decisions: int
+    first: float | None
+    last: float | None
+    verified: int
+    audits: int
+    novel: int
+    safe_mode: int
+    errors: int
+    quarantined: int
+    accepted: int
+    rejected: int
+    audited_rejects: int
+    rejected_good: int
+    bad_accepts: BadAccepts
+    unlabelled: int
+    retrains: int
+    dropped: dict[str, int]
+
+    def share(self, some: int) -> float | None:
+        """Of all decisions; None where there is none."""
+        return some / self.decisions if self.decisions else None
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """Labels on their way: new ones since the newest retrain, of `retrain_every` that set one off; verified parts whose
+    result, and accepted ones whose fate, was never reported.
+    """
+
+    new_labels: int
+    retrain_every: int
+    verified: int
+    accepted: int
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How an engine is doing: over its newest decisions, and since its birth."""
+
+    newest: Span
+    ever: Span
+    waiting: Waiting
+
+
+def standing(store: Store, recipe: Recipe, last: int = 500) -> Standing:
+    """How the engine of a store is doing; last : the newest so many decisions that are looked at apart."""
+    retrains, policy = store.past_retrains(), recipe.policy
+    every = store.tally()
+    newest, ever = _span(store.tally(last), retrains, policy), _span(every, retrains, policy)
+    new_labels = sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0))
+    unheard = every.outcomes.accepted - every.outcomes.stops - every.outcomes.confirmed
+    return Standing(newest, ever, Waiting(new_labels, recipe.retrain_every, ever.unlabelled, unheard))
+
+
+def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
+    outcomes, first = tally.outcomes, tally.first
+    here = [each.report for each in retrains if first is not None and each.time >= first]
+
+    def reason(*reasons: Reason) -> int:
+        return tally.count(lambda kind: kind.reason in reasons)
+
+    return Span(
+        decisions=tally.count(),
+        first=first,
+        last=tally.last,
+        verified=tally.count(lambda kind: kind.action is Action.VERIFY),
+        audits=reason(Reason.AUDIT),
+        novel=reason(Reason.NOVEL),
+        safe_mode=reason(Reason.SAFE_MODE),
+        errors=reason(Reason.MODEL_ERROR),
+        quarantined=tally.count(lambda kind: kind.quarantined),
+        accepted=outcomes.accepted,
+        rejected=outcomes.rejected,
+        audited_rejects=outcomes.audited_rejects,
+        rejected_good=outcomes.audited_rejects_good,
+        bad_accepts=bad_accepts(outcomes, policy),
+        unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
+        retrains=len(here),
+        dropped=dict(Counter(report.reason for report in here if not report.accepted)),
+    )
+
+
+def bad_accepts(outcomes: Outcomes, policy: Policy) -> BadAccepts:
+    """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
+
+    Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
+    """
+    heard = outcomes.stops + outcomes.confirmed
+    every = policy.stops == "all" or 0 < outcomes.accepted == heard
+    by = "every outcome" if every and heard else "audits" if outcomes.audited_accepts else ""
+    known, bad = {
+        "every outcome": (heard, outcomes.stops),
+        "audits": (outcomes.audited_accepts, outcomes.audited_accepts_bad),
+        "": (0, 0),
+    }[by]
+    low, high = wilson_interval(known - bad, bad, policy.alpha)
+    n = outcomes.accepted + outcomes.audited_accepts
+    return BadAccepts(n, known, bad, outcomes.stops, by, 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What a picture of a store is drawn from: consecutive decisions, retrains and events; last : looked at apart."""
+
+    stretches: list[Stretch]
+    retrains: list[PastRetrain]
+    modes: list[Event]
+    tolerance: float
+    last: int
+
+
+def course(store: Store, recipe: Recipe, last: int) -> Course:
+    """Read what a picture is drawn from."""
+    modes = [event for event in store.events() if event.kind == "safe mode"]
+    n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
+    return Course(store.stretches(n), store.past_retrains(), modes, 1.0 - recipe.policy.lower_bound, last)
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """How far each detector of the safe mode is on its way to an alarm, from 0 to 1: accepts, rejects, novelty."""
+
+    accepts: float
+    rejects: float
+    novelty: float
+
+
+def watch(store: Store, recipe: Recipe) -> Watch | None:
+    """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
+    from .answering import rule_now  # torch
+    from .decision.guarantee import WatchedRule
+
+    if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
+        return None
+    rule = rule_now(store, recipe.policy)
+    if not isinstance(rule, WatchedRule):
+        return None
+    accepts, rejects, novelty = (max(0.0, capital / rule.alarm_at) for capital in rule.watch.tolist())
+    return Watch(accepts, rejects, novelty)

@@ -1,0 +1,230 @@
+"""What people look back on: past decisions, labels, retrains and counts, without traces unless one is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import StoreError
+from ..records import Action, Reason, RetrainReport, Source
+from .records import Labelled, ModelVersion, Outcomes, count_outcomes
+
+LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
+Key = tuple[float, str]  # of a decision in its history: time and id
+
+
+@dataclass(frozen=True, slots=True)
+class PastDecision:
+    """A decision as it was recorded, and what became of it; fields as in `Decision`.
+
+    time : of the decision, in seconds.  part : its number, where one was given.
+    content_hash, quarantined : as in `StoredDecision`.
+    success, source : the label, None where there is none.  label_seq, label_time : its number, and when it came.
+    """
+
+    id: str
+    time: float
+    part: str | None
+    action: Action
+    predicted: Action
+    lower: float
+    upper: float
+    n_success: int
+    n_failure: int
+    reason: Reason
+    audit: bool
+    propensity: float
+    model_version: int
+    content_hash: int
+    quarantined: bool
+    success: bool | None
+    source: Source | None
+    label_seq: int | None
+    label_time: float | None
+
+    @property
+    def key(self) -> Key:
+        """Its place in the history."""
+        return self.time, self.id
+
+    @property
+    def label(self) -> str:
+        """good, bad or none."""
+        return "none" if self.success is None else "good" if self.success else "bad"
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryFilter:
+    """Which decisions are meant; None: all.
+
+    label : good, bad or none.  since, until : times in seconds, the first included, the last not.
+    Raises StoreError for a label that is none of these.
+    """
+
+    action: Action | None = None
+    reason: Reason | None = None
+    label: str | None = None
+    since: float | None = None
+    until: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.label is not None and self.label not in LABELS:
+            raise StoreError(f"Expected label to be one of {', '.join(LABELS)}, got {self.label!r}.")
+
+    def takes(self, past: PastDecision) -> bool:
+        """Whether a decision is meant."""
+        return (
+            (self.action is None or past.action is self.action)
+            and (self.reason is None or past.reason is self.reason)
+            and (self.label is None or past.label == self.label)
+            and (self.since is None or past.time >= self.since)
+            and (self.until is None or past.time < self.until)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PastLabel:
+    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `Evidence`.
+
+    seq, time : its number, and when it came.  decided : when its decision was made.
+    point : (d,), None where there is none or none was asked for.
+    """
+
+    seq: int
+    time: float
+    decision_id: str
+    success: bool
+    source: Source
+    model_version: int
+    content_hash: int
+    quarantined: bool
+    silent: int
+    point: NDArray[np.float32] | None
+    decided: float
+    lower: float
+    upper: float
+    novel: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PastRetrain:
+    """A retrain as it was recorded: 1, 2, ... in each cell, when, and the newest label that it knew of."""
+
+    number: int
+    time: float
+    last_seq: int
+    report: RetrainReport
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How many decisions of one kind there are; fields as in `PastDecision`."""
+
+    action: Action
+    predicted: Action
+    reason: Reason
+    audit: bool
+    quarantined: bool
+    success: bool | None
+    n: int
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """Counted decisions.  first, last : times of the oldest and the newest of them; None where there is none."""
+
+    kinds: tuple[Kind, ...]
+    first: float | None
+    last: float | None
+
+    def count(self, takes: Callable[[Kind], bool] = lambda kind: True) -> int:
+        """How many decisions there are of the kinds that are meant; of all by default."""
+        return sum(kind.n for kind in self.kinds if takes(kind))
+
+    @property
+    def outcomes(self) -> Outcomes:
+        """What became of what the model was certain of."""
+        return count_outcomes((k.action, k.predicted, k.audit, k.success, k.n) for k in self.kinds)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Consecutive decisions.  n : of them.  last : time of the newest.
+
+    verified, novel : decided so.  accepted, bad : went on without a check, and of these are known to be bad.
+    """
+
+    n: int
+    last: float
+    verified: int
+    novel: int
+    accepted: int
+    bad: int
+
+
+class StoreViews(Protocol):
+    """What a store shows to whoever looks back. What is queued is written first."""
+
+    def decisions(
+        self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
+    ) -> list[PastDecision]:
+        """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
+
+        beyond : only those before (or after) this one: the next page.
+        """
+
+    def past_decision(self, decision_id: str) -> PastDecision | None:
+        """Return one decision; None where it is unknown."""
+
+    def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
+        """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
+
+    def past_retrains(self) -> list[PastRetrain]:
+        """Return every retrain, oldest first."""
+
+    def kept_version(self, version: int) -> ModelVersion | None:
+        """Return an accepted version; None where it is not kept."""
+
+    def labelled_upto(self, seq: int, limit: int) -> Labelled:
+        """Return the newest `limit` labelled traces among the labels up to number `seq`, as `labelled` does."""
+
+    def tally(self, last: int | None = None) -> Tally:
+        """Count the newest `last` decisions, all where it is None."""
+
+    def stretches(self, n: int) -> list[Stretch]:
+        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
+
+
+def number_or_nan(value: float | None) -> float:
+    """Return a bound; what a database made NULL of was NaN."""
+    return math.nan if value is None else float(value)
+
+
+def stretch_of(decisions: Sequence[PastDecision]) -> Stretch:
+    """Count consecutive decisions."""
+    accepted = [past for past in decisions if past.action is Action.ACCEPT]
+    return Stretch(
+        n=len(decisions),
+        last=decisions[-1].time,
+        verified=sum(past.action is Action.VERIFY for past in decisions),
+        novel=sum(past.reason is Reason.NOVEL for past in decisions),
+        accepted=len(accepted),
+        bad=sum(past.success is False for past in accepted),
+    )
+
+
+def tally_of(decisions: Iterable[PastDecision]) -> Tally:
+    """Count decisions, oldest first."""
+    counts: dict[tuple[Action, Action, Reason, bool, bool, bool | None], int] = {}
+    times: list[float] = []
+    for past in decisions:
+        kind = (past.action, past.predicted, past.reason, past.audit, past.quarantined, past.success)
+        counts[kind] = counts.get(kind, 0) + 1
+        times.append(past.time)
+    kinds = tuple(Kind(*kind, n) for kind, n in counts.items())
+    return Tally(kinds, times[0] if times else None, times[-1] if times else None)
