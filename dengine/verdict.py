@@ -210,6 +210,10 @@ def _safe(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) 
     return f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
 
 
+def _no_store(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
+
+
 WHY: dict[Reason, Why] = {
     Reason.CERTAIN: _certain,
     Reason.UNCERTAIN: _uncertain,
@@ -221,6 +225,7 @@ WHY: dict[Reason, Why] = {
     Reason.MODEL_ERROR: _model_error,
     Reason.NOVEL: _novel,
     Reason.SAFE_MODE: _safe,
+    Reason.NO_STORE: _no_store,
 }
 
 

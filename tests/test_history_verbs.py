@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 from dengine import DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
 from dengine.cli import main
 from dengine.cli.history import WIDEST
-from dengine.cli.output import WIDE, masked
+from dengine.cli.output import WIDE
 from dengine.decision.bounds import wilson_interval
 from dengine.standing import bad_accepts, course, standing
 from dengine.store.records import Outcomes
@@ -229,8 +229,6 @@ def test_watch_redraws_until_ctrl_c_and_ends_cleanly(store: Path) -> None:
 
 def test_a_password_is_never_shown() -> None:
     url = "postgresql+psycopg://me:secret%40x@host:5432/cells"
-    assert masked(url) == "postgresql+psycopg://me:***@host:5432/cells"
-    assert masked("folder/engine.db") == "folder/engine.db"
     for words in (("history", url), ("explain", url, "last"), ("status", url)):
         result = dengine(*(word.replace("host:5432", "127.0.0.1:1") for word in words))
         assert result.exit_code == 1
