@@ -378,13 +378,13 @@ class Fuzz:
 
 
 SHARES = {  # of all attempts; those on files and commands take the longest
-    "traces": 0.30,
+    "traces": 0.31,
     "labels": 0.25,
     "ids": 0.18,
     "toml": 0.10,
     "data": 0.10,
     "imports": 0.03,
-    "journals": 0.02,
+    "journals": 0.01,
     "arguments": 0.01,
     "stores": 0.01,
 }
