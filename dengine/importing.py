@@ -120,7 +120,10 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> list[JournalL
     after the other, where the first line begins with `# dengine 2`, and `label,sample,sample,...`, of verified parts,
     where it does not. Lines that begin with # are comments. DataError names the first line that does not fit.
     """
-    text = Path(path).read_text(encoding="utf-8")
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"Cannot read the journal {path}: {error}; copy it again from the cell.") from error
     read = _read_line if text.startswith("# dengine 2 ") else _read_first_form
     found = [
         read(line.split(","), spec, f"line {number} of {path}")

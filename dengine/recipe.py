@@ -80,7 +80,7 @@ class Recipe:
             value = getattr(self, name)
             if not (is_whole(value, least, most) or (name == "max_steps" and value is None)):
                 raise SettingError(
-                    f"Expected {name} to be an integer of at least {least} and at most {most}, got {shortened(value)}."
+                    f"Expected {name} to be an integer of at least {least}, got {shortened(value)}; at most {most:,}."
                 )
         if not (is_number(self.budget) and self.budget > 0.0):
             raise SettingError(f"Expected budget > 0 seconds, got {shortened(self.budget)}.")

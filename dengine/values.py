@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from numbers import Integral, Real
 from typing import Any
 
@@ -13,10 +12,11 @@ def is_whole(value: Any, least: int, most: int) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a real number that a float can hold, an infinity among them; a NaN is none."""
+    """Whether it is a real number that a float can hold, an infinity or a NaN among them: no range holds the latter."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:
-        return not math.isnan(float(value))
+        float(value)
     except OverflowError:
         return False
+    return True

@@ -719,7 +719,7 @@ def test_an_archive_that_claims_more_than_there_is_memory_is_a_data_error(small:
         file.create_dataset("X", shape=(10**6, 10**7), chunks=(10, 1000), dtype="f4")
         file["y"] = small.y
     for name in ("claim.npz", "claim.h5"):
-        with pytest.raises(DataError, match=r"Unable to allocate|at most 8 GB"):
+        with pytest.raises(DataError, match=r"has another size|at most .* GB of arrays"):
             load_dataset(tmp_path / name)
 
 

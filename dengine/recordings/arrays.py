@@ -84,7 +84,12 @@ def from_pair(X: Any, y: Any, asked: Asked) -> Dataset:
 
 def _labels(y: Any) -> Any:
     """Labels as they came; words as 1 and 0."""
-    words = np.asarray(y)
+    try:
+        words = np.asarray(y)
+    except (ValueError, TypeError) as error:
+        raise DataError(
+            f"Expected a label for each trace, 1 (success) or 0 (failure), got something else: {error}."
+        ) from error
     if words.dtype.kind not in "OUS" or words.ndim != 1:
         return words
     text = words.astype(np.str_) if words.dtype.kind == "S" else words

@@ -104,7 +104,7 @@ def _real(X: ArrayLike) -> NDArray[np.float32]:
         if array.dtype.kind not in "cmMSU":
             with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
                 return array.astype(np.float32, copy=False)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"Expected X of real numbers, (n, T) or (n, C, T), got something else: {error}.") from error
     raise DataError(f"Expected X of real numbers, got dtype {array.dtype}.")
 

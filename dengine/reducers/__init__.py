@@ -89,7 +89,7 @@ def _must_be_like(default: Any, key: str, value: Any) -> None:
         bool: isinstance(value, bool | np.bool_),
         str: isinstance(value, str),
         int: is_whole(value, 2 if key == "folds" else -MOST, 1000 if key == "folds" else MOST),
-        float: is_number(value),
+        float: is_number(value) and value == value,  # no NaN
     }
     if what is not None and not fits[type(default)]:
         raise SettingError(f"Expected {what} as the reducer's {key}, as {default!r}, got {shortened(value)}.")

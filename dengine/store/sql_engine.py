@@ -9,6 +9,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
+from ..wording import shortened
+from .checks import as_text
 
 # Of a server that answers no more, libpq says so after some seconds, not hours.
 PATIENCE = {
@@ -23,6 +25,10 @@ BUSY = 10.0  # seconds to wait for another process that writes to the same SQLit
 
 def make_engine(url: str) -> sa.Engine:
     """Return an engine for a file or URL; refuses what this store was never tested on."""
+    if as_text(url) != url:
+        raise StoreError(
+            f"Expected a file or a database URL of UTF-8 characters without a NUL, got {shortened(url)}; rename it."
+        )
     try:
         parsed = sa.make_url(url) if "://" in url else sa.URL.create("sqlite", database=str(Path(url)))
         if parsed.drivername in ("postgres", "postgresql"):
