@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
 from .checks import mixed_shapes
-from .records import DecidedTrace, Evidence, NewLabel, StoredDecision
+from .records import FORGOTTEN, DecidedTrace, Event, Evidence, NewLabel, StoredDecision
 
 CHUNK = 500  # rows sent or fetched at a time
 
@@ -107,10 +107,15 @@ def read_decision(row: Any) -> StoredDecision:
         trace=unpack_trace(row),
         content_hash=row.content_hash,
         quarantined=row.quarantined,
-        success=row.success,
+        success=None if row.success in (None, FORGOTTEN) else bool(row.success),
         source=None if row.source is None else Source(row.source),
         part=row.part,
     )
+
+
+def read_event(row: Any) -> Event:
+    """Read a row of `event`."""
+    return Event(row.number, row.time, row.kind, row.text, None if row.data is None else json.loads(row.data), row.author)
 
 
 def read_evidence(rows: Sequence[Any]) -> Evidence:
