@@ -19,6 +19,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
+from .corrections import Corrections
 from .deciding import DecisionMaker, as_part
 from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
@@ -28,19 +29,21 @@ from .loop import drive
 from .model.base import EngineModel, Exportable, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
-from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
+from .resuming import Telling
+from .retraining import Clock, EncoderTime, Limits, Retrainer
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .traces import as_trace, spec_of
 from .versions import ModelVersions
+from .window import Window
 
 OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
 OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine:
+class DataEngine(Corrections):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -104,8 +107,9 @@ class DataEngine:
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
-        self._versions = ModelVersions(template, retrainer, store, clock)
-        self._feedback = Feedback(store, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
+        telling, since = Telling(settings.told_since, settings.began_in), settings.policy_since
+        self._versions = ModelVersions(template, retrainer, store, clock, telling)
+        self._feedback = Feedback(store, self._versions, settings.recipe.policy.stops == "all", on_safe_mode, since)
         self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
         self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
         if settings.trace is not None:
@@ -120,7 +124,6 @@ class DataEngine:
     def open(cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, **options: Any) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
-        (Of a part that a stop reached too late, the first engine keeps its success too until its next retrain.)
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
         options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them.
         Raises StoreError where there is nothing to go on with, SettingError where an object is missing.
@@ -232,12 +235,12 @@ class DataEngine:
 
     @property
     def recipe(self) -> Recipe:
-        """Every setting as it is in force; fixed once the engine is made."""
+        """Every setting as it is in force; all but the policy are fixed once the engine is made."""
         return self._settings.recipe
 
     @property
     def policy(self) -> Policy:
-        """The user's numbers as they are in force; for others make another engine."""
+        """The user's numbers as they are in force; `set_policy` changes them."""
         return self._settings.recipe.policy
 
     @property
@@ -261,9 +264,9 @@ class DataEngine:
         return self._feedback.safe_mode
 
     def certificate(self) -> Certificate:
-        """What can be said by now, at level 1 - alpha, of the parts that were decided without a check."""
+        """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return certificate_of(self.store.outcomes(), self.policy)
+        return certificate_of(self.store.outcomes(self._settings.policy_since), self.policy)
 
     @property
     def new_labels(self) -> int:

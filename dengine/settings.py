@@ -29,6 +29,7 @@ LOOP = (
     "audit_rate",
     "stops",
 )  # that count for any model
+MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +40,9 @@ class EngineSettings:
     model : what a model that was handed in is called; None: the recipe describes the model.
     described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
     trace : the traces' contract; None until the first trace.
+    policy_since : the first model version under the policy in force; 0: every one.
+    told_since : the first version of whose decisions the rule in force is told.  began_in : the position in `SAFE_MODE`
+        that it began in.
     """
 
     recipe: Recipe
@@ -46,6 +50,9 @@ class EngineSettings:
     model: str | None = None
     described: str | None = None
     trace: TraceSpec | None = None
+    policy_since: int = 0
+    told_since: int = 0
+    began_in: int = 0
 
     def __post_init__(self) -> None:
         if not isinstance(self.seed, int | np.integer) or isinstance(self.seed, bool) or self.seed < 0:
@@ -59,7 +66,7 @@ class EngineSettings:
         known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
         if self.trace is not None:
             known["trace"] = json.dumps(asdict(self.trace))
-        return known
+        return known | {name: str(value) for name in MARKS if (value := getattr(self, name))}
 
     @classmethod
     def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
@@ -92,7 +99,8 @@ class EngineSettings:
                 raise SettingError(
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
-        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace_in(known))
+        marks = {name: int(known.get(name, "0")) for name in MARKS}
+        return cls(recipe, int(known["seed"]), known.get("model"), made_with, trace_in(known), **marks)
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""

@@ -131,6 +131,8 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
         (3, "late", None, "", 3, 4, 4),
     ]
     assert [c.number for c in store.corrections(2)] == [3]
+    correct(store, False, "late")
+    assert [c.was for c in store.corrections()] == [True, True, True, None]
     event = store.events()[1]
     assert (event.kind, event.data, event.author) == ("correct", {"names": ["2", "0"]}, "kim")
     assert (store.events()[0].data, store.events()[0].author) == (None, "")

@@ -94,8 +94,9 @@ class MemoryHistory:
         return number
 
     def _correct(self, label: StoredLabel, success: bool | None, event: Event) -> None:
-        made = (len(self._corrections) + 1, event.time, label.item.decision.id, success, event.author, event.number)
         before = self.counted(label)
+        was = None if before == FORGOTTEN else bool(before)
+        made = (len(self._corrections) + 1, event.time, label.item.decision.id, success, was, event.author, event.number)
         self._corrections.append(Correction(*made, newest_seq=len(self._labels), seq=label.seq))
         self._said[label.item.decision.id] = success
         self.count(label.item, before, -1)

@@ -188,6 +188,7 @@ class Correction:
 
     number : 1, 2, ... in each cell.  time : in seconds.
     success : the label from now on; None: it is forgotten, and takes no part in anything that is learned or counted.
+    was : the label until then, None likewise.
     author : who said so.  event : number of its event.  newest_seq : number of the cell's newest label at that moment.
     seq : number of the label that it corrects.
     """
@@ -196,6 +197,7 @@ class Correction:
     time: float
     decision_id: str
     success: bool | None
+    was: bool | None
     author: str
     event: int
     newest_seq: int

@@ -15,7 +15,7 @@ from . import sql_queries as ask
 from .checks import as_data, as_text, check_state, no_such_version, nothing_to_correct, unknown_decision
 from .records import Change, Correction, Event, ModelVersion
 from .sql_queue import SqlDatabase
-from .sql_rows import chunks, from_npz, read_event, version_row
+from .sql_rows import as_label, chunks, from_npz, read_event, version_row
 from .sql_tables import CORRECTION, EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
 
 
@@ -106,17 +106,17 @@ class SqlHistory:
 
     def _correct(self, connection: sa.Connection, change: Change, author: str | None, event: int, now: float) -> None:
         found = [row for part in chunks(change.decisions) for row in connection.execute(ask.held_query(self.cell_id, part))]
-        source_of = {row.id: row.source for row in found}
+        was = {row.id: row.counted for row in found}
         for name in change.decisions:
-            if name not in source_of:
+            if name not in was:
                 raise unknown_decision(name)
-            if source_of[name] is None:
+            if was[name] is None:
                 raise nothing_to_correct(name)
         first = self._database.next_number(connection, CORRECTION.c.number)
         newest = self._database.next_number(connection, LABEL.c.seq) - 1
         said = {"success": change.success, "author": author, "event": event, "newest_seq": newest, "time": now}
         rows = [
-            said | {"cell_id": self.cell_id, "number": first + i, "decision_id": name}
+            said | {"cell_id": self.cell_id, "number": first + i, "decision_id": name, "was": as_label(was[name])}
             for i, name in enumerate(change.decisions)
         ]
         for part in chunks(rows):

@@ -49,7 +49,12 @@ def decision_query(cell_id: str, decision_id: str) -> Query:
 
 def held_query(cell_id: str, ids: Sequence[str]) -> Query:
     """What labels repeat of these decisions, and the labels that they have already."""
-    columns = (*DECISION.c["id", "content_hash", "quarantined"], LABEL.c.success, LABEL.c.source)
+    columns = (
+        *DECISION.c["id", "content_hash", "quarantined"],
+        LABEL.c.success,
+        LABEL.c.source,
+        counted().label("counted"),
+    )
     return sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id, DECISION.c.id.in_(ids))
 
 
@@ -153,7 +158,7 @@ def event_query(cell_id: str, limit: int | None) -> Query:
 
 def correction_query(cell_id: str, after: int) -> Query:
     """The corrections after number `after`, oldest first, with the fields of `Correction`."""
-    own = ("number", "time", "decision_id", "success", "author", "event", "newest_seq")
+    own = ("number", "time", "decision_id", "success", "was", "author", "event", "newest_seq")
     same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
     query = sa.select(*CORRECTION.c[own], LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
     return query.where(CORRECTION.c.cell_id == cell_id, CORRECTION.c.number > after).order_by(CORRECTION.c.number)

@@ -107,10 +107,15 @@ def read_decision(row: Any) -> StoredDecision:
         trace=unpack_trace(row),
         content_hash=row.content_hash,
         quarantined=row.quarantined,
-        success=None if row.success in (None, FORGOTTEN) else bool(row.success),
+        success=as_label(row.success),
         source=None if row.source is None else Source(row.source),
         part=row.part,
     )
+
+
+def as_label(counted: int | None) -> bool | None:
+    """Return a label as it counts; None where there is none, or where it is forgotten."""
+    return None if counted in (None, FORGOTTEN) else bool(counted)
 
 
 def read_event(row: Any) -> Event:

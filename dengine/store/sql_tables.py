@@ -103,6 +103,7 @@ CORRECTION = sa.Table(  # later words on labels; the newest of a decision counts
     sa.Column("time", sa.Double, nullable=False),
     sa.Column("decision_id", sa.String, nullable=False),
     sa.Column("success", sa.Boolean),  # NULL: forgotten
+    sa.Column("was", sa.Boolean),  # until then; NULL likewise
     sa.Column("author", sa.String, nullable=False),
     sa.Column("event", sa.BigInteger, nullable=False),
     sa.Column("newest_seq", sa.BigInteger, nullable=False),  # of the cell's labels at that moment
