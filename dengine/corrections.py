@@ -183,10 +183,10 @@ class Corrections:
     def _done(self, change: Change, safe_again: str = "what was told anew keeps the tolerance") -> Changed:
         number = self.store.events(1)[0].number
         self._feedback.announce(safe_again)
-        return Changed(change.kind, f"{change.text[0].upper()}{change.text[1:]}.", number, self._versions.version)
+        return Changed(change.kind, _sentence(f"{change.text}."), number, self._versions.version)
 
     def _unchanged(self, kind: str, text: str) -> Changed:
-        return Changed(kind, text, None, self._versions.version)
+        return Changed(kind, _sentence(text), None, self._versions.version)
 
 
 def _as_label(success: Any) -> bool:
@@ -199,6 +199,10 @@ def _was(known: StoredDecision) -> str:
     return "forgotten" if known.success is None else f"a {SAID[known.success]}"
 
 
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
 def _listed(ids: Sequence[str], most: int = 5) -> str:
     shown = ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
-    return f"the label{'s' if len(ids) > 1 else ''} of {shown}"
+    return f"the labels of {shown} are" if len(ids) > 1 else f"the label of {shown} is"

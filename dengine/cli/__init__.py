@@ -15,6 +15,7 @@ import click
 
 from .. import __version__
 from ..errors import DengineError
+from .correcting import correct, forget, retrain, rollback, set_policy
 from .data import data
 from .export import export, import_labels
 from .interrupting import end_interrupted
@@ -63,5 +64,8 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (
+    *(data, replay, compare, train, run, simulate, status, export, import_labels),
+    *(correct, forget, rollback, set_policy, retrain),
+):
     main.add_command(verb)
