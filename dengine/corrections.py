@@ -142,7 +142,7 @@ class Corrections:
         anew = not own and any(name in new for name in SCORING)
         settings = self._under(policy, anew)
         was = {name: getattr(old, name) for name in new}
-        text = ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
+        text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
         data = {"old": asdict(old), "new": asdict(policy)}
         event = Change("policy", text, data, author, settings=settings.to_store())
         telling = Telling(settings.told_since, settings.began_in)

@@ -108,7 +108,7 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path) -> None:
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, LB 80 %" in said("status", store)
     line = said("set-policy", store, "--interval", "jeffreys")
-    assert line.startswith("Interval wilson -> jeffreys. Event 2, by")
+    assert line.startswith("The policy's interval wilson -> jeffreys. Event 2, by")
 
 
 @pytest.mark.parametrize(
