@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .cells.base import Cell
 from .contracts import as_agreed
+from .corrections import Corrections
 from .deciding import DecisionMaker, as_part
 from .decision.policy import Policy
 from .errors import StoreError
@@ -35,12 +36,14 @@ from .loop import drive
 from .model.base import EngineModel, Model
 from .recipe import Recipe
 from .records import Cycle, Decision, RetrainReport, TraceSpec
-from .retraining import Clock, EncoderTime, Limits, Retrainer, Window
+from .resuming import Telling
+from .retraining import Clock, EncoderTime, Limits, Retrainer
 from .reviewing import EngineReview
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
 from .store.records import DecidedTrace, StoredDecision, stored_decision
 from .versions import ModelVersions
+from .window import Window
 
 log = logging.getLogger("dengine")
 OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
@@ -48,7 +51,7 @@ OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine(EngineFacts, EngineReview):
+class DataEngine(EngineFacts, EngineReview, Corrections):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -116,8 +119,10 @@ class DataEngine(EngineFacts, EngineReview):
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
         self._keeper = Keeper(store, owning=not reading, patient=replaying)
         weakref.finalize(self, self._keeper.close)  # of a program that forgot to
-        self._versions = ModelVersions(template, retrainer, self._keeper, clock)
-        self._feedback = Feedback(self._keeper, self._versions, settings.recipe.policy.stops == "all", on_safe_mode)
+        telling, since = Telling(settings.told_since, settings.began_in), settings.policy_since
+        self._versions = ModelVersions(template, retrainer, self._keeper, clock, telling)
+        stops_all = settings.recipe.policy.stops == "all"
+        self._feedback = Feedback(self._keeper, self._versions, stops_all, on_safe_mode, since)
         self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
         self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
         self._settings_waiting = False
@@ -141,7 +146,6 @@ class DataEngine(EngineFacts, EngineReview):
     def open(cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, **options: Any) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
-        (Of a part that a stop reached too late, the first engine keeps its success too until its next retrain.)
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
         options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them; reading=True looks at a
             store that another engine may own, to export it for one, and neither decides nor learns.

@@ -45,12 +45,12 @@ class EngineFacts:
 
     @property
     def recipe(self) -> Recipe:
-        """Every setting as it is in force; fixed once the engine is made."""
+        """Every setting as it is in force; all but the policy are fixed once the engine is made."""
         return self._settings.recipe
 
     @property
     def policy(self) -> Policy:
-        """The user's numbers as they are in force; for others make another engine."""
+        """The user's numbers as they are in force; `set_policy` changes them."""
         return self._settings.recipe.policy
 
     @property
@@ -74,9 +74,9 @@ class EngineFacts:
         return self._feedback.safe_mode
 
     def certificate(self) -> Certificate:
-        """What can be said by now, at level 1 - alpha, of the parts that were decided without a check."""
+        """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return certificate_of(self.store.outcomes(), self.policy)
+        return certificate_of(self.store.outcomes(self._settings.policy_since), self.policy)
 
     @property
     def new_labels(self) -> int:

@@ -26,12 +26,19 @@ class Feedback:
     """Takes in what became of decided parts.
 
     stops_all : whether silence until the next decision confirms an accepted part.
+    policy_since : the first model version under this policy: what an earlier one accepted is not waited for.
     on_safe_mode : called with the reason, "" where it ends, when the safe mode begins or ends; it is recorded before.
     """
 
     def __init__(
-        self, keeper: Keeper, versions: ModelVersions, stops_all: bool, on_safe_mode: Callable[[str], object] | None = None
+        self,
+        keeper: Keeper,
+        versions: ModelVersions,
+        stops_all: bool,
+        on_safe_mode: Callable[[str], object] | None = None,
+        policy_since: int = 0,
     ) -> None:
+        self.policy_since = policy_since
         self.keeper, self.versions, self.stops_all = keeper, versions, stops_all
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
@@ -46,9 +53,9 @@ class Feedback:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.safe_mode
         store = self.keeper.store
-        ids = store.unreported_accepts()
+        ids = store.unreported_accepts(self.policy_since)
         if not self.stops_all:
-            self._silent = len(ids) - store.silent_total()
+            self._silent = len(ids) - store.silent_total(self.policy_since)
             return
         for id_ in ids:
             known = store.get_decision(id_)
@@ -78,7 +85,7 @@ class Feedback:
                 self.store_waiting()
             except StoreError:  # they still wait, in memory; no decision fails for it
                 log.exception("confirmed parts could not be stored")
-        self._announce()
+        self.announce()
 
     def decided(self, item: DecidedTrace) -> None:
         """A part was decided on."""
@@ -100,13 +107,15 @@ class Feedback:
         self._went_on.pop(known.id, None)
         if known.quarantined:
             return
+        if late:
+            self.versions.unlearn(known)
         self._learn(known, label, point)
         self._keep(known, success, int(seq))
-        if late:  # its success stays among the references until the next retrain
+        if late:
             self.versions.new_labels -= 1
             self._untrue = True
         self.arrive()
-        self._announce()
+        self.announce()
 
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has taken by now train, and the rule is told the truth."""
@@ -146,7 +155,8 @@ class Feedback:
 
     def _was_silent(self, known: StoredDecision) -> bool:
         """Whether an accepted part was counted among the silent ones before its label came."""
-        return known.action is Action.ACCEPT and known.id not in self._went_on and not self.stops_all
+        counted = known.action is Action.ACCEPT and known.id not in self._went_on and not self.stops_all
+        return counted and known.model_version >= self.policy_since
 
     def _label(self, known: StoredDecision, success: bool, source: Source, less: int = 0) -> tuple[NewLabel, Point | None]:
         point = None if known.quarantined else self.versions.reference_point(known)
@@ -158,14 +168,20 @@ class Feedback:
         self._silent = 0
         self.versions.learn(known, label.success, point, label.silent)
 
-    def _announce(self) -> None:
+    def begin_policy(self, stops_all: bool, since: int) -> None:
+        """Go on under another policy. What was accepted under the last one and not heard of stays unheard of."""
+        self.stops_all, self.policy_since = stops_all, since
+        self._went_on.clear()
+        self._silent = 0
+
+    def announce(self, safe_again: str = "fresh evidence keeps the tolerance") -> None:
         """Record that safe mode began or ended, and tell; last of all, for either may fail and must cost no label."""
         now = self.safe_mode
         if now == self._mode:
             return
         self._mode = now
         try:
-            self.keeper.event("safe mode", now or "ended: fresh evidence keeps the tolerance")
+            self.keeper.event("safe mode", now or f"ended: {safe_again}")
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
         except Exception:

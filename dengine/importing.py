@@ -208,7 +208,8 @@ def _import_lines(
     looks = [gate(torch.from_numpy(line.trace)) for line in lines]
     ids = _ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
     counts_silence = policy.stops == "some"
-    silent = len(store.unreported_accepts()) - store.silent_total() if counts_silence else 0
+    since = int(store.settings().get("policy_since", 0))
+    silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
     for start in range(0, len(lines), CHUNK):
         labels: list[NewLabel] = []
         for i in range(start, min(start + CHUNK, len(lines))):
@@ -216,7 +217,7 @@ def _import_lines(
             if held is None:
                 decision = _decided(ids[i], line, fault, policy.audit_rate)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
-            elif held.success is not None:
+            elif held.source is not None:  # a forgotten one has a label too
                 counts["known"] += 1
                 continue
             if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent

@@ -1,32 +1,76 @@
-"""Going on with a store: the same version, the same decisions, bit for bit."""
+"""Going on with a store: the same version, the same decisions, bit for bit.
+
+What the references of a version learned since it was stored, labels and corrections, is done again in the order in which it
+happened.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .model.base import EngineModel, Told
-from .retraining import Window
+from .references import References
 from .store.base import Store
-from .store.records import Evidence, Labelled, ModelVersion
+from .store.records import Correction, Evidence, ModelVersion
+from .window import Window
 
 MANY = 500  # labels and no retrain yet: they were imported
 
 
 @dataclass(frozen=True)
+class Telling:
+    """What the rule in force is told: what was decided from version `since` on; it began in the safe mode `began_in`."""
+
+    since: int = 0
+    began_in: int = 0
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a version was trained on.
+
+    seq : (n,) its labels.  corrected_to : newest correction that these had.  counts_from : newest label that the next
+        retrain does not wait for.
+    """
+
+    seq: NDArray[np.int64]
+    corrected_to: int
+    counts_from: int
+
+    def to_state(self) -> dict[str, NDArray[Any]]:
+        """Plain arrays for the store."""
+        numbers = {"trained_as": np.array(self.corrected_to), "counts_from": np.array(self.counts_from)}
+        return {"trained_on": self.seq} | numbers
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Origin:
+        """What `to_state` gave; before schema 3 it was less."""
+        seq = state["trained_on"]
+        return cls(seq, int(state.get("trained_as", 0)), int(state.get("counts_from", seq[-1])))
+
+
+@dataclass(frozen=True)
 class Resumed:
-    """Where an engine stood: the model that answered (None: no retrain yet), its version, labels since the last retrain."""
+    """Where an engine stood: the model that answered (None: no retrain yet), its version, labels since the last retrain.
+
+    references : the labels behind its references.  origin : what it was trained on.  corrected_to : newest correction.
+    """
 
     model: EngineModel | None
     version: int
     new_labels: int
+    references: References = field(default_factory=References)
+    origin: Origin | None = None
+    corrected_to: int = 0
 
 
-def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
+def resume(store: Store, template: EngineModel, window: Window, telling: Telling) -> Resumed:
     """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
     labelled = store.labelled(window.capacity)
     window.extend(labelled)
@@ -34,45 +78,107 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     if version is None:
         if len(labelled.seq) >= MANY:
             template.look_ahead_safely(labelled.traces)
-        _tell(template, store.evidence_since(0))
-        return Resumed(None, 0, len(labelled.seq))
-    model = _restored(store, template, version.state, window.newest_seq)
+        template.begin_safely_in(telling.began_in)
+        _tell(template, store.evidence_since(0, telling.since))
+        corrections = store.corrections()
+        return Resumed(None, 0, len(labelled.seq), corrected_to=corrections[-1].number if corrections else 0)
+    model, origin = _restored(store, template, version.state), Origin.from_state(version.state)
     model.prepare_safely(template)
     model.look_ahead_safely(labelled.traces)
-    trained_to = int(version.state["trained_on"][-1])
-    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
-    known_to = version.last_seq if "points" in version.state else trained_to
-    _add_since(model, store, version, labelled, known_to)
-    _tell(model, store.evidence_since(0 if "untold" in version.state else version.last_seq))
-    return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
+    references, corrected_to = join_since(model, store, version, window.capacity)
+    if "untold" in version.state or corrected_to > corrected_at(version):
+        tell_all(model, store.evidence_since(0, telling.since), telling)
+    else:
+        _tell(model, store.evidence_since(version.last_seq, telling.since))
+    new_labels = int((labelled.seq > origin.counts_from).sum())
+    return Resumed(model, version.version, new_labels, references, origin, corrected_to)
 
 
-def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel:
+def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel:
     model = template.successor()
-    if model.needs_refit(state):  # on the very traces that it was fitted on
-        trained_on = state["trained_on"]
-        data = store.labelled(newest - int(trained_on[0]) + 1)
-        kept = np.isin(data.seq, trained_on)
-        model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
+    if model.needs_refit(state):  # on the very traces that it was fitted on, with the labels that these had
+        refit(model, store, Origin.from_state(state))
     return model.set_state(state)
 
 
-def _add_since(model: EngineModel, store: Store, version: ModelVersion, labelled: Labelled, last_seq: int) -> None:
+def refit(model: EngineModel, store: Store, origin: Origin, corrected_to: int | None = None) -> None:
+    """Train a model on what another was trained on, with the labels as they stood then, or after another correction."""
+    as_of = origin.corrected_to if corrected_to is None else corrected_to
+    data = store.labelled(first=int(origin.seq[0]), last=int(origin.seq[-1]), corrected_to=as_of)
+    kept = np.isin(data.seq, origin.seq)
+    model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
+
+
+def corrected_at(version: ModelVersion) -> int:
+    """The newest correction that a version's references had when it was stored."""
+    return int(version.state.get("corrected_to", 0))
+
+
+def join_since(model: EngineModel, store: Store, version: ModelVersion, capacity: int) -> tuple[References, int]:
+    """Let a version's model learn what happened since it was stored, in that order: labels join, corrections change them.
+
+    Returns the labels behind its references, and the newest correction.
+    """
+    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
+    known_to = version.last_seq if "points" in version.state else int(version.state["trained_on"][-1])
+    corrected_to = corrected_at(version)
+    as_of = corrected_to if model.keeps_references else None  # a rival cannot be corrected afterwards
+    since = store.labelled(capacity, first=known_to + 1, corrected_to=as_of)
+    references, corrections = _references(store, version), deque(store.corrections(corrected_to))
+    newest = corrections[-1].number if corrections else corrected_to
     added = store.points_since(version.last_seq, version.version)
     points = dict(zip(added.seq.tolist(), added.points, strict=True))
-    for i in np.flatnonzero(labelled.seq > last_seq):
-        hash_ = int(labelled.hashes[i])
-        point = points.get(int(labelled.seq[i]))  # unknown: its decision was answered by an earlier version
-        point = model.place_safely(labelled.traces[i], hash_) if point is None else point
-        model.add_safely(point, int(labelled.labels[i]), hash_)
+    for seq, trace, label, hash_ in zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True):
+        while corrections and corrections[0].newest_seq < seq:
+            change(model, references, store, corrections.popleft())
+        point = points.get(seq)  # unknown: its decision was answered by an earlier version
+        point = model.place_safely(trace, hash_) if point is None else point
+        if model.add_safely(point, int(label), hash_):
+            references.add(seq)
+    for each in corrections:
+        change(model, references, store, each)
+    return references, newest
 
 
-def tell_all(model: EngineModel, known: Evidence) -> None:
-    """Let a model's rule forget, and tell it all that is known."""
+def _references(store: Store, version: ModelVersion) -> References:
+    state = version.state
+    if "points" not in state or "references" in state:
+        return References(state.get("references", ()))
+    trained_on = state["trained_on"]  # before schema 3: what it was trained on, and what came in meanwhile
+    meanwhile = store.labelled(first=int(trained_on[-1]) + 1, last=version.last_seq, corrected_to=0)
+    return References([*trained_on, *meanwhile.seq])
+
+
+def change(model: EngineModel, references: References, store: Store, correction: Correction) -> bool:
+    """Do to a model's references what a correction says; False where the reference is not what it should be.
+
+    A reference gets its new label, or leaves. What was forgotten and counts again joins as the newest.
+    """
+    known = store.get_decision(correction.decision_id)
+    if known is None or known.quarantined or not model.keeps_references:
+        return True
+    age, label = references.age(correction.seq), correction.success
+    if age is not None:
+        done = model.change_reference(age, known.content_hash, None if label is None else int(label))
+        if label is None:
+            references.remove(age)
+        return done
+    if label is not None and correction.was is None:
+        point = model.place_safely(known.trace, known.content_hash)
+        if model.add_safely(point, int(label), known.content_hash):
+            references.add(correction.seq)
+    return True
+
+
+def tell_all(model: EngineModel, known: Evidence, telling: Telling) -> None:
+    """Let a model's rule forget, and tell it all that is known of what it is to be told."""
     model.forget()
+    model.begin_safely_in(telling.began_in)
     _tell(model, known)
 
 
 def _tell(model: EngineModel, known: Evidence) -> None:
+    if not model.remembers:
+        return
     for row in zip(known.lower, known.upper, known.success, known.novel, known.silent, strict=True):
         model.tell_safely(Told(float(row[0]), float(row[1]), bool(row[2]), bool(row[3]), int(row[4])))

@@ -10,12 +10,12 @@ from .errors import DengineError
 from .history import history
 from .model.base import EngineModel
 from .records import Action, Reason
-from .resuming import resume
-from .retraining import Window
+from .resuming import Telling, resume
 from .settings import EngineSettings
 from .store.base import Store
 from .store.views import PastDecision
 from .versions import ModelVersions
+from .window import Window
 
 if TYPE_CHECKING:
     from .explaining import Explanation
@@ -62,7 +62,8 @@ def _present(store: Store) -> EngineModel | None:
     """The model that answers now, rebuilt; None where it needs an object that the store cannot name."""
     try:
         settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
-        return resume(store, template, Window(settings.recipe.window)).model
+        telling = Telling(settings.told_since, settings.began_in)
+        return resume(store, template, Window(settings.recipe.window), telling).model
     except DengineError as error:
         log.info("the present model cannot be rebuilt from the store alone: %s", error)
         return None

@@ -30,6 +30,7 @@ LOOP = (
     "audit_rate",
     "stops",
 )  # that count for any model
+MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,9 @@ class EngineSettings:
     model : what a model that was handed in is called; None: the recipe describes the model.
     described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
     trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
+    policy_since : the first model version under the policy in force; 0: every one.
+    told_since : the first version of whose decisions the rule in force is told.  began_in : the position in `SAFE_MODE`
+        that it began in.
     """
 
     recipe: Recipe
@@ -48,6 +52,9 @@ class EngineSettings:
     described: str | None = None
     trace: TraceSpec | None = None
     inferred: bool = False
+    policy_since: int = 0
+    told_since: int = 0
+    began_in: int = 0
 
     def __post_init__(self) -> None:
         if not is_whole(self.seed, 0, SEEDS):
@@ -63,7 +70,7 @@ class EngineSettings:
             known["trace"] = json.dumps(asdict(self.trace))
         if self.inferred:
             known["inferred"] = "true"
-        return known
+        return known | {name: str(value) for name in MARKS if (value := getattr(self, name))}
 
     @classmethod
     def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
@@ -97,7 +104,8 @@ class EngineSettings:
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
         inferred = "inferred" in known
-        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known), inferred)
+        marks = {name: int(known.get(name, "0")) for name in MARKS}
+        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known), inferred, **marks)
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""

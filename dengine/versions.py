@@ -9,18 +9,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .decision.policy import Policy
 from .errors import StoreError
 from .keeping import Keeper
 from .model.base import EngineModel, Told
 from .pending import HUNG
 from .records import Reason, RetrainReport
-from .resuming import resume, tell_all
+from .reducers.base import State
+from .references import References
+from .resuming import Origin, Telling, change, join_since, refit, resume, tell_all
 from .retraining import Retrainer, Trained
-from .store.records import StoredDecision
+from .store.base import Store
+from .store.records import Change, StoredDecision
 
 log = logging.getLogger("dengine")
 
 Point = NDArray[np.float32]
+TELL_ALL = Telling()
+RULE = ("rule.", "untold")  # of a version's state: what its rule knew, which goes on
 
 
 class ModelVersions:
@@ -34,15 +40,30 @@ class ModelVersions:
         training or swap, since a version is stored after all that its rule was told of.
     """
 
-    def __init__(self, template: EngineModel, retrainer: Retrainer, keeper: Keeper, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        template: EngineModel,
+        retrainer: Retrainer,
+        keeper: Keeper,
+        clock: Callable[[], float],
+        telling: Telling = TELL_ALL,
+    ) -> None:
         self.template = template
+        self.telling = telling
         self.retrainer = retrainer
         self.keeper = keeper
         self.clock = clock
         self.answering: EngineModel | None = None
         self.version, self.new_labels = 0, 0
         self.store_waiting: Callable[[], None] = _nothing_waits
+        self._references, self._corrected_to = References(), 0
+        self._origin: Origin | None = None
         self._news: RetrainReport | None = None
+
+    @property
+    def store(self) -> Store:
+        """What the keeper keeps; asked without a time limit, so not while the cell waits."""
+        return self.keeper.store
 
     @property
     def newest(self) -> EngineModel:
@@ -51,8 +72,10 @@ class ModelVersions:
 
     def resume(self) -> None:
         """Go on from the store."""
-        resumed = resume(self.keeper.store, self.template, self.retrainer.window)
+        resumed = resume(self.store, self.template, self.retrainer.window, self.telling)
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
+        self._references, self._origin = resumed.references, resumed.origin
+        self._corrected_to = resumed.corrected_to
 
     def reference_point(self, known: StoredDecision) -> Point | None:
         """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
@@ -65,17 +88,98 @@ class ModelVersions:
     def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
         """Take in what became of a part: tell the rule, and make the trace a reference."""
         novel = known.reason is Reason.NOVEL
-        self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
-        self.newest.add_safely(point, int(success), known.content_hash)
+        if known.model_version >= self.telling.since:
+            self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
+        if self.newest.add_safely(point, int(success), known.content_hash):
+            self._references.add(known.id)
         self.new_labels += 1
+
+    def unlearn(self, known: StoredDecision) -> None:
+        """Take out the reference of a part whose label waits for the store: it was not what happened."""
+        age = self._references.age(known.id)
+        if age is not None:
+            self.newest.change_reference(age, known.content_hash, None)
+            self._references.remove(age)
 
     def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
         """Give a label that is stored to the next retrain."""
+        self._references.number(known.id, seq)
         self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        tell_all(self.newest, self.keeper.ask(lambda: self.keeper.store.evidence_since(0)))
+        known = self.keeper.ask(lambda: self.store.evidence_since(0, self.telling.since))
+        tell_all(self.newest, known, self.telling)
+
+    def correct(self) -> None:
+        """Learn what the store's newest corrections say: references, window and rule, before the next decision.
+
+        What keeps references of its own, a rival, is trained anew at once.
+        """
+        window = self.retrainer.window
+        window.refill(self.store.labelled(window.capacity))
+        done = self.newest.keeps_references or self.answering is None
+        for each in self.store.corrections(self._corrected_to):
+            if self.answering is not None:
+                done &= change(self.answering, self._references, self.store, each)
+            self._corrected_to = each.number
+        self.new_labels = window.after(0 if self._origin is None else self._origin.counts_from)
+        self.tell_anew()
+        if not done:
+            self.retrain()
+
+    def roll_back(self, number: int, event: Change) -> RetrainReport:
+        """Let an earlier version answer again, as a new one, with what came since among its references."""
+        begin, version = self.clock(), self.store.load_version(number)
+        state = {name: values for name, values in version.state.items() if not name.startswith(RULE)}
+        model, origin = self.template.successor(), Origin.from_state(version.state)
+        if not model.keeps_references:
+            # A rival cannot take a label back: it learns from the same traces as they are labelled now.
+            origin = replace(origin, corrected_to=self._corrected_to)
+        if model.needs_refit(state):
+            refit(model, self.store, origin)
+        model.set_state(state)
+        model.prepare_safely(self.newest)
+        references, _ = join_since(model, self.store, version, self.retrainer.window.capacity)
+        origin = replace(origin, counts_from=self.retrainer.window.newest_seq)
+        n = len(origin.seq)
+        report = RetrainReport(self.version + 1, self.clock() - begin, n, 0, True, f"rolled back to version {number}")
+        self._record(event, report, model, references, origin)
+        self.new_labels = 0
+        return report
+
+    def set_policy(self, policy: Policy | None, telling: Telling, event: Change) -> None:
+        """Go on under another policy, as a new version of the same model; None: only what the engine looks at changed.
+
+        telling : what its rule is to be told.
+        """
+        template, model = self.template, self.answering
+        if policy is not None:
+            template = template.under(policy)
+            template.begin_safely_in(telling.began_in)
+            if model is not None:
+                model = model.under(policy)
+                model.prepare_safely(template)
+        if model is None or self._origin is None:
+            self.store.record(event)
+        else:
+            reason = "another policy, the same model"
+            report = RetrainReport(self.version + 1, 0.0, len(self._origin.seq), 0, True, reason)
+            self._record(event, report, model, self._references, self._origin)
+        self.template, self.telling = template, telling
+
+    def _record(
+        self, event: Change, report: RetrainReport, model: EngineModel, references: References, origin: Origin
+    ) -> None:
+        """Store a version together with what a person did; then it answers."""
+        state = self._state(model, references, origin)
+        self.store.record(replace(event, version=(report, self.retrainer.window.newest_seq, state)))
+        self.answering, self.version, self._news = model, report.version, report
+        self._references, self._origin = references, origin
+
+    def _state(self, model: EngineModel, references: References, origin: Origin) -> State:
+        own = {"references": references.seqs()} if model.keeps_references else {}
+        return model.get_state() | origin.to_state() | own | {"corrected_to": np.array(self._corrected_to)}
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
@@ -121,17 +225,13 @@ class ModelVersions:
             self._swap(trained)
 
     def _swap(self, trained: Trained) -> RetrainReport:
-        model, seq, reason = trained.candidate.model, trained.seq, trained.candidate.reason
-        report = RetrainReport(self.version, 0.0, len(seq), trained.candidate.n_steps, False, reason)
+        candidate = trained.candidate
+        report = RetrainReport(self.version, 0.0, len(trained.seq), candidate.n_steps, False, candidate.reason)
         try:
             self.store_waiting()
             report = self._store(report, trained)
-        except (
-            StoreError
-        ) as error:  # a version that is not stored would be gone with the process, and its decisions with it
+        except StoreError as error:  # a version that is not stored would be gone with the process
             return self._not_stored(report, error)
-        if model is not None:
-            self.answering, self.version = model, report.version  # one reference is swapped
         self._news = report
         return report
 
@@ -139,12 +239,17 @@ class ModelVersions:
         model, seq, state = trained.candidate.model, trained.seq, None
         if model is not None:
             model.prepare_safely(self.newest)
-            self.retrainer.window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
+            # Labels that came in meanwhile are in the new version.
+            references = References([*seq, *self.retrainer.window.catch_up(model, int(seq[-1]))])
+            origin = Origin(seq, self._corrected_to, int(seq[-1]))
             report = replace(report, version=self.version + 1, accepted=True)
-            state = model.get_state() | {"trained_on": seq}
+            state = self._state(model, references, origin)
         # Until the version could answer; storing it comes on top.
         report = replace(report, seconds=self.clock() - trained.begin)
         self.keeper.version(report, self.retrainer.window.newest_seq, state)
+        if model is not None:
+            self.answering, self.version = model, report.version  # one reference is swapped
+            self._references, self._origin = references, origin
         return report
 
     def _not_stored(self, report: RetrainReport, error: StoreError) -> RetrainReport:

@@ -38,6 +38,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "retraining": 8,
     "resuming": 8,
     "contracts": 8,
+    "references": 8,
     "deciding": 8,
     "interrupts": 1,
     "backlog": 8,
@@ -45,6 +46,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "pending": 8,
     "facts": 8,
     "versions": 8,
+    "window": 8,
     "feedback": 8,
     "envelope": 2,
     "history": 8,
@@ -53,6 +55,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "answering": 8,
     "explaining": 8,
     "reviewing": 8,
+    "corrections": 8,
     "loop": 8,
     "engine": 9,
     "checks": 10,
@@ -68,7 +71,8 @@ HEAVY = {  # at the top of a module only in those dedicated to it, which are the
     "mujoco": ("cells.simulation.world",),
     "matplotlib": ("experiments.figures",),
     "sqlalchemy": tuple(
-        f"store.sql{name}" for name in ("", "_connections", "_engine", "_owning", "_queries", "_queue", "_tables", "_views")
+        f"store.sql{name}"
+        for name in ("", "_connections", "_engine", "_history", "_owning", "_queries", "_queue", "_tables", "_views")
     ),
     "pandas": (),
     "torchmetrics": (),

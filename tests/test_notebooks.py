@@ -34,8 +34,13 @@ def exact(notebook: Any) -> list[Any]:
     return [cell for cell in notebook.cells if "exact" in cell.metadata.get("tags", [])]
 
 
-def test_there_is_a_notebook_for_each_of_the_three_questions() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["comparing_reducers", "recordings_to_deployment", "the_guarantee_seen"]
+def test_there_is_a_notebook_for_each_of_the_four_questions() -> None:
+    assert [path.stem for path in NOTEBOOKS] == [
+        "comparing_reducers",
+        "corrections",
+        "recordings_to_deployment",
+        "the_guarantee_seen",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)

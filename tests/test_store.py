@@ -807,7 +807,7 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     SqlStore(str(file)).close()
     with sqlite3.connect(file) as connection:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
-    with pytest.raises(StoreError, match="schema 2, found schema 99"):
+    with pytest.raises(StoreError, match="schema 3, found schema 99"):
         SqlStore(str(file), "another cell")
 
 
@@ -816,7 +816,7 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     file = tmp_path / "a.db"
     with sqlite3.connect(file) as connection:
         connection.execute(f"CREATE TABLE {table}")
-    with pytest.raises(StoreError, match="schema 2, found tables of another program"):
+    with pytest.raises(StoreError, match="schema 3, found tables of another program"):
         SqlStore(str(file))
     with sqlite3.connect(file) as connection:
         assert connection.execute("SELECT count(*) FROM sqlite_master").fetchone() == (1,)

@@ -1,4 +1,4 @@
-"""A store of schema 1, as dengine 0.2 wrote it, is brought to schema 2 when it is opened; nothing in it changes."""
+"""A store of schema 1, as dengine 0.2 wrote it, is brought to schema 3 when it is opened; nothing in it changes."""
 
 import io
 import os
@@ -191,18 +191,18 @@ def test_what_is_new_is_written_and_read_after_opening_again(old: str) -> None:
     with SqlStore(old) as store:
         store.put_decision(d, TRACE, 5, False, "SN-4")
         assert store.put_label("d", True, Source.VERIFICATION, 1, None, silent=6) == 3
-        store.put_event("note", "brought to schema 2")
+        store.put_event("note", "brought to schema 3")
     with SqlStore(old) as store:
         assert store.get_decision("d").part == "SN-4"
         assert (store.evidence_since(2).novel.tolist(), store.silent_total()) == ([True], 6)
-        assert [(event.number, event.text) for event in store.events()] == [(1, "brought to schema 2")]
+        assert [(event.number, event.text) for event in store.events()] == [(1, "brought to schema 3")]
 
 
 def test_tables_brought_up_to_date_are_those_of_a_new_store_and_every_cell_names_the_schema(
     old: str, tmp_path: Path
 ) -> None:
     SqlStore(old, "a third").close()
-    assert schemas(old) == {"cell": "2", "other": "2", "a third": "2"}
+    assert schemas(old) == {"cell": "3", "other": "3", "a third": "3"}
     changed = shape(old)
     execute(old, *(f"DROP TABLE {table}" for table in changed))
     SqlStore(old).close()
@@ -219,7 +219,7 @@ def test_stores_that_open_schema_1_at_once_all_succeed(old: str) -> None:
     for store in opened:
         store.close()
     assert len(opened) == 4
-    assert set(schemas(old).values()) == {"2"}
+    assert set(schemas(old).values()) == {"3"}
 
 
 def test_processes_that_open_schema_1_at_once_all_succeed(old: str) -> None:
@@ -263,14 +263,14 @@ def test_a_change_that_fails_halfway_leaves_schema_1_as_it_was(old: str, monkeyp
 def test_schema_1_beside_another_programs_event_table_is_refused_and_left_alone(old: str) -> None:
     execute(old, "CREATE TABLE event (id INTEGER)")
     before = shape(old)
-    with pytest.raises(StoreError, match="schema 2, found schema 1 and a table 'event' of another program"):
+    with pytest.raises(StoreError, match="schema 3, found schema 1 and a table 'event' of another program"):
         SqlStore(old)
     assert shape(old) == before
 
 
 def test_cells_of_two_schemas_are_refused(old: str) -> None:
     execute(old, "UPDATE setting SET value = '3' WHERE key = 'schema_version' AND cell_id = 'other'")
-    with pytest.raises(StoreError, match="schema 2, found schema 1, 3"):
+    with pytest.raises(StoreError, match="schema 3, found schema 1, 3"):
         SqlStore(old)
 
 

@@ -16,6 +16,7 @@ import click
 from .. import __version__
 from ..errors import DengineError
 from ..wording import without_password
+from .correcting import correct, forget, retrain, rollback, set_policy
 from .data import data
 from .explaining import explain
 from .export import export, import_labels
@@ -70,5 +71,8 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, history, explain, export, import_labels):
+for verb in (
+    *(data, replay, compare, train, run, simulate, status, history, explain, export, import_labels),
+    *(correct, forget, rollback, set_policy, retrain),
+):
     main.add_command(verb)

@@ -130,7 +130,7 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
         recipe=recipe,
         counts=counts,
         retrains=store.retrains(),
-        certificate=certificate_of(store.outcomes(), recipe.policy),
+        certificate=certificate_of(store.outcomes(int(settings.get("policy_since", 0))), recipe.policy),
         novel=int(newest.novel.sum()),
         recent=len(newest.seq) + int(newest.silent.sum()),
         mode=modes[-1] if modes else None,
@@ -221,6 +221,8 @@ def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
     yield "reasons", _listed(counts["reasons"])
     yield "quarantined", str(counts["quarantined"])
     yield "labels", f"{counts['labels']}: {_listed(counts['sources'])}"
+    if counts["corrected"] or counts["forgotten"]:
+        yield "put right", f"{counts['corrected']} labels corrected, {counts['forgotten']} more forgotten"
     yield "first, last", " to ".join(when(counts[key]) for key in ("first_time", "last_time"))
     if counts["write_failures"]:
         yield "write failures", str(counts["write_failures"])

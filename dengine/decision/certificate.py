@@ -224,7 +224,18 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: Stops, au
 
 
 def certificate_of(outcomes: Any, policy: Policy) -> Certificate:
-    """What a store's `Outcomes` certify by a policy. Where all stops are known, a part counts once its silence is over."""
+    """What a store's `Outcomes` certify by a policy. Where all stops are known, a part counts once its silence is over.
+
+    A label that was forgotten counts as a wrong decision, like an audit whose outcome was lost: forgetting earns nothing.
+    """
+    outcomes = replace(
+        outcomes,
+        stops=outcomes.stops + outcomes.forgotten_accepts,
+        audited_accepts=outcomes.audited_accepts + outcomes.forgotten_audited_accepts,
+        audited_accepts_bad=outcomes.audited_accepts_bad + outcomes.forgotten_audited_accepts,
+        audited_rejects=outcomes.audited_rejects + outcomes.forgotten_audited_rejects,
+        audited_rejects_good=outcomes.audited_rejects_good + outcomes.forgotten_audited_rejects,
+    )
     if policy.stops == "all":
         outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.confirmed)
     return certify(outcomes, policy.alpha, 1.0 - policy.lower_bound, policy.stops, policy.audit_rate)

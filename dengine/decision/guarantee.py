@@ -124,10 +124,20 @@ class WatchedRule(DecisionRule):
         capital = max(before + (times - 1) * step, 0.0) + step  # of equal steps down, none but the last can start from 0
         self.watch[watched].fill_(capital)
         if capital >= self.alarm_at:
-            self.watch.zero_()
-            self.members[:, 1].zero_()
-            self.open.fill_(self.nobody)
-            self.mode.fill_(watched + 1)
+            self.alarm(watched + 1)
+
+    def alarm(self, mode: int) -> None:
+        """Let nothing pass until what held is shown anew; mode : the position in `SAFE_MODE`."""
+        self.watch.zero_()
+        self.members[:, 1].zero_()
+        self.open.fill_(self.nobody)
+        self.mode.fill_(mode)
+
+    @torch.jit.unused
+    def begin_in(self, mode: int) -> None:
+        """As after the alarm of that mode; 0: as it is."""
+        if mode:
+            self.alarm(mode)
 
     def holds(self, side: int) -> bool:
         """Whether any level of a side holds."""

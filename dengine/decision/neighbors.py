@@ -215,6 +215,35 @@ class RadiusIndex:
         if own.any() or int(ring.repeats) > 0:
             self._gather_parts()
 
+    def relabel(self, newest: int, part: int, label: int | None) -> bool:
+        """Give a point another label, or take it out where `label` is None; the others keep their order of age.
+
+        newest : its place counted from the newest point, which is 1.  part : hash of its part.
+        A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
+        """
+        ring, n = self.ring, len(self)
+        slot = (int(ring.total) - newest) % ring.capacity
+        if newest > n:
+            return True
+        if newest < 1 or int(ring.parts[slot]) != part:
+            return False
+        if label is None:
+            self._take_out(slot)
+        else:
+            ring.labels[1, slot] = float(label)
+        return True
+
+    def _take_out(self, slot: int) -> None:
+        ring, n = self.ring, len(self)
+        order = (int(ring.total) - n + torch.arange(n)) % ring.capacity  # oldest first
+        order = order[order != slot]
+        for held in (ring.points, ring.labels, ring.spaces, ring.parts):
+            held[..., : n - 1] = held[..., order]
+        ring.points[:, n - 1 :], ring.labels[1, n - 1 :] = 0.0, 1.0
+        ring.spaces[n - 1 :], ring.parts[n - 1 :] = 0, 0
+        ring.total.fill_(n - 1)
+        self._gather_parts()
+
     def weigh(self) -> None:
         """Find out how far the labels of one part go together, for all counts until this is asked again."""
         if int(self.ring.repeats) > 0:

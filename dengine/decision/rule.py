@@ -124,6 +124,16 @@ class DecisionRule(nn.Module):
         """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
         return 0
 
+    @torch.jit.unused
+    def begin_in(self, mode: int) -> None:
+        """Begin in a safe mode, where the rule has one, as after its alarm."""
+
+
+def learns(rule: DecisionRule) -> bool:
+    """Whether a rule can learn from what it is told: it has a buffer, or a `tell` of its own."""
+    kind = type(rule)
+    return bool(rule.state_dict()) or (kind.tell, kind.note) != (DecisionRule.tell, DecisionRule.note)
+
 
 class RadiusNeighbours(nn.Module):
     """Counts the references around one embedded trace and asks the rule.

@@ -15,6 +15,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..decision.policy import Policy
 from ..errors import ExportError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
@@ -151,6 +152,25 @@ class EngineModel(ABC):
     def add_reference(self, point: Floats, y: int, hash_: int) -> None:
         """Make a labelled trace a reference, by its point."""
 
+    def change_reference(self, newest: int, hash_: int, y: int | None) -> bool:
+        """Give a reference another label, or take it out where `y` is None; False where it is not of this hash.
+
+        newest : its place counted from the newest reference, which is 1.
+        """
+        return False
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its rule learns anything from being told what became of parts."""
+        return False
+
+    def under(self, policy: Policy) -> Self:
+        """The same model, references shared, under another policy, with a rule that was told nothing yet."""
+        return self  # its numbers are its own
+
+    def begin_safely_in(self, mode: int) -> None:  # noqa: B027  # a default: it has no safe mode
+        """Verify everything for this reason, a position in `SAFE_MODE`, until fresh evidence keeps the tolerance."""
+
     @abstractmethod
     def successor(self) -> EngineModel:
         """A model to train next, from where this one is; nothing that training changes is shared, so this one goes on."""
@@ -236,14 +256,16 @@ class EngineModel(ABC):
             log.exception("the model cannot place a labelled trace; the next version learns it from the store")
             return None
 
-    def add_safely(self, point: Floats | None, y: int, hash_: int) -> None:
-        """`add_reference`, where there is a point; a model that fails at it goes on without."""
+    def add_safely(self, point: Floats | None, y: int, hash_: int) -> bool:
+        """`add_reference`, where there is a point; whether it is one now. A model that fails at it goes on without."""
         if point is None:
-            return
+            return False
         try:
             self.add_reference(point, y, hash_)
+            return True
         except Exception:
             log.exception("the model cannot take a labelled trace; the next version learns it from the store")
+            return False
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from ..decision.classifier import WilsonRadiusClassifier
-from ..decision.neighbors import Counts, RadiusIndex
+from ..decision.neighbors import RadiusIndex
 from ..decision.novelty import NoveltyGate, fit_novelty
-from ..decision.rule import SAFE_MODE, DecisionRule
+from ..decision.policy import Policy
+from ..decision.rule import SAFE_MODE, DecisionRule, learns
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..labels import as_labels, as_success
@@ -30,13 +31,14 @@ from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, s
 from ..reducers.cross_fitting import as_reducer
 from ..traces import as_traces
 from .base import EngineModel, Exportable, Prediction, Told
+from .many import ManyPredictions
 from .module import CompiledPredictor, compile_predictor
 from .repeats import repeats_note
 
 WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
 
 
-class ModelPrediction(EngineModel):
+class ModelPrediction(ManyPredictions, EngineModel):
     """Reducer + references + rule, from traces.
 
     reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
@@ -95,8 +97,8 @@ class ModelPrediction(EngineModel):
     @property
     def description(self) -> str:
         """Its reducer, its classifier and its folds, with their settings."""
-        own = described(self.reducer), described(self.classifier)
-        return f"{own[0]} under {own[1]}, {self.folds} folds, {type(self.rule).__name__}"
+        own = f"{described(self.reducer)} under {described(self.classifier)}"
+        return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
 
     def in_force(self, recipe: Recipe) -> Recipe:
         """The recipe with the classifier's numbers."""
@@ -191,6 +193,9 @@ class ModelPrediction(EngineModel):
         """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
         self.index.ring.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_)
 
+    def change_reference(self, newest: int, hash_: int, y: int | None) -> bool:
+        return self.index.relabel(newest, hash_, y)
+
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
@@ -210,6 +215,20 @@ class ModelPrediction(EngineModel):
         self.rule.load_state_dict(fresh.state_dict())
 
     @property
+    def remembers(self) -> bool:
+        return learns(self.rule)
+
+    def under(self, policy: Policy) -> Self:
+        """Another rule, and another module around the same references."""
+        new, own = copy.copy(self), {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
+        new.classifier = clone(self.classifier).set_params(**own)
+        new.rule, new.untold, new._compiled = policy.rule(), False, None
+        return new
+
+    def begin_safely_in(self, mode: int) -> None:
+        self.rule.begin_in(mode)
+
+    @property
     def safe_mode(self) -> str:
         """Why the rule lets nothing pass at present; "" where it does."""
         return SAFE_MODE[self.rule.safe_mode()]
@@ -222,24 +241,6 @@ class ModelPrediction(EngineModel):
             action, reason, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x), hash_)
         embedding = tuple(tuple(row) for row in z.tolist())
         return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
-
-    def predict_many(self, X: ArrayLike) -> list[Prediction]:
-        """The prediction on each trace of (n, T) or (n, C, T)."""
-        return [self.predict_one(x) for x in as_traces(X)]
-
-    def count(self, X: ArrayLike) -> Counts:
-        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
-        found = self.predict_many(X)
-        return np.array([p.n_success for p in found], dtype=np.int64), np.array([p.n_failure for p in found], np.int64)
-
-    def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(lower, upper), each (n,): the bound on each trace's success probability."""
-        found = self.predict_many(X)
-        return np.array([p.lower for p in found]), np.array([p.upper for p in found])
-
-    def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """(n,) array of `Action`."""
-        return np.array([p.action for p in self.predict_many(X)], dtype=object)
 
     def successor(self) -> ModelPrediction:
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
@@ -288,8 +289,7 @@ class ModelPrediction(EngineModel):
         """The model as an exporter takes it; without a contract, one of its traces' shape."""
         if "trace_shape" not in vars(self):
             raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")
-        channels, samples = self.trace_shape
-        return Exportable(self, trace or TraceSpec(samples=samples, channels=channels))
+        return Exportable(self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1]))
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.

@@ -9,7 +9,18 @@ from .._lazy import lazy_names
 if TYPE_CHECKING:
     from .base import Store, open_store
     from .memory import MemoryStore
-    from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
+    from .records import (
+        AddedPoints,
+        Change,
+        Correction,
+        Event,
+        Evidence,
+        Labelled,
+        ModelVersion,
+        NewLabel,
+        Outcomes,
+        StoredDecision,
+    )
     from .sql import SqlStore
 
 _WHERE = {
@@ -20,6 +31,8 @@ _WHERE = {
     "memory": ("MemoryStore",),
     "records": (
         "AddedPoints",
+        "Change",
+        "Correction",
         "Event",
         "Evidence",
         "Labelled",
@@ -33,6 +46,8 @@ _WHERE = {
 
 __all__ = [
     "AddedPoints",
+    "Change",
+    "Correction",
     "Event",
     "Evidence",
     "Labelled",

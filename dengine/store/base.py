@@ -19,11 +19,24 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from .memory import MemoryStore
-from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
+from .records import (
+    AddedPoints,
+    Change,
+    Correction,
+    Event,
+    Evidence,
+    Labelled,
+    ModelVersion,
+    NewLabel,
+    Outcomes,
+    StoredDecision,
+)
 from .views import StoreViews
 
 __all__ = [
     "AddedPoints",
+    "Change",
+    "Correction",
     "Event",
     "Evidence",
     "Labelled",
@@ -107,29 +120,53 @@ class Store(StoreViews, Protocol):
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version."""
 
+    def load_version(self, number: int) -> ModelVersion:
+        """Return the accepted version of this number; StoreError, which names those that are kept, where it is not."""
+
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""
 
-    def labelled(self, limit: int | None = None) -> Labelled:
-        """Return the newest `limit` labelled traces, all where it is None."""
+    def labelled(
+        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+    ) -> Labelled:
+        """Return the newest `limit` labelled traces, all where it is None, with their labels as they count.
+
+        first, last : sequence numbers between which they lie.
+        corrected_to : number of the last correction that counts, for labels as they stood then; None: all do.
+        """
 
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
 
-    def evidence_since(self, seq: int) -> Evidence:
-        """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
+    def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
+        """Return what became of the decisions whose labels came after `seq`, without the quarantined and the forgotten.
 
-    def unreported_accepts(self) -> list[str]:
+        since_version : leave out, here and below, what an earlier model version decided.
+        """
+
+    def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
 
-    def silent_total(self) -> int:
+    def silent_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
 
-    def outcomes(self) -> Outcomes:
+    def outcomes(self, since_version: int = 0) -> Outcomes:
         """Count what became of what the model was certain of."""
 
-    def put_event(self, kind: str, text: str) -> None:
-        """Commit what happened, in a word and for people to read, to the cell's log."""
+    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
+        """Commit what happened, in a word and for people to read, to the cell's log.
+
+        data : the same for machines, as JSON has it.  author : who did it; "" for the engine itself.
+        """
+
+    def record(self, change: Change) -> int:
+        """Commit what a person changed, all or none, together with its event; returns the event's number.
+
+        Raises ReportError for a decision that is unknown or has no label.
+        """
+
+    def corrections(self, after: int = 0) -> list[Correction]:
+        """Return the corrections after number `after`, oldest first."""
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest `limit` events, all where it is None; oldest first."""

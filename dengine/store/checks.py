@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,6 +33,34 @@ def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple
         f"Expected one report a decision, got a second on {decision_id!r}: {said} was reported first and stands, "
         f"now came {says}; {advice}."
     )
+
+
+def nothing_to_correct(decision_id: str) -> ReportError:
+    """Return the error for a correction of a decision that was never reported."""
+    return ReportError(
+        f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported yet; "
+        "there is nothing to correct: report its label."
+    )
+
+
+def no_such_version(number: int, kept: Sequence[int]) -> StoreError:
+    """Return the error for a version that is not kept; it names those that are."""
+    there = ", ".join(map(str, kept)) or "none: nothing was trained yet"
+    return StoreError(f"Expected a version that this cell's store keeps, got {number!r}; it keeps {there}.")
+
+
+def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
+    if data is None:
+        return None
+    try:
+        text = json.dumps(dict(data), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise StoreError(
+            f"Expected an event's data as JSON has it, got {data!r}: {error}; give numbers and text."
+        ) from error
+    plain: dict[str, Any] = json.loads(as_text(text))
+    return plain
 
 
 def as_channels(trace: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -5,47 +5,38 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from itertools import islice
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..records import Action, Decision, Reason, RetrainReport, Source
-from .checks import as_text, check_import, check_parts, check_state, duplicate_id
+from ..records import Action, Decision, Reason, Source
+from .checks import check_import, check_parts, duplicate_id
+from .counting import count_outcomes, summary
 from .intake import check_decision, decided_trace
+from .memory_history import MemoryHistory, StoredLabel
 from .memory_views import MemoryViews
 from .records import (
+    FORGOTTEN,
     STATUS_EVENTS,
     AddedPoints,
     DecidedTrace,
-    Event,
     Evidence,
     Labelled,
-    ModelVersion,
     NewLabel,
     Outcomes,
     StoredDecision,
     checked_label,
-    count_outcomes,
     imported_labels,
     refuse_repeats,
     stack,
     stored_decision,
-    summary,
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Label:
-    seq: int
-    time: float
-    item: DecidedTrace
-    given: NewLabel
-
-
-class MemoryStore(MemoryViews):
+class MemoryStore(MemoryHistory, MemoryViews):
     """The contract of `Store` in plain dicts, for replays and trials: nothing outlives the process.
 
     Of decisions that were never reported only the newest 10,000 are kept, trace and all; an older one is counted
@@ -56,21 +47,17 @@ class MemoryStore(MemoryViews):
 
     def __init__(self, cell_id: str = "cell", clock: Callable[[], float] = time.time) -> None:
         """Open an empty store; `clock` gives the time of a decision in seconds."""
+        super().__init__()
         self.cell_id = cell_id
         self._clock = clock
         self._settings: dict[str, str] = {}
         self._open: dict[str, DecidedTrace] = {}  # decisions without a label
         self._done: dict[str, DecidedTrace] = {}  # and with one
-        self._labels: list[_Label] = []  # label seq stands at index seq - 1
-        self._label_of: dict[str, _Label] = {}
-        self._train: list[_Label] = []  # not quarantined
-        self._retrains: list[RetrainReport] = []
-        self._retrained: list[tuple[float, int]] = []
-        self._version: ModelVersion | None = None
-        self._events: list[Event] = []
-        self._silent = 0
+        self._labels: list[StoredLabel] = []  # label seq stands at index seq - 1
+        self._label_of: dict[str, StoredLabel] = {}
+        self._train: list[StoredLabel] = []  # not quarantined
+        self._silent: Counter[int] = Counter()  # by the version that answered when the label came
         self._kinds: Counter[tuple[Action, Reason, bool]] = Counter()
-        self._became: Counter[tuple[Action, Action, bool, bool | None]] = Counter()  # action, predicted, audit, label
         self._times: tuple[float | None, float | None] = (None, None)
 
     def settings(self) -> dict[str, str]:
@@ -93,7 +80,7 @@ class MemoryStore(MemoryViews):
             raise duplicate_id(decision.id)
         self._open[decision.id] = item
         self._kinds[decision.action, decision.reason, item.quarantined] += 1
-        self._became[decision.action, decision.predicted, decision.audit, None] += 1
+        self.count(item, None, 1)
         self._times = (item.time if self._times[0] is None else self._times[0], item.time)
         if len(self._open) > self.KEEP_UNLABELLED:
             del self._open[next(iter(self._open))]
@@ -110,7 +97,9 @@ class MemoryStore(MemoryViews):
         if kept is None:
             return None
         label = self._label_of.get(decision_id)
-        return stored_decision(kept) if label is None else stored_decision(kept, label.given.success, label.given.source)
+        if label is None:
+            return stored_decision(kept)
+        return stored_decision(kept, self._said.get(decision_id, label.given.success), label.given.source)
 
     def put_label(
         self,
@@ -137,15 +126,14 @@ class MemoryStore(MemoryViews):
 
     def _take(self, given: NewLabel) -> None:
         item = self._done[given.decision_id] = self._open.pop(given.decision_id)
-        label = _Label(len(self._labels) + 1, self._clock(), item, given)
+        label = StoredLabel(len(self._labels) + 1, self._clock(), item, given)
         self._labels.append(label)
         self._label_of[given.decision_id] = label
-        kind = (item.decision.action, item.decision.predicted, item.decision.audit)
-        self._became[*kind, None] -= 1
-        self._became[*kind, given.success] += 1
+        self.count(item, None, -1)
+        self.count(item, int(given.success), 1)
         if not item.quarantined:
             self._train.append(label)
-            self._silent += given.silent
+            self._silent[given.model_version] += given.silent
 
     def put_labelled(
         self,
@@ -167,30 +155,16 @@ class MemoryStore(MemoryViews):
             self._take(label)  # at once, or the import would be forgotten
         return np.arange(first, first + len(given), dtype=np.int64)
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Record a retrain; only the newest accepted state is kept."""
-        copies = check_state(report, state)
-        self._retrains.append(report)
-        self._retrained.append((self._clock(), int(last_seq)))
-        if report.accepted and copies is not None:
-            self._version = ModelVersion(report.version, int(last_seq), copies)
-
-    def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version, with arrays of its own."""
-        last = self._version
-        if last is None:
-            return None
-        return ModelVersion(last.version, last.last_seq, {name: values.copy() for name, values in last.state.items()})
-
-    def retrains(self) -> list[RetrainReport]:
-        return list(self._retrains)
-
-    def labelled(self, limit: int | None = None) -> Labelled:
-        rows = self._train if limit is None else self._train[max(0, len(self._train) - limit) :]
+    def labelled(
+        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+    ) -> Labelled:
+        said, most = self.said_to(corrected_to), len(self._labels) if last is None else last
+        newest = (row for row in reversed(self._train) if first <= row.seq <= most and self.counted(row, said) != FORGOTTEN)
+        rows = list(islice(newest, limit))[::-1]
         return Labelled(
             seq=np.array([row.seq for row in rows], dtype=np.int64),
             traces=stack([row.item.trace for row in rows], (0, 0, 0)),
-            labels=np.array([row.given.success for row in rows], dtype=np.int8),
+            labels=np.array([self.counted(row, said) for row in rows], dtype=np.int8),
             hashes=np.array([row.item.content_hash for row in rows], dtype=np.int64),
         )
 
@@ -202,45 +176,44 @@ class MemoryStore(MemoryViews):
             points=stack([point for _, point in rows], (0, 0)),
         )
 
-    def evidence_since(self, seq: int) -> Evidence:
+    def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
         after = [row for row in self._labels[max(0, seq) :] if not row.item.quarantined]
+        after = [
+            row for row in after if row.item.decision.model_version >= since_version and self.counted(row) != FORGOTTEN
+        ]
         return Evidence(
             seq=np.array([row.seq for row in after], dtype=np.int64),
             lower=np.array([row.item.decision.lower for row in after], dtype=np.float64),
             upper=np.array([row.item.decision.upper for row in after], dtype=np.float64),
-            success=np.array([row.given.success for row in after], dtype=bool),
+            success=np.array([self.counted(row) for row in after], dtype=bool),
             novel=np.array([row.item.decision.reason is Reason.NOVEL for row in after], dtype=bool),
             silent=np.array([row.given.silent for row in after], dtype=np.int64),
         )
 
-    def unreported_accepts(self) -> list[str]:
+    def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first; forgotten ones are not among them."""
         waiting = [item for item in self._open.values() if item.decision.action is Action.ACCEPT and not item.quarantined]
+        waiting = [item for item in waiting if item.decision.model_version >= since_version]
         return [item.decision.id for item in sorted(waiting, key=lambda item: item.time)]  # a stable sort
 
-    def silent_total(self) -> int:
-        return self._silent
+    def silent_total(self, since_version: int = 0) -> int:
+        return sum(n for version, n in self._silent.items() if version >= since_version)
 
-    def outcomes(self) -> Outcomes:
+    def outcomes(self, since_version: int = 0) -> Outcomes:
         """Count what became of what the model was certain of; forgotten decisions are counted too."""
-        return count_outcomes((*kind, n) for kind, n in self._became.items())
-
-    def put_event(self, kind: str, text: str) -> None:
-        self._events.append(Event(len(self._events) + 1, self._clock(), as_text(kind), as_text(text)))
-
-    def events(self, limit: int | None = None) -> list[Event]:
-        return self._events[0 if limit is None else max(0, len(self._events) - limit) :]
+        return count_outcomes((*kind[:4], n) for kind, n in self._became.items() if kind[4] >= since_version)
 
     def status(self) -> dict[str, Any]:
         """Count decisions, labels and versions; forgotten decisions are counted too."""
         return summary(
             self.cell_id,
             [(action.value, reason.value, quarantined, n) for (action, reason, quarantined), n in self._kinds.items()],
-            Counter(label.given.source.value for label in self._labels),
+            Counter(label.given.source.value for label in self._labels if self.counted(label) != FORGOTTEN),
             self._retrains,
             self._times,
             max((label.time for label in self._labels), default=None),
             self.events(STATUS_EVENTS),
+            corrected=self._corrected(),
         )
 
     def close(self) -> None:

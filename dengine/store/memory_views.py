@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..records import RetrainReport
-from .records import DecidedTrace, Labelled, ModelVersion
+from .records import DecidedTrace, Labelled, ModelVersion, as_label
 from .views import (
     HistoryFilter,
     Key,
@@ -34,6 +34,7 @@ class MemoryViews:
 
     if TYPE_CHECKING:  # the store's own
 
+        def counted(self, label: Any) -> int: ...
         def last_version(self) -> ModelVersion | None: ...
         def labelled(self, limit: int | None = None) -> Labelled: ...
 
@@ -59,7 +60,7 @@ class MemoryViews:
             model_version=decision.model_version,
             content_hash=item.content_hash,
             quarantined=item.quarantined,
-            success=None if label is None else label.given.success,
+            success=None if label is None else as_label(self.counted(label)),
             source=None if label is None else label.given.source,
             label_seq=None if label is None else label.seq,
             label_time=None if label is None else label.time,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ from ..records import Action, Decision, Reason, RetrainReport, Source
 from .checks import already_reported, as_point, as_silent, mixed_shapes, unknown_decision
 
 STATUS_EVENTS = 5  # newest ones that a status shows
+FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,8 @@ class StoredDecision:
     content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given. It deals the
         permanent fold, and says who may vote once: equal traces share it, or the traces of one part.
     quarantined : kept, but never given to training.
-    success, source : the label, if one was reported.
+    success, source : the label as it counts, if one was reported: of a corrected one the newest correction's, of a
+        forgotten one None, beside the source that it had.
     part : serial number of the part that the trace was recorded on, where one was given.
     """
 
@@ -130,6 +131,8 @@ class Outcomes:
     audited_accepts, audited_rejects : labelled audits of what the model would have accepted, and rejected.
     audited_accepts_bad : of these, label False.
     audited_rejects_good : of these, label True.
+    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
+        none of the counts of labels above.
     """
 
     accepted: int
@@ -140,16 +143,66 @@ class Outcomes:
     rejected: int
     audited_rejects: int
     audited_rejects_good: int
+    forgotten_accepts: int = 0
+    forgotten_audited_accepts: int = 0
+    forgotten_audited_rejects: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happened to an engine, for people; number : 1, 2, ... in each cell.  time : in seconds."""
+    """What happened to an engine, for people; number : 1, 2, ... in each cell.  time : in seconds.
+
+    data : the same for machines, as JSON has it; None where there is none.  author : who did it; "" for the engine itself.
+    """
 
     number: int
     time: float
     kind: str
     text: str
+    data: dict[str, Any] | None = None
+    author: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a person changed, on its way into a store: one event, and what it changes, all or none.
+
+    kind, text, data, author : of the event.
+    decisions : whose labels are corrected to `success`, None for a forgotten one.
+    version : the retrain's report, its newest label, its state, of a version that takes the present one's place.
+    settings : in the place of the present ones; None leaves these.
+    """
+
+    kind: str
+    text: str
+    data: Mapping[str, Any] | None = None
+    author: str = ""
+    decisions: Sequence[str] = ()
+    success: bool | None = None
+    version: tuple[RetrainReport, int, Mapping[str, NDArray[Any]]] | None = None
+    settings: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A later word on a label. Nothing is overwritten: the newest one of a decision counts.
+
+    number : 1, 2, ... in each cell.  time : in seconds.
+    success : the label from now on; None: it is forgotten, and takes no part in anything that is learned or counted.
+    was : the label until then, None likewise.
+    author : who said so.  event : number of its event.  newest_seq : number of the cell's newest label at that moment.
+    seq : number of the label that it corrects.
+    """
+
+    number: int
+    time: float
+    decision_id: str
+    success: bool | None
+    was: bool | None
+    author: str
+    event: int
+    newest_seq: int
+    seq: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,26 +272,6 @@ def refuse_repeats(
         reported[label.decision_id] = now
 
 
-def count_outcomes(kinds: Iterable[tuple[str, str, bool, bool | None, int]]) -> Outcomes:
-    """Count outcomes; kinds : (action, predicted, audit, label or None, how many)."""
-    done: Counter[tuple[str, bool | None]] = Counter()  # by action and label
-    audited: Counter[tuple[str, bool | None]] = Counter()  # audits, by prediction and label
-    for action, predicted, audit, success, n in kinds:
-        done[action, success] += n
-        audited[predicted, success] += n if audit else 0
-    accept, reject = Action.ACCEPT.value, Action.REJECT.value
-    return Outcomes(
-        accepted=sum(done[accept, label] for label in (None, False, True)),
-        stops=done[accept, False],
-        confirmed=done[accept, True],
-        audited_accepts=audited[accept, False] + audited[accept, True],
-        audited_accepts_bad=audited[accept, False],
-        rejected=sum(done[reject, label] for label in (None, False, True)),
-        audited_rejects=audited[reject, False] + audited[reject, True],
-        audited_rejects_good=audited[reject, True],
-    )
-
-
 def stack(rows: Sequence[NDArray[np.float32]], empty: tuple[int, ...]) -> NDArray[np.float32]:
     """Return rows of one shape as one array; none of them as `empty`."""
     if not rows:
@@ -249,40 +282,6 @@ def stack(rows: Sequence[NDArray[np.float32]], empty: tuple[int, ...]) -> NDArra
     return np.stack(rows)
 
 
-def summary(
-    cell_id: str,
-    kinds: Sequence[tuple[str, str, bool, int]],
-    sources: Mapping[str, int],
-    retrains: Sequence[RetrainReport],
-    times: tuple[float | None, float | None],
-    last_label_time: float | None,
-    events: Sequence[Event],
-    write_failures: int = 0,
-) -> dict[str, Any]:
-    """Return the status of a store from its counts; kinds : (action, reason, quarantined, how many).
-
-    events : the newest STATUS_EVENTS.
-    """
-    actions: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
-    for action, reason, _, n in kinds:
-        actions[action] += n
-        reasons[reason] += n
-    versions = [report.version for report in retrains if report.accepted]
-    return {
-        "cell_id": cell_id,
-        "decisions": sum(actions.values()),
-        "actions": {action.value: actions[action.value] for action in Action},
-        "reasons": {reason.value: reasons[reason.value] for reason in Reason},
-        "quarantined": sum(n for _, _, quarantined, n in kinds if quarantined),
-        "labels": sum(sources.values()),
-        "sources": {source.value: sources.get(source.value, 0) for source in Source},
-        "retrains": len(retrains),
-        "versions": len(versions),
-        "last_version": versions[-1] if versions else None,
-        "first_time": times[0],
-        "last_time": times[1],
-        "last_label_time": last_label_time,
-        "events": [{"kind": event.kind, "text": event.text, "time": event.time} for event in events],
-        "write_failures": write_failures,
-    }
+def as_label(counted: int | None) -> bool | None:
+    """Return a label as it counts; None where there is none, or where it is forgotten."""
+    return None if counted in (None, FORGOTTEN) else bool(counted)

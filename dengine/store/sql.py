@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -19,37 +20,35 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from ..errors import StoreError
-from ..records import Decision, RetrainReport, Source
+from ..records import Decision, Source
 from . import sql_queries as ask
-from .checks import as_hash, as_text, check_import, check_parts, check_state, duplicate_id
+from .checks import as_hash, check_import, check_parts, duplicate_id
+from .counting import count_outcomes, summary
 from .intake import check_decision, decided_trace
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
     DecidedTrace,
-    Event,
     Evidence,
     Labelled,
-    ModelVersion,
     NewLabel,
     Outcomes,
     StoredDecision,
     checked_label,
-    count_outcomes,
     imported_labels,
     refuse_repeats,
     stack,
     stored_decision,
-    summary,
 )
+from .sql_history import SqlHistory, replacing
 from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
-from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_rows import CHUNK, chunks, label_row, read_decision, read_evidence, read_traces, unpack
+from .sql_tables import LABEL, SCHEMA_KEY, SETTING
 from .sql_views import SqlViews
 
 
-class SqlStore(SqlOwning, SqlViews):
+class SqlStore(SqlOwning, SqlHistory, SqlViews):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
@@ -84,17 +83,7 @@ class SqlStore(SqlOwning, SqlViews):
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
         """Replace the settings by these."""
-        if SCHEMA_KEY in settings:
-            raise StoreError(f"Expected settings of the engine, got {SCHEMA_KEY!r}, which is the store's; rename it.")
-        rows = [{"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()]
-        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key != SCHEMA_KEY)
-
-        def replace(connection: sa.Connection) -> None:
-            connection.execute(sa.delete(SETTING).where(mine))
-            if rows:
-                connection.execute(sa.insert(SETTING), rows)
-
-        self._database.write(replace)
+        self._database.write(replacing(self.cell_id, settings))
 
     # Decisions
 
@@ -193,13 +182,17 @@ class SqlStore(SqlOwning, SqlViews):
             if known is not None:
                 raise duplicate_id(known.id)
 
-    def labelled(self, limit: int | None = None) -> Labelled:
+    def labelled(
+        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+    ) -> Labelled:
         """Return the newest `limit` labelled traces, oldest first; read along the index `label_training`."""
+        query = ask.newest_query(self.cell_id, limit, int(first), last, corrected_to)
         with self._database.transaction(write=False) as connection:
-            newest = connection.execute(ask.newest_query(self.cell_id, limit)).all()[::-1]
-            first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
-            traces = read_traces(rows, len(newest))
+            newest = connection.execute(query).all()[::-1]
+            begin, end = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
+            rows = connection.execute(ask.trace_query(self.cell_id, begin, end).execution_options(yield_per=CHUNK))
+            known = {row.seq for row in newest}  # the forgotten are not among them
+            traces = read_traces((row for row in rows if row.seq in known), len(newest))
         return Labelled(
             seq=np.array([row.seq for row in newest], dtype=np.int64),
             traces=traces,
@@ -213,67 +206,25 @@ class SqlStore(SqlOwning, SqlViews):
         seqs = np.array([row.seq for row in rows], dtype=np.int64)
         return AddedPoints(seqs, stack([unpack(row.point) for row in rows], (0, 0)))
 
-    def evidence_since(self, seq: int) -> Evidence:
-        """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
-        return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq))))
+    def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
+        """Return what became of the decisions whose labels came after `seq`, without the quarantined and the forgotten."""
+        return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq), int(since_version))))
 
-    def unreported_accepts(self) -> list[str]:
+    def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first; what is queued is written first."""
         self.flush()
+        query = partial(ask.unreported_query, self.cell_id, since=int(since_version))
         with self._database.transaction(write=False) as connection:
-            return list(connection.execute(ask.unreported_query(self.cell_id, connection.dialect.name)).scalars())
+            return list(connection.execute(query(connection.dialect.name)).scalars())
 
-    def silent_total(self) -> int:
+    def silent_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on unheard of, over all labels but the quarantined ones."""
-        return int(self._read(ask.silent_query(self.cell_id))[0][0])
+        return int(self._read(ask.silent_query(self.cell_id, int(since_version)))[0][0])
 
-    def outcomes(self) -> Outcomes:
+    def outcomes(self, since_version: int = 0) -> Outcomes:
         """Count what became of what the model was certain of; what is queued is written first."""
         self.flush()
-        return count_outcomes(tuple(row) for row in self._read(ask.outcome_query(self.cell_id)))
-
-    def _read(self, query: sa.Select[Any]) -> Sequence[Any]:
-        with self._database.transaction(write=False) as connection:
-            return connection.execute(query).all()
-
-    # Model versions
-
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Commit a retrain; a dropped candidate has no state."""
-        row = version_row(self.cell_id, report, int(last_seq), self._clock(), check_state(report, state))
-
-        def record(connection: sa.Connection) -> None:
-            retrain = self._database.next_number(connection, VERSION.c.retrain)
-            connection.execute(sa.insert(VERSION), row | {"retrain": retrain})
-
-        self._database.write(record)
-
-    def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version."""
-        rows = self._read(ask.version_query(self.cell_id))
-        if not rows:
-            return None
-        return ModelVersion(rows[0].version, rows[0].last_seq, from_npz(rows[0].state, self._database.name))
-
-    def retrains(self) -> list[RetrainReport]:
-        """Return every retrain, oldest first."""
-        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self.cell_id))]
-
-    # Events
-
-    def put_event(self, kind: str, text: str) -> None:
-        """Commit what happened to the cell's log."""
-        row = {"cell_id": self.cell_id, "time": self._clock(), "kind": as_text(kind), "text": as_text(text)}
-
-        def log(connection: sa.Connection) -> None:
-            number = self._database.next_number(connection, EVENT.c.number)
-            connection.execute(sa.insert(EVENT), row | {"number": number})
-
-        self._database.write(log)
-
-    def events(self, limit: int | None = None) -> list[Event]:
-        """Return the newest `limit` events, oldest first."""
-        return [Event(*row) for row in self._read(ask.event_query(self.cell_id, limit))[::-1]]
+        return count_outcomes(tuple(row) for row in self._read(ask.outcome_query(self.cell_id, int(since_version))))
 
     # Overview
 
@@ -290,6 +241,7 @@ class SqlStore(SqlOwning, SqlViews):
             max((row.last for row in sources), default=None),
             self.events(STATUS_EVENTS),
             self._database.failures,
+            self._corrected(),
         )
 
     def __enter__(self) -> Self:

@@ -8,7 +8,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..records import Action
-from .sql_tables import DECISION, EVENT, LABEL, TRACE, VERSION
+from .records import FORGOTTEN
+from .sql_tables import CORRECTION, DECISION, EVENT, LABEL, TRACE, VERSION
 
 Query = sa.Select[Any]
 
@@ -17,31 +18,64 @@ LABEL_OF_DECISION = (LABEL.c.cell_id == DECISION.c.cell_id) & (LABEL.c.decision_
 WITH_LABELS = DECISION.outerjoin(LABEL, LABEL_OF_DECISION)
 
 
+def corrected(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
+    """What the newest correction of a label says: 0, 1 or FORGOTTEN, NULL where there is none; along `correction_of`.
+
+    corrected_to : number of the last correction that counts; None: all do.
+    """
+    says = sa.func.coalesce(sa.cast(CORRECTION.c.success, sa.Integer), sa.literal_column(str(FORGOTTEN)))
+    query = sa.select(says).where(CORRECTION.c.cell_id == LABEL.c.cell_id, CORRECTION.c.decision_id == LABEL.c.decision_id)
+    query = query if corrected_to is None else query.where(CORRECTION.c.number <= corrected_to)
+    return query.order_by(CORRECTION.c.number.desc()).limit(1).correlate(LABEL).scalar_subquery()
+
+
+def counted(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
+    """A label as it counts: 0, 1 or FORGOTTEN, NULL where a decision has none."""
+    return sa.func.coalesce(corrected(corrected_to), sa.cast(LABEL.c.success, sa.Integer))
+
+
+def remembered(corrected_to: int | None = None) -> sa.ColumnElement[bool]:
+    """Whether a label was not forgotten."""
+    return sa.func.coalesce(corrected(corrected_to), 0) != FORGOTTEN
+
+
 def decision_query(cell_id: str, decision_id: str) -> Query:
     """A decision with its trace, and with its label where it has one."""
     mine = (DECISION.c.cell_id == cell_id) & (DECISION.c.id == decision_id)
     traces = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
-    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], LABEL.c.success, LABEL.c.source)
+    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], counted().label("success"), LABEL.c.source)
     return sa.select(*columns).select_from(DECISION.join(TRACE, traces).outerjoin(LABEL, LABEL_OF_DECISION)).where(mine)
 
 
 def held_query(cell_id: str, ids: Sequence[str]) -> Query:
     """What labels repeat of these decisions, and the labels that they have already."""
-    columns = (*DECISION.c["id", "content_hash", "quarantined"], LABEL.c.success, LABEL.c.source)
+    columns = (
+        *DECISION.c["id", "content_hash", "quarantined"],
+        LABEL.c.success,
+        LABEL.c.source,
+        counted().label("counted"),
+    )
     return sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id, DECISION.c.id.in_(ids))
 
 
-def newest_query(cell_id: str, limit: int | None) -> Query:
-    """The newest labels that train, newest first, without their traces; along the index `label_training`."""
-    query = sa.select(*LABEL.c["seq", "success", "content_hash"])
-    query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false())
+def newest_query(
+    cell_id: str, limit: int | None, first: int = 1, last: int | None = None, corrected_to: int | None = None
+) -> Query:
+    """The newest labels that train, newest first, without their traces; along the index `label_training`.
+
+    first, last : sequence numbers between which they lie.  corrected_to : as in `corrected`.
+    """
+    query = sa.select(LABEL.c.seq, counted(corrected_to).label("success"), LABEL.c.content_hash)
+    query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false(), remembered(corrected_to))
+    query = query if first <= 1 else query.where(LABEL.c.seq >= first)
+    query = query if last is None else query.where(LABEL.c.seq <= last)
     return query.order_by(LABEL.c.seq.desc()).limit(limit)
 
 
 def trace_query(cell_id: str, first: int, last: int) -> Query:
-    """The traces of the labels `first` to `last` that train, oldest first."""
+    """The traces of the labels `first` to `last`, the forgotten too, oldest first."""
     same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
-    query = sa.select(*TRACE.c["channels", "samples", "data"]).select_from(LABEL.join(TRACE, same))
+    query = sa.select(LABEL.c.seq, *TRACE.c["channels", "samples", "data"]).select_from(LABEL.join(TRACE, same))
     mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
     return query.where(mine, LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
 
@@ -53,32 +87,40 @@ def points_query(cell_id: str, seq: int, model_version: int) -> Query:
     return query.order_by(LABEL.c.seq)
 
 
-def evidence_query(cell_id: str, seq: int) -> Query:
-    """The bounds of decisions whose labels came after `seq`, with those labels, oldest first."""
-    query = sa.select(*LABEL.c["seq", "success", "silent"], *DECISION.c["lower", "upper", "reason"])
+def evidence_query(cell_id: str, seq: int, since: int = 0) -> Query:
+    """The bounds of decisions, by versions from `since` on, whose labels came after `seq`, oldest first."""
+    label = (LABEL.c.seq, counted().label("success"), LABEL.c.silent)
+    query = sa.select(*label, *DECISION.c["lower", "upper", "reason"])
     mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > seq)
+    mine = mine & remembered() & _by_versions_from(since, DECISION)
     return query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine).order_by(LABEL.c.seq)
 
 
-def unreported_query(cell_id: str, dialect: str) -> Query:
+def _by_versions_from(since: int, table: sa.Table) -> sa.ColumnElement[bool]:
+    return sa.true() if since <= 0 else table.c.model_version >= since
+
+
+def unreported_query(cell_id: str, dialect: str, since: int = 0) -> Query:
     """The ids of accepted decisions without a label, oldest first; among those of one time in the order of insertion."""
     mine = (DECISION.c.cell_id == cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
+    mine = mine & _by_versions_from(since, DECISION)
     query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
     return query.order_by(DECISION.c.time, sa.literal_column(INSERTED[dialect]))
 
 
-def silent_query(cell_id: str) -> Query:
+def silent_query(cell_id: str, since: int = 0) -> Query:
     """How many accepted parts went on unheard of, by all labels that train."""
     query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-    return query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false())
+    mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
+    return query.where(mine, _by_versions_from(since, LABEL))
 
 
-def outcome_query(cell_id: str) -> Query:
+def outcome_query(cell_id: str, since: int = 0) -> Query:
     """How many decisions that the model was certain of, by action, prediction, audit and label."""
-    kind = (*DECISION.c["action", "predicted", "audit"], LABEL.c.success)
-    certain = (DECISION.c.action != Action.VERIFY.value) | DECISION.c.audit
-    query = sa.select(*kind, sa.func.count()).select_from(WITH_LABELS)
-    return query.where(DECISION.c.cell_id == cell_id, certain).group_by(*kind)
+    kind = (*DECISION.c["action", "predicted", "audit"], counted().label("success"))
+    certain = ((DECISION.c.action != Action.VERIFY.value) | DECISION.c.audit) & _by_versions_from(since, DECISION)
+    each = sa.select(*kind).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id, certain).subquery()
+    return sa.select(*each.c, sa.func.count()).group_by(*each.c)
 
 
 def kind_query(cell_id: str) -> Query:
@@ -89,15 +131,16 @@ def kind_query(cell_id: str) -> Query:
 
 
 def source_query(cell_id: str) -> Query:
-    """How many labels, by source; and the time of the last."""
+    """How many labels that were not forgotten, by source; and the time of the last."""
     query = sa.select(LABEL.c.source, sa.func.count().label("n"), sa.func.max(LABEL.c.time).label("last"))
-    return query.where(LABEL.c.cell_id == cell_id).group_by(LABEL.c.source)
+    return query.where(LABEL.c.cell_id == cell_id, remembered()).group_by(LABEL.c.source)
 
 
-def version_query(cell_id: str) -> Query:
-    """The newest accepted version."""
+def version_query(cell_id: str, number: int | None = None) -> Query:
+    """The newest accepted version, or the one of this number."""
     query = sa.select(*VERSION.c["version", "last_seq", "state"])
     query = query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true())
+    query = query if number is None else query.where(VERSION.c.version == number)
     return query.order_by(VERSION.c.retrain.desc()).limit(1)
 
 
@@ -109,5 +152,22 @@ def retrain_query(cell_id: str) -> Query:
 
 def event_query(cell_id: str, limit: int | None) -> Query:
     """The newest events, newest first, with the fields of `Event`."""
-    query = sa.select(*EVENT.c["number", "time", "kind", "text"]).where(EVENT.c.cell_id == cell_id)
-    return query.order_by(EVENT.c.number.desc()).limit(limit)
+    columns = EVENT.c["number", "time", "kind", "text", "data", "author"]
+    return sa.select(*columns).where(EVENT.c.cell_id == cell_id).order_by(EVENT.c.number.desc()).limit(limit)
+
+
+def correction_query(cell_id: str, after: int) -> Query:
+    """The corrections after number `after`, oldest first, with the fields of `Correction`."""
+    own = ("number", "time", "decision_id", "success", "was", "author", "event", "newest_seq")
+    same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
+    query = sa.select(*CORRECTION.c[own], LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
+    return query.where(CORRECTION.c.cell_id == cell_id, CORRECTION.c.number > after).order_by(CORRECTION.c.number)
+
+
+def corrected_query(cell_id: str) -> Query:
+    """What the newest correction of each corrected decision says, NULL where it is forgotten, and how many say so."""
+    later = CORRECTION.alias("later")
+    newer = (later.c.cell_id == CORRECTION.c.cell_id) & (later.c.decision_id == CORRECTION.c.decision_id)
+    newest = ~sa.exists().where(newer, later.c.number > CORRECTION.c.number)
+    query = sa.select(CORRECTION.c.success, sa.func.count()).where(CORRECTION.c.cell_id == cell_id, newest)
+    return query.group_by(CORRECTION.c.success)

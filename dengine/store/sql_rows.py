@@ -15,7 +15,7 @@ from ..archives import read_archive
 from ..errors import DataError, StoreError
 from ..records import Action, Reason, RetrainReport, Source
 from .checks import mixed_shapes
-from .records import DecidedTrace, Evidence, NewLabel, StoredDecision
+from .records import DecidedTrace, Event, Evidence, NewLabel, StoredDecision, as_label
 
 CHUNK = 500  # rows sent or fetched at a time
 
@@ -108,10 +108,15 @@ def read_decision(row: Any) -> StoredDecision:
         trace=unpack_trace(row),
         content_hash=row.content_hash,
         quarantined=row.quarantined,
-        success=row.success,
+        success=as_label(row.success),
         source=None if row.source is None else Source(row.source),
         part=row.part,
     )
+
+
+def read_event(row: Any) -> Event:
+    """Read a row of `event`."""
+    return Event(row.number, row.time, row.kind, row.text, None if row.data is None else json.loads(row.data), row.author)
 
 
 def read_evidence(rows: Sequence[Any]) -> Evidence:

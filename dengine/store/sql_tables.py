@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import sqlalchemy as sa
 
 from ..errors import StoreError
 
-SCHEMA = "2"
+SCHEMA = "3"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
 
 METADATA = sa.MetaData()
@@ -91,7 +93,29 @@ EVENT = sa.Table(  # since schema 2
     sa.Column("time", sa.Double, nullable=False),
     sa.Column("kind", sa.String, nullable=False),
     sa.Column("text", sa.Text, nullable=False),
+    sa.Column("data", sa.Text),  # JSON; this and the next since schema 3
+    sa.Column("author", sa.String, nullable=False, server_default=sa.text("''")),
 )
+CORRECTION = sa.Table(  # later words on labels; the newest of a decision counts; since schema 3
+    "correction",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("decision_id", sa.String, nullable=False),
+    sa.Column("success", sa.Boolean),  # NULL: forgotten
+    sa.Column("was", sa.Boolean),  # until then; NULL likewise
+    sa.Column("author", sa.String, nullable=False),
+    sa.Column("event", sa.BigInteger, nullable=False),
+    sa.Column("newest_seq", sa.BigInteger, nullable=False),  # of the cell's labels at that moment
+    sa.Index("correction_of", "cell_id", "decision_id", "number"),
+)
+
+Columns = tuple[sa.Column[Any], ...]
+NEW_SINCE: dict[str, tuple[Columns, tuple[sa.Table, ...]]] = {  # what an older schema lacks
+    "schema 1": ((DECISION.c.part, LABEL.c.silent), (EVENT, CORRECTION)),
+    "schema 2": ((EVENT.c.data, EVENT.c.author), (CORRECTION,)),
+}
 
 
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
@@ -114,13 +138,15 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
 
 
 def _bring_up_to_date(connection: sa.Connection, found: set[str], name: str) -> None:
-    """Change tables of schema 1 to the present one, for all cells at once; refuse any other."""
+    """Change tables of an older schema to the present one, for all cells at once; refuse any other."""
     held = _held(connection, found)
-    if held == "schema 1":
-        for column in (DECISION.c.part, LABEL.c.silent):
+    if held in NEW_SINCE:
+        columns, tables = NEW_SINCE[held]
+        for column in columns:
             new = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
             connection.exec_driver_sql(f"ALTER TABLE {column.table.name} ADD COLUMN {new}")
-        EVENT.create(connection)
+        for table in tables:
+            table.create(connection)
         connection.execute(sa.update(SETTING).where(SETTING.c.key == SCHEMA_KEY).values(value=SCHEMA))
     elif held != f"schema {SCHEMA}":
         raise StoreError(
@@ -136,5 +162,5 @@ def _held(connection: sa.Connection, found: set[str]) -> str:
         return "tables of another program: " + ", ".join(sorted(found))
     query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
     schema = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
-    beside = schema == "schema 1" and EVENT.name in found  # schema 1 had none
-    return f"{schema} and a table {EVENT.name!r} of another program" if beside else schema
+    beside = [table.name for table in NEW_SINCE.get(schema, ((), ()))[1] if table.name in found]  # it had none such
+    return f"{schema} and a table {beside[0]!r} of another program" if beside else schema

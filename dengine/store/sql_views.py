@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from ..records import Action, Reason, RetrainReport, Source
 from . import sql_queries as ask
-from .records import Labelled, ModelVersion
+from .records import FORGOTTEN, Labelled, ModelVersion, as_label
 from .sql_queue import SqlDatabase
 from .sql_rows import CHUNK, from_npz, read_traces, unpack
 from .sql_tables import DECISION, LABEL, VERSION
@@ -36,12 +36,15 @@ OF_DECISION = (
 OF_LABEL = (
     "seq", "time", "decision_id", "success", "source", "model_version", "content_hash", "quarantined", "silent",
 )  # fmt: skip
+SAID: sa.ColumnElement[int | None] = sa.func.nullif(
+    ask.counted(), FORGOTTEN
+)  # a label as it counts now: 0, 1, NULL where there is none, or is forgotten
 IN_TIME = (DECISION.c.time, DECISION.c.id)
 
 
 def past_query(cell_id: str) -> Query:
     """Decisions with their labels, without traces and embeddings."""
-    labels = (*LABEL.c["success", "source"], LABEL.c.seq.label("label_seq"), LABEL.c.time.label("label_time"))
+    labels = (SAID.label("success"), LABEL.c.source, LABEL.c.seq.label("label_seq"), LABEL.c.time.label("label_time"))
     query = sa.select(*DECISION.c[OF_DECISION], *labels).select_from(ask.WITH_LABELS)
     return query.where(DECISION.c.cell_id == cell_id)
 
@@ -62,7 +65,8 @@ def _meant(where: HistoryFilter) -> list[sa.ColumnElement[bool]]:
     if where.reason is not None:
         found.append(DECISION.c.reason == where.reason.value)
     if where.label is not None:
-        found.append(LABEL.c.success.is_(LABELS[where.label]))
+        meant = LABELS[where.label]
+        found.append(SAID.is_(None) if meant is None else int(meant) == SAID)
     if where.since is not None:
         found.append(DECISION.c.time >= where.since)
     if where.until is not None:
@@ -87,7 +91,7 @@ def tally_query(cell_id: str, last: int | None) -> Query:
         newest = newest.order_by(*(column.desc() for column in IN_TIME)).limit(last)
     some = newest.subquery("newest")
     of = (LABEL.c.cell_id == some.c.cell_id) & (LABEL.c.decision_id == some.c.id)
-    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], LABEL.c.success)
+    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], SAID.label("success"))
     times = (sa.func.min(some.c.time).label("first"), sa.func.max(some.c.time).label("last"))
     query = sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of))
     return query.group_by(*kind)
@@ -104,7 +108,7 @@ def stretch_query(cell_id: str, length: int) -> Query:
         every.c.action == Action.VERIFY.value,
         every.c.reason == Reason.NOVEL.value,
         accepted,
-        accepted & (LABEL.c.success == sa.false()),
+        accepted & (SAID == 0),
     )
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
@@ -167,7 +171,7 @@ class SqlViews:
     def tally(self, last: int | None = None) -> Tally:
         """Count the newest `last` decisions, all where it is None."""
         rows = self._look(tally_query(self.cell_id, last))
-        kinds = tuple(Kind(Action(row[0]), Action(row[1]), Reason(row[2]), *row[3:7]) for row in rows)
+        kinds = tuple(Kind(Action(r[0]), Action(r[1]), Reason(r[2]), r[3], r[4], as_label(r[5]), r[6]) for r in rows)
         first, newest = (min((r.first for r in rows), default=None), max((r.last for r in rows), default=None))
         return Tally(kinds, first, newest)
 
@@ -201,7 +205,7 @@ def _past(row: Any) -> PastDecision:
         model_version=row.model_version,
         content_hash=row.content_hash,
         quarantined=row.quarantined,
-        success=row.success,
+        success=as_label(row.success),
         source=None if row.source is None else Source(row.source),
         label_seq=row.label_seq,
         label_time=row.label_time,

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .records import Labelled, ModelVersion, Outcomes, count_outcomes
+from .counting import count_outcomes
+from .records import Labelled, ModelVersion, Outcomes
 
 LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
 Key = tuple[float, str]  # of a decision in its history: time and id

@@ -1,0 +1,555 @@
+"""Correct, forget, roll back, another policy: what counts at once, what is kept, what opening the store again gives."""
+
+import copy
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, ReplayCell
+from dengine.errors import ReportError, SettingError, StoreError
+from dengine.folds import fold_of
+from dengine.store import MemoryStore
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
+POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", audit_rate=0.1)
+N = 200
+
+
+class Nearest:
+    """A rival: the label of the nearest trace, and how many it holds."""
+
+    def fit(self, X, y) -> "Nearest":
+        self.X, self.y = np.array(X).reshape(len(X), -1), np.array(y)
+        return self
+
+    def add(self, x, y) -> None:
+        self.X, self.y = np.vstack([self.X, np.ravel(x)]), np.append(self.y, y)
+
+    def count(self, X):
+        ones = np.ones(len(X), dtype=int)
+        return ones * int(self.y.sum()), ones * int((self.y == 0).sum())
+
+    def predict_interval(self, X):
+        nearest = ((np.reshape(X, (len(X), 1, -1)) - self.X) ** 2).sum(2).argmin(1)
+        return self.y[nearest] * 1.0, self.y[nearest] * 1.0
+
+    def decide(self, X):
+        return np.array([Action.ACCEPT if low else Action.REJECT for low in self.predict_interval(X)[0]], dtype=object)
+
+
+def make(recipe: Recipe = RECIPE, **options) -> DataEngine:
+    return DataEngine(recipe=recipe, replaying=True, **options)
+
+
+def play(engine: DataEngine, data: Dataset, part: slice = slice(None), confirm: bool = True) -> list:
+    order = np.arange(len(data))[part]
+    return list(engine.run(ReplayCell(data, order, confirm=confirm), len(order)))
+
+
+def evidence(d: Decision) -> tuple:
+    """All of a decision but its id."""
+    return (d.action, d.predicted, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version, d.reason)
+
+
+def asked(engine: DataEngine, data: Dataset) -> list:
+    """What the model says of every trace, without a trace of the asking."""
+    return [] if engine.version == 0 else engine._versions.answering.predict_many(data.X)
+
+
+def state(engine: DataEngine) -> tuple:
+    """All that decides what an engine does next."""
+    window = engine._versions.retrainer.window.snapshot()
+    rule = {name: t.tolist() for name, t in engine._versions.newest.rule.state_dict().items()}
+    return (
+        (engine.version, engine.new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
+        (window.seq.tolist(), window.labels.tolist(), engine._feedback._silent + len(engine._feedback._went_on)),
+    )
+
+
+def again(engine: DataEngine, place: Path, **options) -> DataEngine:
+    """An engine opened on a copy of the store, as the first one is now."""
+    engine.flush()
+    if isinstance(engine.store, MemoryStore):
+        return DataEngine.open(copy.deepcopy(engine.store), replaying=True, **options)
+    target = place / f"copy-{len(list(place.iterdir()))}.db"
+    with closing(sqlite3.connect(place / "engine.db")) as old, closing(sqlite3.connect(target)) as new:
+        old.backup(new)
+    return DataEngine.open(target, replaying=True, **options)
+
+
+def labelled(engine: DataEngine, seq: int) -> str:
+    """The id of the decision whose label has this number."""
+    store = engine.store
+    if isinstance(store, MemoryStore):
+        return store._labels[seq - 1].item.decision.id
+    with store._database.transaction(write=False) as connection:
+        return connection.exec_driver_sql(f"SELECT decision_id FROM label WHERE seq = {int(seq)}").scalar_one()
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., DataEngine]:
+    """Makes an engine on either store."""
+    return lambda recipe=RECIPE, **options: make(
+        recipe, store=None if request.param == "memory" else tmp_path / "engine.db", **options
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------- labels
+
+
+def test_a_corrected_label_is_counted_by_the_very_next_decision_in_its_own_space(
+    kept: Callable[..., DataEngine], data: Dataset
+) -> None:
+    engine = kept()
+    cycles = play(engine, data, slice(0, 150))
+    cycle = next(c for c in reversed(cycles) if c.success)
+    probe = data.X[cycle.index] + np.float32(1e-4)
+    before = engine.decide(probe)
+    spaces = engine.model.index.spaces.copy()
+    said = engine.correct(cycle.decision.id, False, author="kim")
+    after = engine.decide(probe)
+    assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure + 1)
+    assert (after.embedding, after.model_version) == (before.embedding, before.model_version)
+    assert engine.model.index.spaces.tolist() == spaces.tolist()
+    assert set(spaces) == set(fold_of(engine.model.index.parts, engine.model.n_spaces))
+    assert "counts as a failure, was a success" in said.text
+    event = engine.store.events(1)[0]
+    assert (event.number, event.kind, event.author) == (said.event, "correct", "kim")
+    assert event.data == {"decisions": {cycle.decision.id: {"was": True, "now": False}}}
+
+
+def test_a_forgotten_label_is_not_counted_and_comes_back_by_a_correction(
+    kept: Callable[..., DataEngine], data: Dataset
+) -> None:
+    engine = kept()
+    cycles = play(engine, data, slice(0, 150))
+    cycle = next(c for c in reversed(cycles) if c.success)
+    probe, n = data.X[cycle.index] + np.float32(1e-4), len(engine.model.index)
+    before = engine.decide(probe)
+    said = engine.forget(cycle.decision.id, author="kim", reason="another part lay in the fixture")
+    after = engine.decide(probe)
+    assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure)
+    assert len(engine.model.index) == n - 1
+    assert said.text == f"The label of {cycle.decision.id} is forgotten: another part lay in the fixture."
+    assert engine.store.get_decision(cycle.decision.id).trace.shape == (1, data.X.shape[1])
+    engine.correct(cycle.decision.id, True)
+    assert evidence(engine.decide(probe)) == evidence(before)
+
+
+def test_what_is_forgotten_trains_nothing_any_more_and_what_is_corrected_trains_as_it_is_now(data: Dataset) -> None:
+    engine = make()
+    cycles = play(engine, data, slice(0, 100))
+    engine.forget(*(c.decision.id for c in cycles[:5]))
+    engine.correct(cycles[5].decision.id, not cycles[5].success)
+    engine.retrain()
+    trained = engine.store.last_version().state
+    assert trained["trained_on"].tolist() == list(range(6, 101))
+    assert trained["labels"][0] == (not cycles[5].success)
+
+
+def test_what_was_decided_and_reported_stays_as_it_was(tmp_path: Path, data: Dataset) -> None:
+    engine = make(store=tmp_path / "engine.db")
+    cycles = play(engine, data, slice(0, 100))
+
+    def rows() -> list:
+        with engine.store._database.transaction(write=False) as connection:
+            tables = ("decision", "label", "trace", "model_version")
+            return [connection.exec_driver_sql(f"SELECT * FROM {table} ORDER BY 1, 2").all() for table in tables]
+
+    before = rows()
+    engine.correct(cycles[3].decision.id, not cycles[3].success)
+    engine.forget(cycles[4].decision.id)
+    assert rows() == before
+    assert len(engine.store.corrections()) == 2
+
+
+def test_a_correction_before_the_first_retrain_is_learned_by_it(data: Dataset) -> None:
+    engine = make()
+    first = engine.decide(data.X[0])
+    engine.report(first.id, True)
+    engine.correct(first.id, False)
+    assert (engine.version, engine.new_labels) == (0, 1)
+    play(engine, data, slice(1, 60))
+    assert engine.store.last_version().state["labels"][0] == 0
+
+
+def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now(data: Dataset) -> None:
+    engine = make(RECIPE.with_policy(stops="all"))
+    play(engine, data, slice(0, 120))
+    good = data.X[np.flatnonzero(data.y == 1)]
+    wrong = []
+    for x in good:
+        decision = engine.decide(x)
+        if decision.action is Action.ACCEPT:
+            engine.report(decision.id, False)  # a broken stop sensor
+            wrong.append(decision.id)
+        if engine.safe_mode:
+            break
+    assert engine.safe_mode
+    engine.forget(*wrong, reason="the stop sensor was broken")
+    assert engine.safe_mode == ""
+    assert [e.kind for e in engine.store.events(3)] == ["safe mode", "forget", "safe mode"]
+
+
+def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
+    engine = make(RECIPE.with_policy(stops="all"))
+    cycles = play(engine, data)
+    stopped = []
+    for x in data.X[np.flatnonzero(data.y == 1)][:3]:
+        stopped.append(engine.decide(x))
+        engine.report(stopped[-1].id, False)
+    assert {decision.action for decision in stopped} == {Action.ACCEPT}
+    before = engine.certificate().accepted
+    engine.forget(stopped[0].id)
+    assert engine.certificate().accepted == before
+    engine.forget(next(c.decision.id for c in cycles if c.decision.action is Action.ACCEPT))
+    assert engine.certificate().accepted.upper > before.upper
+    engine.correct(stopped[1].id, True)
+    assert engine.certificate().accepted.n_bad == before.n_bad
+
+
+@pytest.mark.parametrize("verb", ["correct", "forget"])
+def test_what_has_no_label_is_refused_with_advice_and_changes_nothing(verb: str, data: Dataset) -> None:
+    engine = make()
+    open_ = engine.decide(data.X[0])
+
+    def put_right(name: object) -> None:
+        engine.correct(name, True) if verb == "correct" else engine.forget(name)
+
+    with pytest.raises(ReportError, match="report its label"):
+        put_right(open_.id)
+    for unknown in ("nobody", None, float("nan"), 7):
+        with pytest.raises(ReportError, match="does not hold"):
+            put_right(unknown)
+    assert (engine.store.events(), engine.store.corrections()) == ([], [])
+
+
+@pytest.mark.parametrize("success", [100, -1, "0", "NG", float("nan"), None, 2])
+def test_a_label_that_is_none_is_refused(success: object, data: Dataset) -> None:
+    engine = make()
+    decision = engine.decide(data.X[0])
+    engine.report(decision.id, True)
+    with pytest.raises(ReportError, match="Expected a label, True"):
+        engine.correct(decision.id, success)
+    assert engine.store.labelled().labels.tolist() == [1]
+
+
+def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:
+    engine = make()
+    play(engine, data, slice(0, 60))
+    name = labelled(engine, 1)
+    engine.forget(name)
+    before = (state(engine), len(engine.store.events()))
+    held = labelled(engine, 2)
+    answers = [
+        engine.forget(name),
+        engine.correct(held, engine.store.get_decision(held).success),
+        engine.rollback(engine.version),
+        engine.set_policy(engine.policy),
+    ]
+    assert [each.event for each in answers] == [None] * 4
+    assert all("nothing changed" in each.text for each in answers)
+    assert (state(engine), len(engine.store.events())) == before
+
+
+def test_a_part_that_came_twice_is_corrected_where_it_was_meant(data: Dataset) -> None:
+    engine = make()
+    play(engine, data, slice(0, 80))
+    twice = [engine.decide(data.X[150], part="SN-1") for _ in range(2)]
+    engine.report(twice[0].id, True)
+    engine.report(twice[1].id, True)
+    engine.correct(twice[0].id, False)
+    assert engine.model.index.labels[-2:].tolist() == [0, 1]
+    engine.forget(twice[1].id)
+    assert engine.model.index.labels[-1] == 0
+    assert int(engine.model.index.ring.repeats) == 0
+
+
+def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_others(tmp_path: Path, data: Dataset) -> None:
+    engine = make(replace(RECIPE, window=60), store=tmp_path / "engine.db")
+    play(engine, data, slice(0, 130))
+    oldest = int(engine._versions.retrainer.window.snapshot().seq[0])
+    engine.forget(labelled(engine, oldest + 10), labelled(engine, oldest + 20))
+    play(engine, data, slice(130, 139))
+    with again(engine, tmp_path) as reopened:
+        assert asked(reopened, data) == asked(engine, data)
+        np.testing.assert_array_equal(reopened.model.index.points, engine.model.index.points)
+        assert state(reopened) == state(engine)
+
+
+def test_a_rival_is_trained_anew_at_once(data: Dataset) -> None:
+    engine = DataEngine(model=Nearest(), retrain_every=40, replaying=True)
+    cycles = play(engine, data, slice(0, 90))
+    version = engine.version
+    engine.correct(cycles[10].decision.id, not cycles[10].success)
+    assert engine.version == version + 1
+    known = [c.success for c in cycles if c.success is not None]
+    assert engine.model.y.tolist() != known
+    engine.forget(cycles[11].decision.id)
+    assert len(engine.model.y) == len(engine.store.labelled().seq)
+
+
+# ------------------------------------------------------------------------------------------------ reopened, bit for bit
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("play"), st.integers(5, 45)),
+        st.tuples(st.just("correct"), st.integers(0, 10_000)),
+        st.tuples(st.just("forget"), st.integers(0, 10_000)),
+        st.tuples(st.just("rollback"), st.integers(0, 10_000)),
+        st.tuples(st.just("policy"), st.sampled_from([0.85, 0.9, 0.95])),
+        st.tuples(st.just("audits"), st.sampled_from([0.0, 0.2])),
+        st.tuples(st.just("stops"), st.sampled_from(["some", "all"])),
+    ),
+    min_size=2,
+    max_size=8,
+)
+
+
+def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
+    n = engine.store.status()["labels"] + engine.store.status()["forgotten"]
+    if kind == "play":
+        start = engine.store.status()["decisions"]
+        play(engine, data, slice(start, start + value), confirm=False)
+    elif kind in ("correct", "forget") and n:
+        name = labelled(engine, 1 + value % n)
+        engine.forget(name) if kind == "forget" else engine.correct(name, value % 3 != 0)
+    elif kind == "rollback":
+        kept = sorted(r.version for r in engine.store.retrains() if r.accepted)[-5:]
+        if kept:
+            engine.rollback(kept[value % len(kept)])
+    elif kind in ("policy", "audits", "stops"):
+        name = {"policy": "lower_bound", "audits": "audit_rate", "stops": "stops"}[kind]
+        engine.set_policy(replace(engine.policy, **{name: value}))
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
+@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@given(steps=STEPS)
+def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
+    recipe: Recipe, steps: list, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    data, place = make_data(480, seed=3), tmp_path_factory.mktemp("again")
+    with make(recipe, store=place / "engine.db") as engine:
+        play(engine, data, slice(0, 90), confirm=False)
+        for each in steps:
+            step(engine, data, *each)
+        start = engine.store.status()["decisions"]
+        with again(engine, place) as reopened:
+            assert asked(reopened, data) == asked(engine, data)
+            assert state(reopened) == state(engine)
+            rest = slice(start, start + 45)
+            first, second = (play(each, data, rest, confirm=False) for each in (engine, reopened))
+            assert [evidence(c.decision) for c in first] == [evidence(c.decision) for c in second]
+            assert state(reopened) == state(engine)
+
+
+def test_a_late_stop_leaves_the_same_references_as_a_reopened_engine_has(data: Dataset) -> None:
+    engine = make(RECIPE.with_policy(stops="all"))
+    play(engine, data, slice(0, 120))
+    accepted = [d for d in (engine.decide(x) for x in data.X[120:150]) if d.action is Action.ACCEPT]
+    engine.report(accepted[3].id, False)
+    engine.settle()
+    reopened = again(engine, Path())
+    assert asked(reopened, data) == asked(engine, data)
+
+
+def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Dataset) -> None:
+    """Its labels are corrected and forgotten afterwards; its places, and its references, stay where they were."""
+    own = LinearDiscriminantAnalysis()
+    engine = DataEngine(own, RECIPE.policy, retrain_every=40, replaying=True)
+    cycles = play(engine, data, slice(0, 90))
+    engine.correct(cycles[3].decision.id, not cycles[3].success)
+    engine.forget(cycles[4].decision.id, cycles[5].decision.id)
+    reopened = DataEngine.open(copy.deepcopy(engine.store), reducer=own, replaying=True)
+    assert asked(reopened, data) == asked(engine, data)
+    first = engine.store.retrains()[0].version
+    engine.rollback(first)
+    reopened = DataEngine.open(copy.deepcopy(engine.store), reducer=own, replaying=True)
+    assert asked(reopened, data) == asked(engine, data)
+
+
+# ------------------------------------------------------------------------------------------------------------ rollback
+
+
+def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(
+    kept: Callable[..., DataEngine], data: Dataset
+) -> None:
+    engine = kept()
+    play(engine, data, slice(0, 100))
+    old, number, version = engine.model.spaces, engine.version - 1, engine.version
+    said = engine.rollback(number, author="kim")
+    assert (engine.version, said.version, said.kind) == (version + 1, version + 1, "rollback")
+    assert engine.store.retrains()[-1].reason == f"rolled back to version {number}"
+    assert engine.store.events(1)[0].data == {"to": number, "was": version, "now": version + 1}
+    assert engine.model.spaces is not old
+    assert len(engine.model.index) == len(engine.store.labelled().seq)
+    assert engine.new_labels == 0
+    assert engine.decide(data.X[150]).model_version == version + 1
+    first = engine.store.load_version(number).state
+    np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
+    np.testing.assert_array_equal(engine.model.index.points[: first["points"].shape[1]], first["points"].T)
+
+
+def test_the_next_retrain_after_a_rollback_waits_for_new_labels_and_a_correction_reaches_it(data: Dataset) -> None:
+    engine = make()
+    cycles = play(engine, data, slice(0, 100))
+    engine.correct(cycles[0].decision.id, not cycles[0].success)
+    engine.rollback(1)
+    assert engine.model.index.labels[0] == (not cycles[0].success)
+    version = engine.version
+    play(engine, data, slice(100, 139))
+    assert engine.version == version
+    play(engine, data, slice(139, 160))
+    assert engine.version == version + 1
+
+
+@pytest.mark.parametrize("number", [0, 99, -1])
+def test_a_version_that_is_not_kept_is_refused_and_those_that_are_named(number: int, data: Dataset) -> None:
+    engine = make()
+    play(engine, data, slice(0, 90))
+    before = state(engine)
+    with pytest.raises(StoreError, match=f"got {number}; it keeps 1, 2"):
+        engine.rollback(number)
+    assert (state(engine), engine.store.events()) == (before, [])
+
+
+@pytest.mark.parametrize("number", [True, "1", 1.0, None])
+def test_what_is_no_number_is_refused(number: object) -> None:
+    with pytest.raises(SettingError, match="number of a version"):
+        make().rollback(number)
+
+
+def test_a_rival_goes_back_to_the_traces_of_that_version_as_they_are_labelled_now(data: Dataset) -> None:
+    engine = DataEngine(model=Nearest(), retrain_every=40, replaying=True)
+    cycles = play(engine, data, slice(0, 90))
+    engine.correct(cycles[2].decision.id, not cycles[2].success)
+    engine.rollback(1)
+    labels = engine.store.labelled()
+    assert engine.model.y.tolist() == labels.labels.tolist()
+    again_ = DataEngine.open(copy.deepcopy(engine.store), model=Nearest(), replaying=True)
+    assert again_.model.y.tolist() == engine.model.y.tolist()
+
+
+# -------------------------------------------------------------------------------------------------------------- policy
+
+
+def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bounds(
+    kept: Callable[..., DataEngine], data: Dataset
+) -> None:
+    engine = kept()
+    play(engine, data, slice(0, 150))
+    probe = data.X[160]
+    before = engine.decide(probe)
+    said = engine.set_policy(replace(engine.policy, alpha=0.001, lower_bound=0.99), author="kim")
+    after = engine.decide(probe)
+    assert (before.action, after.action) == (Action.ACCEPT, Action.VERIFY)
+    assert (after.n_success, after.n_failure) == (before.n_success, before.n_failure)
+    assert after.lower < before.lower
+    assert engine.store.get_decision(before.id).lower == before.lower
+    assert said.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
+    event = engine.store.events(1)[0]
+    assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (0.1, 0.001, "kim")
+    assert engine.exported().recipe == engine.recipe.to_toml()
+    assert "alpha = 0.001" in engine.exported().recipe
+
+
+def test_the_certificate_speaks_of_what_was_decided_since_the_policy_changed(data: Dataset) -> None:
+    engine = make(POOLED)
+    play(engine, data, slice(0, 170), confirm=False)
+    assert engine.certificate().accepted.n > 0
+    engine.set_policy(replace(engine.policy, lower_bound=0.85))
+    assert (engine.certificate().accepted.n, engine.certificate().tolerance) == (0, pytest.approx(0.15))
+    assert int(engine.model.rule.members.sum()) == 0
+    assert {d.action for d in (engine.decide(x) for x in data.X[:20])} == {Action.VERIFY}  # nothing is shown yet
+
+
+def test_the_audit_rate_alone_leaves_the_rule_as_it_is(data: Dataset) -> None:
+    engine = make(POOLED)
+    play(engine, data, slice(0, 170), confirm=False)
+    rule = engine.model.rule
+    members = rule.members.clone()
+    engine.set_policy(replace(engine.policy, audit_rate=0.9))
+    assert engine.model.rule is rule
+    assert (rule.members == members).all()
+    looked = [engine.decide(x) for x in data.X[170:] if not engine.safe_mode]
+    certain = [d for d in looked if d.predicted is not Action.VERIFY]
+    assert sum(d.audit for d in certain) > 0.6 * len(certain) > 0
+    assert {d.propensity for d in certain} == {0.9}
+
+
+def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Path, data: Dataset) -> None:
+    engine = make(RECIPE.with_policy(stops="all"), store=tmp_path / "engine.db")
+    play(engine, data, slice(0, 120))
+    for x in data.X[np.flatnonzero(data.y == 1)]:
+        decision = engine.decide(x)
+        if decision.action is Action.ACCEPT:
+            engine.report(decision.id, False)
+        if engine.safe_mode:
+            break
+    why = engine.safe_mode
+    assert why
+    engine.set_policy(replace(engine.policy, lower_bound=0.85))
+    assert engine.safe_mode == why
+    assert engine.decide(data.X[160]).reason in (Reason.SAFE_MODE, Reason.NOVEL)
+    with again(engine, tmp_path) as reopened:
+        assert reopened.safe_mode == why
+    engine.correct(decision.id, True)  # told anew: it still began in safe mode
+    assert engine.safe_mode == why
+    engine.set_policy(replace(engine.policy, stops="some"))  # the paper's rule has no safe mode
+    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "ended: the rule of the policy in force has none")
+
+
+def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:
+    engine = make()
+    play(engine, data, slice(0, 150), confirm=False)
+    silent = len(engine.store.unreported_accepts())
+    assert silent > 5
+    engine.set_policy(replace(engine.policy, stops="all"))
+    reopened = DataEngine.open(copy.deepcopy(engine.store), replaying=True)
+    for each in (engine, reopened):
+        each.decide(data.X[160])
+        each.decide(data.X[161])
+        each.flush()
+        assert len(each.store.unreported_accepts()) >= silent
+
+
+def test_a_reopened_store_keeps_the_policy_and_refuses_the_old_one(tmp_path: Path, data: Dataset) -> None:
+    new = Policy(alpha=0.05, lower_bound=0.85)
+    with make(store=tmp_path / "engine.db") as engine:
+        play(engine, data, slice(0, 60))
+        engine.set_policy(new)
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert engine.policy == new
+    with pytest.raises(SettingError, match="lower_bound"):
+        DataEngine.open_or_create(tmp_path / "engine.db", policy=RECIPE.policy)
+
+
+def test_before_the_first_retrain_a_policy_changes_too(data: Dataset) -> None:
+    engine = make()
+    engine.set_policy(POOLED.policy)
+    play(engine, data, slice(0, 90), confirm=False)
+    assert (type(engine.model.rule).__name__, engine.policy) == ("PooledRule", POOLED.policy)
+
+
+@pytest.mark.parametrize("policy", [None, "pooled", {"alpha": 0.1}])
+def test_what_is_no_policy_is_refused(policy: object) -> None:
+    with pytest.raises(SettingError, match="Expected a Policy"):
+        make().set_policy(policy)
+
+
+def test_of_a_rival_only_what_the_engine_does_itself_can_change(data: Dataset) -> None:
+    engine = DataEngine(model=Nearest(), retrain_every=40, replaying=True)
+    play(engine, data, slice(0, 60))
+    with pytest.raises(SettingError, match="alpha would have no effect"):
+        engine.set_policy(replace(engine.policy, alpha=0.2))
+    engine.set_policy(replace(engine.policy, audit_rate=0.5, stops="all"))
+    assert engine.policy.audit_rate == 0.5
