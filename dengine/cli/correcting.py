@@ -60,8 +60,7 @@ def correct(store: str, decision: str, label: str, author: str | None, as_json: 
     """Say that a label was wrong: the part was good, or bad.
 
     From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
-    decided; the correction is a later row. A
-    forgotten label counts again by it.
+    decided; the correction is a later row. A forgotten label counts again by it.
     """
     _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
 
@@ -110,8 +109,7 @@ def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> N
     """Decide by another policy from now on.
 
     What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
-    and the certificate, start anew: a
-    tolerance that is chosen after the data was seen needs fresh evidence.
+    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence.
     """
     from dataclasses import replace
 
