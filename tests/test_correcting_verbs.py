@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from dengine import DataEngine, Dataset, Policy
-from dengine.cli import main
+from dengine.cli import correcting, main
+from dengine.decision.bounds import INTERVALS as EVERY_INTERVAL
 from dengine.importing import import_labelled
 
 
@@ -127,6 +128,10 @@ def test_a_wrong_call_ends_with_2_and_changes_nothing(words: tuple, store: Path)
     assert dengine(*(store if word == "STORE" else word for word in words)).exit_code == 2
     assert labels(store) == before
     assert document("status", store)["events"] == []
+
+
+def test_every_interval_can_be_chosen() -> None:
+    assert sorted(correcting.INTERVALS) == sorted(EVERY_INTERVAL)
 
 
 def test_a_retrain_by_hand_learns_what_was_corrected(store: Path) -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..decision.bounds import INTERVALS
 from .options import SETTINGS, example, json_option
 from .output import certificate_record, show, write_json
 
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 LABELS = {"good": True, "bad": False}
+INTERVALS = ("binomial", "wilson", "clopper_pearson", "jeffreys")  # whose functions are not imported to parse
 POLICY = ("alpha", "lower_bound", "guarantee", "stops", "audit_rate")
 store_argument = click.argument("store", metavar="STORE")
 author_option = click.option("--author", help="Who says so, for the record.  [default: the login name]")
@@ -50,29 +50,29 @@ def _login() -> str:
         return ""
 
 
-@click.command(epilog=example("dengine correct engine.db DECISION bad"))
+@click.command(epilog=example("dengine correct engine.db import-d684ff7e4dbab839-0 bad"))
 @store_argument
 @click.argument("decision", metavar="ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
 @author_option
 @json_option
 def correct(store: str, decision: str, label: str, author: str | None, as_json: bool) -> None:
-    """Say that a label was wrong: from now on the decision ID counts as good or bad.
+    """Say that a label was wrong: the part was good, or bad.
 
-    The label as it was reported stays in the store, and so does what was decided; the correction is a later row. A
-    forgotten label counts again by it.
+    From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
+    decided; the correction is a later row. A forgotten label counts again by it.
     """
     _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
 
 
-@click.command(epilog=example("dengine forget engine.db DECISION DECISION --reason 'another part lay in the fixture'"))
+@click.command(epilog=example("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'"))
 @store_argument
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
 @author_option
 @json_option
 def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | None, as_json: bool) -> None:
-    """Leave the labels of these decisions out of all that is learned and counted.
+    """Leave labels out of all that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
     where one is unknown or has no label, none.
@@ -80,7 +80,7 @@ def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | No
     _changed("forget", store, author, lambda engine, who: engine.forget(*decisions, author=who, reason=reason), as_json)
 
 
-@click.command(epilog=example("dengine rollback engine.db 3"))
+@click.command(epilog=example("dengine rollback engine.db 1"))
 @store_argument
 @click.argument("version", metavar="VERSION", type=int)
 @author_option
@@ -102,14 +102,14 @@ def _policy_options(command: Command) -> Command:
 @click.command("set-policy", epilog=example("dengine set-policy engine.db --alpha 0.05 --lower-bound 0.95"))
 @store_argument
 @_policy_options
-@click.option("--interval", type=click.Choice(list(INTERVALS)), help="The confidence interval.")
+@click.option("--interval", type=click.Choice(INTERVALS), help="The confidence interval.")
 @author_option
 @json_option
 def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> None:
-    """Decide by another policy from now on; what is not given stays as it is.
+    """Decide by another policy from now on.
 
-    Earlier decisions keep the bounds they were decided by. What the rule learned, and the certificate, start anew: a
-    tolerance that is chosen after the data was seen needs fresh evidence.
+    What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
+    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence.
     """
     from dataclasses import replace
 
@@ -126,7 +126,7 @@ def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> N
 @author_option
 @json_option
 def retrain(store: str, author: str | None, as_json: bool) -> None:
-    """Train on the labels of the store now, as they count after all corrections.
+    """Train now, on the store's labels as they count.
 
     A candidate that fails its gate is dropped and recorded, and the version before goes on answering.
     """
