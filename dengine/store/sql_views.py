@@ -66,7 +66,7 @@ def _meant(where: HistoryFilter) -> list[sa.ColumnElement[bool]]:
         found.append(DECISION.c.reason == where.reason.value)
     if where.label is not None:
         meant = LABELS[where.label]
-        found.append(SAID.is_(None) if meant is None else int(meant) == SAID)
+        found.append(SAID.is_(None) if meant is None else SAID.in_([int(meant)]))
     if where.since is not None:
         found.append(DECISION.c.time >= where.since)
     if where.until is not None:
