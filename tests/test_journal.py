@@ -56,7 +56,7 @@ def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tm
 def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     new = make_data(10, 40, 3)
     path = write(tmp_path / "cell.csv", new.X.reshape(10, -1), new.y)
-    back = read_journal(path, TraceSpec(40, channels=3))
+    back = read_journal(path, TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
     assert [line.label for line in back] == new.y.astype(bool).tolist()
     assert {line.reason for line in back} == {Reason.NO_MODEL}
@@ -65,12 +65,12 @@ def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tm
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("1,2,3", "Expected 100 samples in line 1 of .*, got 2; a last line that was cut"),
+        ("1,2,3", "Expected 100 samples in line 1 of .*, got 2; it is damaged, or of another cell"),
         ("2" + ",1" * 100, "Expected a label of 1 or 0 in line 1 of .*, got '2'"),
         ("1,x" + ",1" * 99, "line 1 of .* are no row of numbers: .*'x'"),
         ("", "no labels"),
         (HEAD + "1,P1,verify,verify,uncertain,0,1,0,0,7", "Expected 100 samples in line 2"),
-        (HEAD + "1", "Expected 100 samples in line 2"),
+        (HEAD + "1", "The decision in line 2"),
         (
             HEAD + "1,P1,think,verify,uncertain,0,1,0,0" + ",1" * 100,
             "The decision in line 2 .*'think' is not a valid Action",
@@ -81,7 +81,7 @@ def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tm
 )
 def test_a_line_that_does_not_fit_is_named(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "cell.csv"
-    path.write_text(line)
+    path.write_text(line + "\n")
     with pytest.raises(DataError, match=message):
         read_journal(path, TraceSpec(100))
 

@@ -16,7 +16,7 @@ import click
 from .. import __version__
 from ..errors import DengineError
 from .data import data
-from .export import export, import_labels
+from .export import export, export_cpp, import_labels, make_key
 from .interrupting import end_interrupted
 from .options import example
 from .replaying import compare, replay
@@ -63,5 +63,5 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (data, replay, compare, train, run, simulate, status, export, export_cpp, make_key, import_labels):
     main.add_command(verb)

@@ -1,6 +1,7 @@
 """An exported file, whatever its format: what it is made from, what it says of itself, and its checksum.
 
-The checksum guards against damage, not against an adversary: whoever can change the file can change the sum.
+The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. What does is a
+signature, by `key`.
 """
 
 from __future__ import annotations
@@ -25,6 +26,16 @@ from ..errors import ExportError
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
 from .module import FIELDS, DecisionModule
+from .signing import (
+    KeyFile,
+    check_signature,
+    earlier_signatures,
+    listed,
+    read_key,
+    signature,
+    signature_file,
+    write_signatures,
+)
 
 SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
 METADATA = "dengine.json"
@@ -98,6 +109,34 @@ def _guarantee_of(rule: Any) -> str:
     return next((name for name, rules in RULES.items() if own in rules.values()), own)
 
 
+def write_export(
+    target: Path, write: Callable[[Path], None], key: KeyFile | None, source: Exportable | None = None
+) -> Path:
+    """`write_checked`, signed with a key, and noted in the store that the engine remembers in.
+
+    The new signature stands beside the earlier one until the file is replaced, so that one of them always fits.
+    """
+    secret = None if key is None else read_key(key)
+    earlier = earlier_signatures(target)
+    signed: list[str] = []
+
+    def whole(partial: Path) -> None:
+        write(partial)
+        content = partial.read_bytes()
+        if secret is not None:
+            signed.append(signature(content, secret))
+            write_signatures(target, [*earlier[-1:], *signed])
+        if source is not None and source.note is not None:
+            source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
+
+    written = write_checked(target, whole)
+    if signed:
+        write_signatures(target, signed)
+    elif earlier:
+        signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
+    return written
+
+
 def write_checked(target: Path, write: Callable[[Path], None]) -> Path:
     """Write a file beside its name, sum it, and move both into place, so that a killed export leaves no half file."""
     partial = target.with_name(target.name + ".partial")
@@ -121,26 +160,31 @@ def sum_file(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
 
 
-def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a file says of itself, after checking its sum and without loading its code."""
-    return metadata_of(checked_bytes(Path(path)), Path(path))
+def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
+    """What a file says of itself, after checking its sum, and its signature by a key, and without loading its code."""
+    return metadata_of(checked_bytes(Path(path), key), Path(path))
 
 
-def checked_bytes(path: Path) -> bytes:
-    """A file's content; ExportError unless its sum is right. libtorch itself does not notice flipped bits."""
+def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
+    """A file's content; ExportError unless its sum is right, and, with a key, its signature.
+
+    libtorch itself does not notice flipped bits. The sum file has two lines while a file is being replaced.
+    """
     try:
         content = path.read_bytes()
-        words = sum_file(path).read_text(encoding="utf-8").split()
+        if key is not None:
+            check_signature(path, content, key)
+        sums = [each for each in listed(sum_file(path).read_text(encoding="utf-8"), path.name) if len(each) == 64]
     except FileNotFoundError as error:
         raise ExportError(f"{error.filename} is missing; an export is a file and its .sha256, copied together.") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ExportError(f"{path} or its .sha256 cannot be read: {error}.") from error
-    if not words or len(words[0]) != 64:
-        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum; copy it again together with {path.name}.")
+    if not sums:
+        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
     found = hashlib.sha256(content).hexdigest()
-    if found != words[0]:
+    if found not in sums:
         raise ExportError(
-            f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {words[0][:12]}…; copy it again."
+            f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {sums[-1][:12]}…; copy it again."
         )
     return content
 
