@@ -82,9 +82,10 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         text = _text(raw, where)
         if text.strip() and not text.startswith("#"):
             reader.take(text.rstrip("\r"), where)
-    if not reader.lines:
+    waits, lines = reader.waits, reader.labelled()
+    if not lines:
         raise DataError(f"{path} holds no labels yet.")
-    return Journal(reader.labelled(), reader.waits, version, total, len(tail))
+    return Journal(lines, waits, version, total, len(tail))
 
 
 def _head(line: bytes) -> tuple[int, str]:
@@ -113,11 +114,16 @@ class _Reader:
         self.spec, self.version = spec, version
         self.lines: list[JournalLine] = []
         self._parts: dict[str, JournalLine] = {}  # by id, as known by now
-        self._last = ""  # the id of the part that was decided on last
-        self.waits = False
+        self._open: JournalLine | None = None  # the part that was decided on last, while nothing was heard of it
+
+    @property
+    def waits(self) -> bool:
+        """Whether the last part was accepted, and nothing came after it."""
+        return self._open is not None and self._open.action is Action.ACCEPT
 
     def labelled(self) -> list[JournalLine]:
         """Without rejected parts, which went back to the bin, and verified ones of which nothing was heard yet."""
+        self._settle()
         return [line for line in self.lines if line.label is not None or line.action is Action.ACCEPT]
 
     def take(self, text: str, where: str) -> None:
@@ -125,42 +131,47 @@ class _Reader:
         if self.version > 1 and text.startswith(("part,", "label,")):
             kind, *words = _checked(text, where).split(",")
             if kind == "part":
-                self._take_part(self._part(words[1:], words[0], where))
+                self._take_part(self._part(words[1:], words[0], where), where)
             else:
                 self._take_label(words, where)
         elif self.version == 2:
-            self._take_part(self._part(text.split(","), "", where))
+            self._take_part(self._part(text.split(","), "", where), where)
         elif self.version == 1:
-            self._take_part(self._first_form(text.split(","), where))
+            self._take_part(self._first_form(text.split(","), where), where)
         else:
             raise DataError(f"Expected a line that begins with part or label in {where}, got {text[:20]!r}.")
 
-    def _take_part(self, line: JournalLine) -> None:
+    def _take_part(self, line: JournalLine, where: str) -> None:
         if line.id and line.id in self._parts:
-            raise DataError(f"Expected one line of the part {line.id}, got another; the journal was pasted together.")
-        self.lines.append(line)
+            raise DataError(
+                f"Expected one line of the part {line.id}, {where} is another; the journal was pasted together."
+            )
+        self._settle()
         self._parts[line.id] = line
-        self._last = line.id
-        self.waits = line.action is Action.ACCEPT and line.label is None
+        if line.label is None:
+            self._open = line
+        else:
+            self.lines.append(line)
+
+    def _settle(self) -> None:
+        """The next part comes: no sooner is an accepted one counted of which nothing was heard."""
+        if self._open is not None:
+            self.lines.append(self._open)
+        self._open = None
 
     def _take_label(self, words: list[str], where: str) -> None:
         if len(words) != 2 or not words[0] or words[0] not in self._parts or words[1] not in LABELS:
             raise DataError(
-                f"Expected the id of an earlier part and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}."
+                f"Expected an earlier part's id and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}."
             )
         known, label = self._parts[words[0]], LABELS[words[1]]
         if known.action is Action.REJECT or known.label is not None:
             raise DataError(f"Expected one label of a part that was not rejected in {where}, got another of {known.id}.")
-        late = known.id != self._last
-        line = replace(known, label=label, late=late)
-        self._parts[known.id] = line
-        if late:
-            self.lines.append(line)
-            return
-        place = next(i for i in reversed(range(len(self.lines))) if self.lines[i] is known)
-        del self.lines[place]  # it is known now, and not before the labels that came since
-        self.lines.append(line)
-        self.waits = False
+        late = known is not self._open
+        self._parts[known.id] = replace(known, label=label, late=late)
+        self.lines.append(self._parts[known.id])
+        if not late:
+            self._open = None
 
     def _part(self, words: list[str], id_: str, where: str) -> JournalLine:
         label, part, *decided = (*words[:9], *[""] * (9 - len(words)))
