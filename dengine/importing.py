@@ -177,7 +177,8 @@ def _import_lines(
                 decision = _decided(ids[i], line, fault, policy.audit_rate)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
             elif held.success is not None:
-                counts["known" if line.label in (None, held.success) else "contradicted"] += 1
+                if line.label is not None:
+                    counts["known" if line.label == held.success else "contradicted"] += 1
                 continue
             if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
                 silent += (line.label is None) - (held is not None)

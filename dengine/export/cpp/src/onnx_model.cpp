@@ -23,7 +23,7 @@ class OnnxModel final : public Model {
         read(metadata);
         shape.any_length = false;  // the graph has one
         std::vector<float> trace = floats(metadata.list("golden.trace")), expected = floats(metadata.list("golden.embedding"));
-        const bool golden = !expected.empty();  // files of 0.5 had none
+        const bool golden = !expected.empty();  // earlier files have none
         if (!golden) trace.assign(shape.size(), 0.0F);
         if (trace.size() != shape.size() || (golden && expected.size() != width)) {
             throw Fault(DENGINE_BAD_MODEL, "its golden trace does not fit its own contract");
