@@ -87,4 +87,5 @@ class EngineFacts:
         """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
-        return replace(own, model_version=self.version, recipe=self.recipe.to_toml(), **coin)
+        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
+        return replace(own, note=self._keeper.event, **about, **coin)

@@ -14,7 +14,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,24 +27,31 @@ from .engine import DataEngine
 from .errors import DataError, StoreError
 from .folds import content_hash, own_hash
 from .forms import form_in, must_agree
+from .journals import Journal, JournalLine, read_journal
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .settings import trace_in
 from .store.base import NewLabel, Store, opening
-from .traces import TraceGate, as_trace, as_traces
+from .traces import TraceGate, as_traces
 
+EXPORTED = "export"  # the kind of the events that note a model's sum
 CHUNK = 500  # traces committed together
-LABELS = {"1": True, "0": False}
 
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """What became of a data set's traces: taken in, taken in but kept from training, or known from an earlier import."""
+    """What became of a data set's traces: taken in, taken in but kept from training, or known from an earlier import.
+
+    cut : bytes of a journal's last line that was not finished, and was left out.
+    contradicted : labels that say the opposite of what an earlier import took in, and were left out.
+    """
 
     imported: int
     quarantined: int
     known: int
     resumed: bool
+    cut: int = 0
+    contradicted: int = 0
 
 
 def import_labelled(
@@ -94,90 +100,18 @@ def train_until_done(
     return reports
 
 
-@dataclass(frozen=True, slots=True)
-class JournalLine:
-    """A part in a cell program's journal: its trace (C, T), its label, and what was decided on it, as in `Decision`.
-
-    label : None where nothing was heard of an accepted part.
-    """
-
-    trace: NDArray[np.float32]
-    label: bool | None
-    part: str | None = None
-    action: Action = Action.VERIFY
-    predicted: Action = Action.VERIFY
-    reason: Reason = Reason.NO_MODEL
-    lower: float = 0.0
-    upper: float = 1.0
-    n_success: int = 0
-    n_failure: int = 0
-
-
-def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> list[JournalLine]:
-    """The lines of a cell program's journal, in order.
-
-    A line is `label,part,action,predicted,reason,lower,upper,n_success,n_failure,sample,sample,...`, several channels one
-    after the other, where the first line begins with `# dengine 2`, and `label,sample,sample,...`, of verified parts,
-    where it does not. Lines that begin with # are comments. DataError names the first line that does not fit.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"Cannot read the journal {path}: {error}; copy it again from the cell.") from error
-    read = _read_line if text.startswith("# dengine 2 ") else _read_first_form
-    found = [
-        read(line.split(","), spec, f"line {number} of {path}")
-        for number, line in enumerate(text.split("\n"), start=1)
-        if line.strip() and not line.startswith("#")
-    ]
-    if not found:
-        raise DataError(f"{path} holds no labels yet.")
-    return found
-
-
-def _read_line(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
-    trace = _read_trace(words[9:], spec, where)
-    label, part, *decided = words[:9]
-    try:
-        action, predicted = Action(decided[0]), Action(decided[1])
-        bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
-        reason = Reason(decided[2])
-    except ValueError as error:
-        raise DataError(f"The decision in {where} cannot be read: {error}.") from error
-    silent = label == "" and action is Action.ACCEPT
-    if action is Action.REJECT or not (silent or label in LABELS):
-        raise DataError(f"Expected a verified part with a label of 1 or 0, or an accepted one, in {where}, got {label!r}.")
-    return JournalLine(trace, LABELS.get(label), part or None, action, predicted, reason, *bound)
-
-
-def _read_first_form(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
-    trace = _read_trace(words[1:], spec, where)
-    if words[0] not in LABELS:
-        raise DataError(f"Expected a label of 1 or 0 in {where}, got {words[0][:20]!r}.")
-    return JournalLine(trace, LABELS[words[0]])
-
-
-def _read_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
-    expected = spec.channels * spec.samples
-    if len(words) != expected and (spec.fit == "strict" or len(words) % spec.channels):
-        raise DataError(
-            f"Expected {expected} samples in {where}, got {len(words)}; a last line that was cut can be removed."
-        )
-    try:
-        with np.errstate(over="ignore"):
-            values = np.array([float(word) for word in words]).astype(np.float32)
-    except ValueError as error:
-        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
-    return as_trace(values.reshape(spec.channels, -1), spec)
-
-
 def import_journal(
-    store: str | os.PathLike[str], path: str | os.PathLike[str], on_traces: Callable[[int], None] | None = None
+    store: str | os.PathLike[str] | Store,
+    path: str | os.PathLike[str],
+    on_traces: Callable[[int], None] | None = None,
+    any_model: bool = False,
 ) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
     Parts keep their numbers, the bounds that they were decided by and the sources of their labels, so that the rule and the
     certificate count them as the engine's own. The report counts labels.
+    any_model : take a journal of a model that the store has not noted as exported from it.
+    Raises DataError, before anything is stored, for a journal that is damaged, or of a model of another store.
     """
     with opening(store, must_exist=True) as opened:
         known = opened.settings()
@@ -187,18 +121,44 @@ def import_journal(
                 f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
             )
         policy = Recipe.from_toml(known["recipe"]).policy
-        lines = _with_known_outcomes(read_journal(path, spec), policy.stops)
+        journal = read_journal(path, spec)
+        if not any_model:
+            _must_be_of(opened, journal, path)
+        lines = _with_known_outcomes(journal, policy.stops)
         report = _import_lines(opened, lines, spec, policy, on_traces)
     opened.close()
-    return report
+    return replace(report, cut=journal.cut)
 
 
-def _with_known_outcomes(lines: list[JournalLine], stops: str) -> list[JournalLine]:
-    """Where all stops are reported, the next decision confirmed an accepted part; of the last one nothing is known yet."""
+def _must_be_of(store: Store, journal: Journal, path: str | os.PathLike[str]) -> None:
+    """DataError where a journal's model was not exported from the store. Earlier forms are of exports not noted always."""
+    exports = {event.text.split()[0] for event in store.events() if event.kind == EXPORTED}
+    if journal.version > 2 and exports and journal.sum not in exports:
+        raise DataError(
+            f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
+            "which is none of its exports; name the store that it came from, or say --any-model if it is right."
+        )
+
+
+def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
+    """Where all stops are reported, the next decision confirmed an accepted part, unless its stop came late.
+
+    Of the last part nothing is known yet.
+    """
     if stops == "some":
-        return lines
-    known = lines if lines[-1].label is not None else lines[:-1]
-    return [replace(line, label=True) if line.label is None else line for line in known]
+        return journal.lines
+    late = {line.id: line.label for line in journal.lines if line.late}
+    waits = [line for line in journal.lines if line.label is None][-1:] if journal.waits else []
+    return [
+        replace(line, label=True) if line.label is None else line
+        for line in journal.lines
+        if not any(line is each for each in waits) and not _is_elsewhere(line, late.get(line.id) if line.id else None)
+    ]
+
+
+def _is_elsewhere(line: JournalLine, late: bool | None) -> bool:
+    """Whether another line brings an accepted part's label: the late one its stop, the first one its confirmation."""
+    return line.action is Action.ACCEPT and late is not None and line.late == late
 
 
 def _import_lines(
@@ -206,7 +166,8 @@ def _import_lines(
 ) -> ImportReport:
     gate, counts = TraceGate(spec), Counter[str]()
     looks = [gate(torch.from_numpy(line.trace)) for line in lines]
-    ids = _ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
+    made = _ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
+    ids = [line.id or id_ for line, id_ in zip(lines, made, strict=True)]
     counts_silence = policy.stops == "some"
     since = int(store.settings().get("policy_since", 0))
     silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
@@ -218,7 +179,8 @@ def _import_lines(
                 decision = _decided(ids[i], line, fault, policy.audit_rate)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
             elif held.source is not None:  # a forgotten one has a label too
-                counts["known"] += 1
+                if line.label is not None:
+                    counts["known" if line.label == held.success else "contradicted"] += 1
                 continue
             if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
                 silent += (line.label is None) - (held is not None)
@@ -232,7 +194,9 @@ def _import_lines(
         if on_traces is not None:
             on_traces(min(CHUNK, len(lines) - start))
     store.flush()
-    return ImportReport(counts["imported"], counts["quarantined"], counts["known"], True)
+    return ImportReport(
+        counts["imported"], counts["quarantined"], counts["known"], True, contradicted=counts["contradicted"]
+    )
 
 
 def _decided(id_: str, line: JournalLine, fault: int, audit_rate: float) -> Decision:

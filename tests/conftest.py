@@ -4,13 +4,17 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dengine import Dataset
+from dengine.export import export_sources
 
 REPO = Path(__file__).resolve().parents[1]
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
@@ -18,8 +22,10 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = ("test_docs", "test_notebooks", "test_golden", "test_training", "test_cli", "test_estimators", "test_reducers")
+# The C++ programs are built once, by one worker.
+GROUPS = dict.fromkeys(("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program"), "cpp")
 # Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
-UMAP = ("test_golden", "test_estimators", "test_reducers", "test_plane")
+GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers", "test_plane"), "umap")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
@@ -27,7 +33,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Long files first; a file's own order stays as it is, and so does the worker that it is run by."""
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
     for item in items:
-        item.add_marker(pytest.mark.xdist_group("umap" if item.path.stem in UMAP else item.path.stem))
+        item.add_marker(pytest.mark.xdist_group(GROUPS.get(item.path.stem, item.path.stem)))
 
 
 def insertion_like(
@@ -42,6 +48,32 @@ def insertion_like(
     X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, noise, (n, channels, samples))
     X = X.astype(np.float32)
     return Dataset(X[:, 0] if channels == 1 else X, y, name="insertion-like")
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built libraries and programs; kept, so that only the first run compiles."""
+    missing = [tool for tool in ("cmake", "g++") if shutil.which(tool) is None]
+    if missing:
+        message = f"building the cell program needs {' and '.join(missing)}"
+        if os.environ.get("DENGINE_REQUIRE_CPP") == "1":
+            pytest.fail(message)
+        pytest.skip(message)
+    sources, build = REPO / "build" / "cell_sources", REPO / "build" / "cell"
+    written = export_sources(tmp_path_factory.mktemp("cell") / "sources")
+    for file in (each for each in written.rglob("*") if each.is_file()):
+        kept = sources / file.relative_to(written)
+        if not kept.exists() or kept.read_bytes() != file.read_bytes():  # what has not changed is not compiled again
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            kept.write_bytes(file.read_bytes())
+    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+    for command in (
+        ["cmake", "-S", str(sources), "-B", str(build), prefix],
+        ["cmake", "--build", str(build), "--parallel", "2", "--target", "all", "sha256sum_check"],
+    ):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return build
 
 
 @pytest.fixture(scope="session")

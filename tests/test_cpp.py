@@ -1,11 +1,12 @@
 """The cell program without Python decides as the engine does, learns, and refuses what it must not use."""
 
 import hashlib
-import os
+import hmac
 import shutil
 import subprocess
 import time
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -32,26 +33,6 @@ from dengine.importing import import_journal
 from dengine.records import Action, Reason
 
 SAMPLES = 100
-
-
-@pytest.fixture(scope="session")
-def programs(repo: Path) -> Path:
-    """The folder of the built programs; kept, so that only the first run compiles."""
-    missing = [tool for tool in ("cmake", "g++") if shutil.which(tool) is None]
-    if missing:
-        message = f"building the cell program needs {' and '.join(missing)}"
-        if os.environ.get("DENGINE_REQUIRE_CPP") == "1":
-            pytest.fail(message)
-        pytest.skip(message)
-    build = repo / "build" / "cpp"
-    prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
-    for command in (
-        ["cmake", "-S", str(repo / "tests" / "cpp"), "-B", str(build), prefix],
-        ["cmake", "--build", str(build)],
-    ):
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    return build
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +64,7 @@ def many(make_data: Callable[..., Dataset]) -> np.ndarray:
 
 def cell(programs: Path, *arguments: Any, stdin: bytes = b"", fails: bool = False) -> tuple[list[list[str]], str]:
     """The program's lines, split at commas, and what it said on stderr."""
-    command = [str(programs / "dengine_cell"), *map(str, arguments)]
+    command = [str(programs / "dengine-cell"), *map(str, arguments)]
     start = partial(subprocess.run, command, input=stdin, capture_output=True, check=False, timeout=120)
     try:
         done = start()
@@ -119,6 +100,9 @@ def test_the_sum_is_that_of_the_standard(programs: Path) -> None:
         content = rng.bytes(size)
         done = subprocess.run([programs / "sha256sum_check"], input=content, capture_output=True, check=True)
         assert done.stdout.decode().strip() == hashlib.sha256(content).hexdigest()
+        key = "k" * max(1, min(size, 130))  # shorter than a block, a block, longer
+        done = subprocess.run([programs / "sha256sum_check", key], input=content, capture_output=True, check=True)
+        assert done.stdout.decode().strip() == hmac.new(key.encode(), content, hashlib.sha256).hexdigest()
 
 
 def test_csv_lines_get_the_engines_decisions(programs: Path, engine: DataEngine, file: Path, many: np.ndarray) -> None:
@@ -240,9 +224,9 @@ def test_the_cell_learns_stops_and_silence_as_python_does(
     lines, _ = cell(programs, learning[1], *options, stdin=b"".join(expected.lines))
     assert_equal(lines, expected.decisions, 2)
     head, *journal = (tmp_path / "cell.csv").read_text().splitlines()
-    assert head == f"# dengine 2 {hashlib.sha256(learning[1].read_bytes()).hexdigest()}"
+    assert head == f"# dengine 3 {hashlib.sha256(learning[1].read_bytes()).hexdigest()}"
     assert len(journal) == expected.written[-1]
-    kinds = Counter((line.split(",")[0], line.split(",")[2]) for line in journal)
+    kinds = Counter((line.split(",")[2], line.split(",")[4]) for line in journal)
     assert kinds.keys() == {("1", "verify"), ("0", "verify"), ("1", "accept"), ("0", "accept"), ("", "accept")}
     reasons = {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CERTAIN, Reason.UNCERTAIN}
     stops_all = read_metadata(learning[1])["stops"] == "all"
@@ -259,7 +243,7 @@ def test_a_killed_cell_goes_on_as_if_nothing_had_happened(
     X, labels, parts = a_live_stream(make_data, 500)
     expected, journal = live(learning[1], X, labels, parts), tmp_path / "cell.csv"
     waiting = next(i for i in range(150, 350) if not labels[i] and expected.decisions[i].action is Action.ACCEPT)
-    command = [programs / "dengine_cell", learning[1], "--parts", "--learn", "--journal", journal]
+    command = [programs / "dengine-cell", learning[1], "--parts", "--learn", "--journal", journal]
     found: list[list[str]] = []
     for end in (1, waiting + 1, 499):
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -344,22 +328,75 @@ def written(programs: Path, file: Path, many: np.ndarray, tmp_path_factory: pyte
     return journal.read_text()
 
 
-@pytest.mark.parametrize("kind", ["cut", "shorter", "no label", "another action", "another reason"])
+def with_crc(line: str) -> str:
+    return f"{line},{zlib.crc32(line.encode()):08x}"
+
+
+@pytest.mark.parametrize(
+    "kind", ["shorter", "a flipped digit", "no label", "another action", "another reason", "a NUL", "plain"]
+)
 def test_a_journal_line_that_cannot_be_read_is_named(
     programs: Path, file: Path, written: str, tmp_path: Path, kind: str
 ) -> None:
-    journal, text = tmp_path / "cell.csv", written
-    line = text.splitlines()[-1]
+    journal = tmp_path / "cell.csv"
+    head, first, second = written.splitlines()
+    words = second.rsplit(",", 1)[0].split(",")
     wrong = {
-        "cut": text[:-1],
-        "shorter": text.rsplit(",", 1)[0] + "\n",
-        "no label": text + line.split(",", 1)[1] + "\n",
-        "another action": text + line.replace("accept", "think").replace("verify", "think") + "\n",
-        "another reason": text + ",".join([*line.split(",")[:4], "because", *line.split(",")[5:]]) + "\n",
+        "shorter": second[:-1],
+        "a flipped digit": second[:-30] + str((int(second[-30]) + 1) % 10 if second[-30].isdigit() else 1) + second[-29:],
+        "no label": with_crc(",".join([*words[:2], *words[3:]])),
+        "another action": with_crc(",".join([*words[:4], "think", *words[5:]])),
+        "another reason": with_crc(",".join([*words[:6], "because", *words[7:]])),
+        "a NUL": second[:-30] + "\0" + second[-29:],
+        "plain": second.split(",", 2)[2].rsplit(",", 1)[0],  # of the earlier form, which has no checksum
     }
-    journal.write_text(wrong[kind])
+    journal.write_text("\n".join([head, first, wrong[kind], second, ""]))
     _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
-    assert "has a line that was not finished" in said
+    assert "is damaged in line 3; take its earlier lines in" in said
+
+
+def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
+    programs: Path, file: Path, written: str, many: np.ndarray, tmp_path: Path
+) -> None:
+    journal = tmp_path / "cell.csv"
+    first = written.rindex("\n", 0, -1) + 1
+    for end in (first + 1, first + 40, len(written) - 12, len(written) - 1, 5, 0):  # within the line, then within the head
+        journal.write_text(written[:end])
+        _, said = cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:1], [1]))
+        kept = written[:first] if end >= first else written[: written.index("\n") + 1]
+        assert ("the last line was cut while it was written" in said) == (end > 0)
+        assert journal.read_text().startswith(kept)
+        assert journal.read_text().count("\n") == kept.count("\n") + 1
+
+
+def test_a_file_that_is_no_journal_is_left_as_it_is(programs: Path, file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "notes.txt"
+    for text in ("no line end", "# dengine 3 0123", "one\ntwo"):
+        other.write_text(text)
+        _, said = cell(programs, file, "--learn", "--journal", other, fails=True)
+        assert "belongs to another export" in said
+        assert other.read_text() == text
+
+
+def test_a_journal_of_the_earlier_program_is_gone_on_with_and_imported(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    store, file = learning
+    X, labels, parts = a_live_stream(make_data, 120)
+    expected, whole = live(file, X, labels, parts), tmp_path / "whole.csv"
+    cell(programs, file, "--parts", "--learn", "--journal", whole, stdin=b"".join(expected.lines))
+    head, *lines = whole.read_text().splitlines()
+    half, earlier = len(lines) // 2, tmp_path / "earlier.csv"
+    end = next(i for i, n in enumerate(expected.written) if n == half) + 1
+    old = [line.split(",", 2)[2].rsplit(",", 1)[0] for line in lines[:half]]
+    earlier.write_text("\n".join([head.replace("3", "2", 1), *old, ""]))
+    found, _ = cell(programs, file, "--parts", "--learn", "--journal", earlier, stdin=b"".join(expected.lines[end:]))
+    assert_equal(found, expected.decisions[end:], 2)
+    reports = []
+    for journal in (whole, earlier):
+        shutil.copy(store, tmp_path / "engine.db")
+        reports.append(import_journal(tmp_path / "engine.db", journal))
+    assert reports[0] == reports[1]
 
 
 def test_a_file_of_an_older_schema_is_refused(programs: Path, repo: Path) -> None:
@@ -432,8 +469,8 @@ def test_a_file_that_must_not_be_used_is_refused(programs: Path, file: Path, tmp
 
 
 def test_wrong_arguments_show_the_usage(programs: Path, file: Path) -> None:
-    wrong = ([], ["--fast"], ["--learn", "--binary"], ["--parts", "--binary"], ["--journal", "x"])
+    wrong = ([], ["--fast"], ["--learn", "--binary"], ["--parts", "--binary"], ["--parts", "--journal", "x"], ["--key"])
     for arguments in ([str(file)] * bool(each) + each for each in wrong):
-        done = subprocess.run([programs / "dengine_cell", *arguments], capture_output=True, text=True, check=False)
+        done = subprocess.run([programs / "dengine-cell", *arguments], capture_output=True, text=True, check=False)
         assert done.returncode == 2
-        assert done.stderr.startswith("usage: dengine_cell MODEL.ts")
+        assert done.stderr.startswith("usage: dengine-cell MODEL")

@@ -47,7 +47,8 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
-    "cmake -S tests/cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0",  # test_cpp.py builds it as it is meant
+    "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
+    "cmake --build build/cpp": "--parallel 2",
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
 }
 HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")
@@ -152,7 +153,7 @@ def type_in(command: str, desk: Path) -> None:
     elif command.startswith(CPP) and not HAS_CPP:
         assert "DENGINE_REQUIRE_CPP" not in os.environ
     elif command.startswith("python training/benchmark_export.py") and not HAS_CPP:
-        shell(smaller(command).replace("--cell build/cpp/dengine_cell", ""), desk)
+        shell(smaller(command).replace("--cell build/cpp/dengine-cell", ""), desk)
     elif not command.startswith(NOT_RUN):
         shell(smaller(command), desk)
 

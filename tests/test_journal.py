@@ -1,6 +1,7 @@
 """A cell's journal comes back into the store once, bad traces into quarantine."""
 
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from dengine.cli.export import export, import_labels
 from dengine.engine import DataEngine
 from dengine.errors import DataError
 from dengine.folds import content_hash, part_hash
-from dengine.importing import import_journal, read_journal
+from dengine.importing import import_journal
+from dengine.journals import read_journal
 from dengine.records import Reason
 
 HEAD = "# dengine 2 0123\n"
@@ -56,7 +58,7 @@ def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tm
 def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     new = make_data(10, 40, 3)
     path = write(tmp_path / "cell.csv", new.X.reshape(10, -1), new.y)
-    back = read_journal(path, TraceSpec(40, channels=3))
+    back = read_journal(path, TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
     assert [line.label for line in back] == new.y.astype(bool).tolist()
     assert {line.reason for line in back} == {Reason.NO_MODEL}
@@ -65,12 +67,12 @@ def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tm
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("1,2,3", "Expected 100 samples in line 1 of .*, got 2; a last line that was cut"),
+        ("1,2,3", "Expected 100 samples in line 1 of .*, got 2; it is damaged, or of another cell"),
         ("2" + ",1" * 100, "Expected a label of 1 or 0 in line 1 of .*, got '2'"),
         ("1,x" + ",1" * 99, "line 1 of .* are no row of numbers: .*'x'"),
         ("", "no labels"),
         (HEAD + "1,P1,verify,verify,uncertain,0,1,0,0,7", "Expected 100 samples in line 2"),
-        (HEAD + "1", "Expected 100 samples in line 2"),
+        (HEAD + "1", "The decision in line 2"),
         (
             HEAD + "1,P1,think,verify,uncertain,0,1,0,0" + ",1" * 100,
             "The decision in line 2 .*'think' is not a valid Action",
@@ -81,7 +83,7 @@ def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tm
 )
 def test_a_line_that_does_not_fit_is_named(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "cell.csv"
-    path.write_text(line)
+    path.write_text(line + "\n")
     with pytest.raises(DataError, match=message):
         read_journal(path, TraceSpec(100))
 
@@ -153,6 +155,134 @@ def test_a_journal_that_grew_adds_what_is_new(
             engine.decide(X[0])
             engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
     assert found[1] == found[3] == found[7]
+
+
+def with_crc(line: str) -> str:
+    return f"{line},{zlib.crc32(line.encode()):08x}"
+
+
+def write_lines(path: Path, X: np.ndarray, lines: list[str]) -> Path:
+    """A journal of the third form: `part` lines without their samples, of one trace after the other, and `label` lines."""
+    traces = iter(X)
+    whole = [
+        f"{line},{','.join(f'{v:.9g}' for v in next(traces))}"
+        if line.startswith("part,") and ",reject," not in line
+        else line
+        for line in lines
+    ]
+    path.write_text("\n".join(["# dengine 3 0123", *map(with_crc, whole), ""]))
+    return path
+
+
+LATE = [
+    "part,a-1,,P1,verify,verify,uncertain,0.25,0.75,5,5",
+    "part,a-2,,P2,accept,accept,certain,0.925,1,30,0",
+    "label,a-1,1",
+    "part,a-3,,,reject,reject,certain,0,0.07,0,31",
+    "label,a-2,0",
+    "part,a-4,,P4,accept,accept,certain,0.9375,1,31,0",
+    "part,a-5,,P5,accept,accept,certain,0.95,1,40,0",
+    "label,a-5,1",
+    "label,a-4,1",
+    "part,a-6,,P6,verify,verify,uncertain,0.5,1,3,0",
+]
+
+
+def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    journal = read_journal(write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100))
+    found = [(line.id, line.label, line.late) for line in journal.lines]
+    assert found == [
+        ("a-1", True, True),
+        ("a-2", None, False),  # went on, when the next part came
+        ("a-2", False, True),  # its stop
+        ("a-4", None, False),
+        ("a-5", True, False),
+        ("a-4", True, True),
+    ]
+    assert (journal.version, journal.sum, journal.cut, journal.waits) == (3, "0123", 0, False)
+
+
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_late_labels_are_imported_once_by_their_own_ids(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path, stops: Any
+) -> None:
+    path, X = new_store(data, tmp_path / "engine.db", stops=stops), make_data(9, seed=4).X
+    for again in (False, True):
+        report = import_journal(path, write_lines(tmp_path / "cell.csv", X, LATE))
+        assert (report.imported, report.known, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
+    with DataEngine.open(path) as engine:
+        held = {id_: engine.store.get_decision(id_) for id_ in ("a-1", "a-2", "a-3", "a-4", "a-5", "a-6")}
+        assert {id_: None if known is None else known.success for id_, known in held.items()} == {
+            "a-1": True,
+            "a-2": False,
+            "a-3": None,
+            "a-4": True,
+            "a-5": True,
+            "a-6": None,
+        }
+        outcomes = engine.store.outcomes()
+        assert (outcomes.accepted, outcomes.stops, outcomes.confirmed) == (3, 1, 2)
+    contrary = write_lines(tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE])
+    assert import_journal(path, contrary).contradicted == 1
+
+
+def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, store = make_data(9, seed=4).X, new_store(data, tmp_path / "engine.db")
+    third, second = write_lines(tmp_path / "3.csv", X, LATE[:9]), write_cell(tmp_path / "2.csv", X, CELL)
+    first = write(tmp_path / "1.csv", X, np.ones(9, dtype=int))
+    for path, most in ((third, 6), (second, 7), (first, 9)):
+        text = path.read_text()
+        begin = text.rindex("\n", 0, -1) + 1
+        for end in range(begin, len(text), 7 if len(text) - begin > 100 else 1):  # a number in the middle is none
+            path.write_text(text[:end])
+            journal = read_journal(path, TraceSpec(100))
+            assert (len(journal.lines), journal.cut) == (most - 1, end - begin)
+    done = CliRunner().invoke(import_labels, [str(first), "--store", store], catch_exceptions=False)
+    assert "was not finished and was left out" in " ".join(done.output.split())
+
+
+def test_any_changed_byte_of_a_line_with_a_checksum_is_found_and_named(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    path = write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE)
+    content, rng = path.read_bytes(), np.random.default_rng(0)
+    begin, lines = content.index(b"\n") + 1, content.count(b"\n")
+    for place in rng.integers(begin, len(content) - 1, 300):
+        changed = bytearray(content)
+        changed[place] ^= 1 << int(rng.integers(8))
+        number = content[:place].count(b"\n") + 1
+        path.write_bytes(bytes(changed))
+        with pytest.raises(DataError, match=rf"line ({number}|{number + 1}|{lines + 1}) of"):
+            read_journal(path, TraceSpec(100))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"# dengine 2 0123\n1,\xff,verify\n", "Expected UTF-8 in line 2"),
+        (b"# dengine 2 0123\n\0\0\0\n", "NUL byte"),
+        (b"# dengine 3 0123\n1,P1,verify\n", "begins with part or label in line 2"),
+        (b"# dengine 3 0123\nlabel,a-1,1\n", "The checksum of line 2"),
+        (b"# dengine 3 0123\n" + with_crc("label,a-1,1").encode() + b"\n", "Expected an earlier part's id"),
+        (b"# dengine 9 0123\n", "of a newer program"),
+        (b"1,2,3", "holds no labels"),
+        (b"", "holds no labels"),
+        (HEAD.encode() + b"1,P1,verify,verify,uncertain,-1,1,0,0" + b",1" * 100 + b"\n", "Expected bounds between 0 and 1"),
+        (
+            HEAD.encode() + b"1,P1,verify,verify,uncertain,0,nan,0,0" + b",1" * 100 + b"\n",
+            "Expected bounds between 0 and 1",
+        ),
+        (HEAD.encode() + b"1,P1,verify,verify,uncertain,0,1,%d,0" % 2**70 + b",1" * 100 + b"\n", "and counts in line 2"),
+        (b"1,1_0" + b",1" * 99 + b"\n", "are no row of numbers"),
+    ],
+)
+def test_what_is_no_journal_is_a_clear_error(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "cell.csv"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_journal(path, TraceSpec(100))
 
 
 def test_the_verbs_export_and_import(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:

@@ -61,6 +61,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "checks": 10,
     "forms": 9,
     "importing": 10,
+    "journals": 9,
     "export": 10,
     "experiments": 11,
     "cli": 12,

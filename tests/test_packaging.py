@@ -76,6 +76,9 @@ def test_the_wheel_has_every_module_the_types_and_the_bundled_data(wheel: Path, 
     modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
     assert modules <= names
     assert {"dengine/py.typed", "dengine/data/insertion.npz"} <= names
+    sources = {p.relative_to(repo).as_posix() for p in (repo / "dengine" / "export" / "cpp").rglob("*") if p.is_file()}
+    assert len(sources) > 10
+    assert sources <= names
     assert f"dengine-{dengine.__version__}.dist-info/licenses/LICENSE" in names
 
 

@@ -261,7 +261,7 @@ def test_a_journal_of_traces_of_other_lengths_is_read_as_the_engine_would(tmp_pa
     x = ramp(97, 2)
     path, spec = tmp_path / "cell.csv", TraceSpec(SAMPLES, channels=2, fit="pad")
     path.write_text("1," + ",".join(f"{value:.9g}" for value in x.ravel()) + "\n")
-    np.testing.assert_array_equal(read_journal(path, spec)[0].trace, as_trace(x, spec))
+    np.testing.assert_array_equal(read_journal(path, spec).lines[0].trace, as_trace(x, spec))
     for bad in (TraceSpec(SAMPLES, channels=2), TraceSpec(SAMPLES, channels=3, fit="pad")):
         with pytest.raises(DengineError, match="Expected"):
             read_journal(path, bad)

@@ -1,6 +1,6 @@
 """What the exported file costs, and that it decides as the engine does; run it on an idle machine.
 
-    python training/benchmark_export.py --data insertion --reducer conv --cell build/cpp/dengine_cell --out out/
+    python training/benchmark_export.py --data insertion --reducer conv --cell build/cpp/dengine-cell --out out/
 
 Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
 parity over every trace of the data set and random ones, bad ones and audits among them; parity while both learn from

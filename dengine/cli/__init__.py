@@ -19,7 +19,7 @@ from ..wording import without_password
 from .correcting import correct, forget, retrain, rollback, set_policy
 from .data import data
 from .explaining import explain
-from .export import export, import_labels
+from .export import export, export_cpp, import_labels, make_key
 from .history import history
 from .interrupting import end_interrupted
 from .options import example
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, history, explain, export, import_labels),
-    *(correct, forget, rollback, set_policy, retrain),
+    *(data, replay, compare, train, run, simulate, status, history, explain),
+    *(correct, forget, rollback, set_policy, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

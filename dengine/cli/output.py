@@ -91,11 +91,14 @@ def size(n_bytes: float) -> str:
 
 def imported_line(report: ImportReport, store: str) -> str:
     """What became of imported labels; what did not happen is not mentioned."""
+    left = f" Its last line, {report.cut} bytes, was not finished and was left out." if report.cut else ""
+    if report.contradicted:
+        left += f" {report.contradicted} labels say the opposite of what is there and were left out; correct them there."
     if not report.imported and not report.quarantined:
-        return f"Nothing new for {store}: all {report.known} traces were there from an earlier import."
+        return f"Nothing new for {store}: all {report.known} traces were there from an earlier import.{left}"
     bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
     known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
-    return f"Imported {report.imported} labelled traces into {store}.{bad}{known}"
+    return f"Imported {report.imported} labelled traces into {store}.{bad}{known}{left}"
 
 
 @contextmanager

@@ -9,6 +9,8 @@ from .._lazy import lazy_names
 if TYPE_CHECKING:
     from .file import read_metadata, sum_file
     from .onnx import export_onnx, load_onnx
+    from .signing import make_key
+    from .sources import export_sources
     from .torchscript import ExportedDecision, ExportedModel, export_torchscript, load_exported
 
 _WHERE = {
@@ -20,6 +22,8 @@ _WHERE = {
         "export_onnx",
         "load_onnx",
     ),
+    "signing": ("make_key",),
+    "sources": ("export_sources",),
     "torchscript": (
         "ExportedDecision",
         "ExportedModel",
@@ -32,9 +36,11 @@ __all__ = [
     "ExportedDecision",
     "ExportedModel",
     "export_onnx",
+    "export_sources",
     "export_torchscript",
     "load_exported",
     "load_onnx",
+    "make_key",
     "read_metadata",
     "sum_file",
 ]

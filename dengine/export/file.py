@@ -1,6 +1,7 @@
 """An exported file, whatever its format: what it is made from, what it says of itself, and its checksum.
 
-The checksum guards against damage, not against an adversary: whoever can change the file can change the sum.
+The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. What does is a
+signature, by `key`.
 """
 
 from __future__ import annotations
@@ -29,6 +30,16 @@ from ..model.base import Exportable
 from ..outputs import SUMS, Kind, check_output, write_output
 from ..records import Action, Reason, TraceSpec
 from .module import FIELDS, DecisionModule
+from .signing import (
+    KeyFile,
+    check_signature,
+    earlier_signatures,
+    listed,
+    read_key,
+    signature,
+    signature_file,
+    write_signatures,
+)
 
 SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
 METADATA = "dengine.json"
@@ -106,6 +117,33 @@ def _guarantee_of(rule: Any) -> str:
     return next((name for name, rules in RULES.items() if own in rules.values()), own)
 
 
+def write_export(
+    path: str | os.PathLike[str],
+    content: bytes,
+    kind: Kind,
+    force: bool = False,
+    key: KeyFile | None = None,
+    source: Exportable | None = None,
+) -> Path:
+    """`write_checked`, signed with a key, and noted in the store that the engine remembers in.
+
+    The new signature stands beside the earlier one until the file is replaced, so that one of them always fits.
+    """
+    target, secret = Path(path), None if key is None else read_key(key)
+    check_target(target, kind, force)
+    earlier = earlier_signatures(target)
+    if source is not None and source.note is not None:
+        source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
+    if secret is not None:
+        write_signatures(target, [*earlier[-1:], signature(content, secret)])
+    written = write_checked(target, content, kind, force)
+    if secret is not None:
+        write_signatures(target, [signature(content, secret)])
+    elif earlier:
+        signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
+    return written
+
+
 def check_target(path: str | os.PathLike[str], kind: Kind, force: bool) -> None:
     """ExportError where a file and its sum must not be written: before the work of an export."""
     with _as_export_error():
@@ -157,19 +195,24 @@ def sum_file(path: Path) -> Path:
     return path.with_name(path.name + ".sha256")
 
 
-def read_metadata(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a file says of itself, after checking its sum and without loading its code."""
-    return metadata_of(checked_bytes(Path(path)), Path(path))
+def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
+    """What a file says of itself, after checking its sum, and its signature by a key, and without loading its code."""
+    return metadata_of(checked_bytes(Path(path), key), Path(path))
 
 
-def checked_bytes(path: Path) -> bytes:
-    """A file's content; ExportError unless its sum file lists its sum. libtorch itself does not notice flipped bits."""
+def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
+    """A file's content; ExportError unless its sum file lists its sum, and, with a key, its signature fits.
+
+    libtorch itself does not notice flipped bits.
+    """
     _read(path, most=0)  # of the two it is the file itself that is named where both are missing
     for _ in range(TRIES):  # an export may replace file and sums between the two looks
         sums = _sums_of(path)
         content = _read(path)
         found = hashlib.sha256(content).hexdigest()
         if found in sums:
+            if key is not None:
+                check_signature(path, content, key)
             return content
         if _sums_of(path) == sums:
             break
@@ -179,8 +222,7 @@ def checked_bytes(path: Path) -> bytes:
 
 def _sums_of(path: Path) -> list[str]:
     """The sums that a sum file lists: one, or two where an export was killed between its two renames."""
-    lines = _read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace").split("\n")
-    sums = [line.split()[0] for line in lines if line.strip()]
+    sums = listed(_read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace"), path.name)
     if not sums or any(not SHA256.fullmatch(each) for each in sums):
         raise ExportError(f"{sum_file(path)} holds no SHA-256 sum; copy it again together with {path.name}.")
     return sums

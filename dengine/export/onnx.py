@@ -35,9 +35,10 @@ from ..model.module import NOVEL
 from ..outputs import ONNX
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
-from .file import METADATA, check_target, checked_bytes, checked_schema, decision_module, describe, source_of, write_checked
+from .file import METADATA, check_target, checked_bytes, checked_schema, decision_module, describe, source_of, write_export
 from .module import FIELDS
-from .torchscript import TOLERANCE, ExportedDecision
+from .signing import KeyFile
+from .torchscript import TOLERANCE, ExportedDecision, golden_trace
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 FAR = 1e9  # where an empty slot waits: no ball reaches it
@@ -48,10 +49,16 @@ EDGE = 2  # another runtime adds in another order: a reference on the ball's ver
 
 
 def export_onnx(
-    engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None, force: bool = False
+    engine_or_model: Any,
+    path: str | os.PathLike[str],
+    *,
+    trace: TraceSpec | None = None,
+    key: KeyFile | None = None,
+    force: bool = False,
 ) -> Path:
     """Write `path` and `path`.sha256: the decision of a `DataEngine` or a fitted `ModelPrediction` as ONNX.
 
+    key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
     Raises ExportError where the engine audits, its rule learns, a part came again, nothing was trained yet, the reducer or
     the interval has no module, a package is missing, onnxruntime does not decide as the model does, or `path` cannot be
     written. force : as of `export_torchscript`.
@@ -64,17 +71,21 @@ def export_onnx(
     twin = Twin(source).eval()
     metadata = describe(source) | {"format": "onnx", "learns": False}
     program = _to_onnx(twin, source.trace)
-    onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata)})
+    golden = _golden(OnnxModel(program.SerializeToString(), metadata))
+    onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
     content = program.SerializeToString()
     _check(OnnxModel(content, metadata), source.model, source.trace)
-    return write_checked(path, content, ONNX, force)
+    return write_export(path, content, ONNX, force, key, source)
 
 
-def load_onnx(path: str | os.PathLike[str]) -> OnnxModel:
-    """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used."""
+def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> OnnxModel:
+    """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used.
+
+    key : the key's file that it was signed with; it is checked first. None: no signature is asked for.
+    """
     onnx = _package("onnx")
     target = Path(path)
-    content = checked_bytes(target)
+    content = checked_bytes(target, key)
     try:
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
@@ -229,6 +240,12 @@ def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:
     if program is None:
         raise ExportError("torch gave no ONNX program; export torchscript instead.")
     return program.model_proto
+
+
+def _golden(found: OnnxModel) -> dict[str, Any]:
+    """A trace and its embedding, for a loader to check that its machine computes the same."""
+    x = golden_trace(found.trace)
+    return {"trace": x.tolist(), "embedding": found.decide(x).embedding.tolist()}
 
 
 def _check(found: OnnxModel, model: Any, spec: TraceSpec) -> None:

@@ -2,6 +2,9 @@
 
 >>> export_torchscript(engine, "model.ts")     # model.ts and model.ts.sha256
 >>> load_exported("model.ts").decide(trace)    # checked before it is loaded, ready at the first call
+
+An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files. Load only what you
+made, or what was signed with a key of yours.
 """
 
 from __future__ import annotations
@@ -26,20 +29,27 @@ from ..labels import as_success
 from ..outputs import TORCHSCRIPT
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
 from ..traces import as_trace, as_traces
-from .file import METADATA, check_target, checked_bytes, decision_module, describe, metadata_of, source_of, write_checked
+from .file import METADATA, check_target, checked_bytes, decision_module, describe, metadata_of, source_of, write_export
 from .module import METHODS
+from .signing import KeyFile
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
 
 
 def export_torchscript(
-    engine_or_model: Any, path: str | os.PathLike[str], *, trace: TraceSpec | None = None, force: bool = False
+    engine_or_model: Any,
+    path: str | os.PathLike[str],
+    *,
+    trace: TraceSpec | None = None,
+    key: KeyFile | None = None,
+    force: bool = False,
 ) -> Path:
     """Write `path` and `path`.sha256: a `DataEngine`'s decision, or a fitted `ModelPrediction`'s (without audits).
 
     An accepted part of which nothing is known yet stays with the engine: export when none is under way.
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
+    key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
     force : replace whatever file is there; by default only an earlier export is, and never a database, a folder or a link.
     Raises ExportError where nothing was trained yet, the reducer, the interval or the rule cannot be scripted, or `path`
     cannot be written: what was there is then as it was.
@@ -51,7 +61,7 @@ def export_torchscript(
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
-    return write_checked(path, _content(frozen, metadata), TORCHSCRIPT, force)
+    return write_export(path, _content(frozen, metadata), TORCHSCRIPT, force, key, source)
 
 
 def _content(module: Any, metadata: dict[str, Any]) -> bytes:
@@ -61,11 +71,16 @@ def _content(module: Any, metadata: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
+def golden_trace(spec: TraceSpec) -> NDArray[np.float32]:
+    """The trace (C, T) that a loader tries itself on."""
+    x = np.sin(np.arange(spec.channels * spec.samples, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
+    whole: NDArray[np.float32] = x if spec.limit is None else x * np.float32(0.5 * spec.limit)
+    return whole
+
+
 def _golden(module: Any, spec: TraceSpec) -> dict[str, Any]:
     """A trace and its embedding, for the loader to check that this machine computes the same."""
-    x = np.sin(np.arange(spec.channels * spec.samples, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
-    if spec.limit is not None:
-        x = x * np.float32(0.5 * spec.limit)
+    x = golden_trace(spec)
     with torch.inference_mode():
         embedding = module(torch.from_numpy(x)[None])[6][0]  # `decide` would wait for its label
     return {"trace": x.tolist(), "embedding": embedding.tolist()}
@@ -129,13 +144,13 @@ class ExportedModel:
         """Why everything is verified at present, in words; "" where it is not."""
         return SAFE_MODE[self._asked.safe_mode()]
 
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+    def save(self, path: str | os.PathLike[str], *, key: KeyFile | None = None, force: bool = False) -> Path:
         """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum.
 
-        force : as of `export_torchscript`.
+        key, force : as of `export_torchscript`.
         """
         now = {"references": self._asked.n_references(), "references_sha256": None}  # the sum is that of the first export
-        return write_checked(path, _content(self.module, self.metadata | now), TORCHSCRIPT, force)
+        return write_export(path, _content(self.module, self.metadata | now), TORCHSCRIPT, force, key)
 
 
 class FirstSchema:
@@ -171,14 +186,18 @@ def _hash_of(part: Any) -> int:
     return 0 if number is None else part_hash(number)
 
 
-def load_exported(path: str | os.PathLike[str]) -> ExportedModel:
+def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> ExportedModel:
     """Check, load, warm up. Uses one torch thread, steadier by far at these sizes.
 
-    Raises ExportError, before anything is loaded, for a file that is missing, damaged, truncated, foreign or newer, and
-    after loading where this machine does not reproduce the golden embedding.
+    An untrusted file runs as a program when it is loaded: it can read and write what you can. The checksum beside it says
+    only that it was not damaged. A signature says who made it.
+
+    key : the key's file that it was signed with; it is checked before torch sees a byte. None: no signature is asked for.
+    Raises ExportError, before anything is loaded, for a file that is missing, damaged, truncated, foreign or newer, or that
+    was not signed with the key, and after loading where this machine does not reproduce the golden embedding.
     """
     target = Path(path)
-    content = checked_bytes(target)
+    content = checked_bytes(target, key)
     metadata = metadata_of(content, target)
     torch.set_num_threads(1)
     try:

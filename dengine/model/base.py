@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -275,6 +275,7 @@ class Exportable:
     model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
     stops_all : whether silence until the next decision confirms an accepted part.
     model_version, recipe : what the file says of the engine; 0 and "" without one.
+    note : takes what is to be remembered of the export, a kind and a text, as `Store.put_event`; None: nobody remembers.
     """
 
     model: Any
@@ -284,3 +285,4 @@ class Exportable:
     stops_all: bool = False
     model_version: int = 0
     recipe: str = ""
+    note: Callable[[str, str], object] | None = None

@@ -2,13 +2,14 @@
 #pragma once
 
 #include <cctype>
-#include <cstdlib>
 #include <map>
 #include <stdexcept>
 #include <string>
 #include <string_view>
 #include <utility>
 #include <vector>
+
+#include "numbers.hpp"
 
 class Metadata {
   public:
@@ -30,10 +31,8 @@ class Metadata {
     }
 
     double number(const std::string& key) const {
-        const auto& word = text(key);
-        char* end = nullptr;
-        const double x = std::strtod(word.c_str(), &end);
-        if (word.empty() || *end != '\0') throw std::runtime_error("its description's \"" + key + "\" is no number");
+        double x = 0.0;
+        if (!parse(text(key), x)) throw std::runtime_error("its description's \"" + key + "\" is no number");
         return x;
     }
 

@@ -2,14 +2,14 @@
 #pragma once
 
 #include <bit>
-#include <charconv>
 #include <cstddef>
-#include <cstdlib>
 #include <istream>
 #include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
+
+#include "numbers.hpp"
 
 static_assert(std::endian::native == std::endian::little, "binary traces are little-endian");
 
@@ -26,6 +26,31 @@ inline std::string_view trimmed(std::string_view word) {
     return word.substr(first, word.find_last_not_of(" \t\r") - first + 1);
 }
 
+// Whether bytes are UTF-8, as far as a reader in another language asks (RFC 3629).
+inline bool is_utf8(std::string_view text) {
+    for (std::size_t i = 0; i < text.size();) {
+        const unsigned char first = text[i++];
+        const int more = first < 0x80 ? 0 : first >= 0xC2 && first < 0xE0 ? 1 : first >= 0xE0 && first < 0xF0 ? 2
+                         : first >= 0xF0 && first < 0xF5 ? 3 : -1;
+        if (more < 0) return false;
+        for (int k = 0; k < more; ++k, ++i) {
+            if (i == text.size() || (static_cast<unsigned char>(text[i]) & 0xC0) != 0x80) return false;
+            const unsigned char byte = text[i];
+            if (k == 0 && ((first == 0xE0 && byte < 0xA0) || (first == 0xED && byte > 0x9F))) return false;
+            if (k == 0 && ((first == 0xF0 && byte < 0x90) || (first == 0xF4 && byte > 0x8F))) return false;
+        }
+    }
+    return true;
+}
+
+// Whether a part's number can stand in a line: text without commas, control characters and blanks around it.
+inline bool is_part(std::string_view part) {
+    for (const unsigned char byte : part) {
+        if (byte < 0x20 || byte == 0x7F || byte == ',') return false;
+    }
+    return trimmed(part) == part && is_utf8(part);
+}
+
 // The word before the next comma, which is taken off; `more` says whether there was one.
 inline std::string_view take_word(std::string_view& line, bool& more) {
     const auto comma = line.find(',');
@@ -36,16 +61,6 @@ inline std::string_view take_word(std::string_view& line, bool& more) {
 }
 
 inline std::string quoted(std::string_view word) { return '"' + std::string(word.substr(0, 20)) + '"'; }
-
-// nan and inf are numbers here: a sensor that says so gets its reason from the model.
-inline bool parse(std::string_view word, float& out) {
-    const auto [end, error] = std::from_chars(word.data(), word.data() + word.size(), out);
-    if (error == std::errc::result_out_of_range) {
-        out = std::strtof(std::string(word).c_str(), nullptr);  // an infinity, or next to zero
-        return true;
-    }
-    return error == std::errc() && end == word.data() + word.size();
-}
 
 // How many samples a trace has: so many, or where the model fits other lengths, any number in each channel.
 struct Shape {
@@ -66,6 +81,7 @@ inline void parse_line(std::string_view line, Columns columns, const Shape& shap
     input = {};
     bool more = true;
     if (columns.part) input.part = take_word(line, more);
+    if (!is_part(input.part)) input.fault = "expected a part's number in UTF-8 without control characters";
     if (columns.label && more) {
         const auto word = take_word(line, more);
         if (word != "" && word != "0" && word != "1") {
@@ -87,16 +103,6 @@ inline void parse_line(std::string_view line, Columns columns, const Shape& shap
     if (input.fault.empty() && !shape.takes(input.samples.size())) {
         input.fault = "expected " + std::to_string(shape.size()) + " samples, got " + std::to_string(input.samples.size());
     }
-}
-
-// The next line that is not empty; false at the end.
-inline bool next_line(std::istream& in, Columns columns, const Shape& shape, Input& input) {
-    for (std::string line; std::getline(in, line);) {
-        if (trimmed(line).empty()) continue;
-        parse_line(line, columns, shape, input);
-        return true;
-    }
-    return false;
 }
 
 // The next block of `expected` float32; false at the end.

@@ -1,4 +1,5 @@
-// SHA-256 of a block of bytes. Source: FIPS 180-4, sections 4.1.2, 4.2.2, 5.1.1 and 6.2; names as there.
+// SHA-256 of a block of bytes, and HMAC over it. Sources: FIPS 180-4, sections 4.1.2, 4.2.2, 5.1.1 and 6.2, and FIPS 198-1,
+// section 4; names as there.
 #pragma once
 
 #include <array>
@@ -44,8 +45,8 @@ inline void compress(State& H, const unsigned char* block) {
     for (int i = 0; i < 8; ++i) H[i] += working[i];
 }
 
-// The sum as 64 lower-case hexadecimal digits, as `sha256sum` prints it.
-inline std::string hex(std::string_view bytes) {
+// The sum, 32 bytes.
+inline std::string digest(std::string_view bytes) {
     State H = {0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a, 0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
     const auto* data = reinterpret_cast<const unsigned char*>(bytes.data());
     const std::size_t whole = bytes.size() / 64 * 64;
@@ -59,9 +60,41 @@ inline std::string hex(std::string_view bytes) {
 
     std::string out;
     for (const auto word : H) {
-        for (int shift = 28; shift >= 0; shift -= 4) out += "0123456789abcdef"[word >> shift & 0xf];
+        for (int shift = 24; shift >= 0; shift -= 8) out += static_cast<char>(word >> shift & 0xff);
     }
     return out;
+}
+
+// Two lower-case hexadecimal digits a byte, as `sha256sum` prints them.
+inline std::string in_hex(std::string_view bytes) {
+    std::string out;
+    for (const unsigned char byte : bytes) {
+        out += "0123456789abcdef"[byte >> 4];
+        out += "0123456789abcdef"[byte & 0xf];
+    }
+    return out;
+}
+
+inline std::string hex(std::string_view bytes) { return in_hex(digest(bytes)); }
+
+// HMAC-SHA256 as 64 hexadecimal digits.
+inline std::string hmac(std::string_view key, std::string_view text) {
+    std::string K0 = key.size() > 64 ? digest(key) : std::string(key);
+    K0.resize(64, '\0');
+    std::string inner, outer;
+    for (const char byte : K0) {
+        inner += static_cast<char>(byte ^ 0x36);
+        outer += static_cast<char>(byte ^ 0x5c);
+    }
+    return hex(outer + digest(inner.append(text)));
+}
+
+// Whether two texts are alike, in a time that does not tell where they differ.
+inline bool same(std::string_view one, std::string_view other) {
+    if (one.size() != other.size()) return false;
+    unsigned char differences = 0;
+    for (std::size_t i = 0; i < one.size(); ++i) differences |= static_cast<unsigned char>(one[i] ^ other[i]);
+    return differences == 0;
 }
 
 }  // namespace sha256
