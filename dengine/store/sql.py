@@ -44,7 +44,7 @@ from .records import (
     summary,
 )
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
+from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_labelled, unpack, version_row
 from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
 
 
@@ -196,13 +196,7 @@ class SqlStore:
             newest = connection.execute(ask.newest_query(self.cell_id, limit)).all()[::-1]
             first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
             rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
-            traces = read_traces(rows, len(newest))
-        return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64),
-            traces=traces,
-            labels=np.array([row.success for row in newest], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-        )
+            return read_labelled(newest, rows)
 
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
