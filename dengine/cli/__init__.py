@@ -40,7 +40,7 @@ class Verbs(click.Group):
             return super().invoke(ctx)
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
-        except (DengineError, OSError) as error:
+        except (DengineError, OSError, UnicodeError) as error:  # the last of a name that no file system has
             raise click.ClickException(without_password(" ".join(str(error).split()))) from error
         except click.ClickException as error:
             # click repeats the words that it was called with.

@@ -43,7 +43,7 @@ from .records import (
 from .sql_history import SqlHistory, replacing
 from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, label_row, read_decision, read_evidence, read_traces, unpack
+from .sql_rows import CHUNK, chunks, label_row, read_decision, read_evidence, read_labelled, unpack
 from .sql_tables import LABEL, SCHEMA_KEY, SETTING
 from .sql_views import SqlViews
 
@@ -192,13 +192,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
             begin, end = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
             rows = connection.execute(ask.trace_query(self.cell_id, begin, end).execution_options(yield_per=CHUNK))
             known = {row.seq for row in newest}  # the forgotten are not among them
-            traces = read_traces((row for row in rows if row.seq in known), len(newest))
-        return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64),
-            traces=traces,
-            labels=np.array([row.success for row in newest], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-        )
+            return read_labelled(newest, (row for row in rows if row.seq in known))
 
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""

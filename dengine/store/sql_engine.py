@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,10 @@ def _unusable(url: str, said: str) -> StoreError:
 
 def _set_pragmas(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # `_begin` says when a transaction starts, not the driver
-    connection.execute("PRAGMA journal_mode = WAL")
+    try:
+        connection.execute("PRAGMA journal_mode = WAL")
+    except UnicodeDecodeError as error:  # SQLite quotes a damaged table's name in what it says
+        raise sqlite3.DatabaseError("the database is malformed") from error
     connection.execute("PRAGMA synchronous = FULL")  # a returned commit survives lost power; NORMAL would not
 
 

@@ -15,7 +15,7 @@ from ..archives import read_archive
 from ..errors import DataError, StoreError
 from ..records import Action, Reason, RetrainReport, Source
 from .checks import mixed_shapes
-from .records import DecidedTrace, Event, Evidence, NewLabel, StoredDecision, as_label
+from .records import DecidedTrace, Event, Evidence, Labelled, NewLabel, StoredDecision, as_label
 
 CHUNK = 500  # rows sent or fetched at a time
 
@@ -128,6 +128,19 @@ def read_evidence(rows: Sequence[Any]) -> Evidence:
         success=np.array([row.success for row in rows], dtype=bool),
         novel=np.array([row.reason == Reason.NOVEL for row in rows], dtype=bool),
         silent=np.array([row.silent for row in rows], dtype=np.int64),
+    )
+
+
+def read_labelled(newest: Sequence[Any], traces: Iterable[Any]) -> Labelled:
+    """Read rows of `label`, newest last, and those of their traces. StoreError for a label that a damaged file has made."""
+    labels = [row.success for row in newest]
+    if not all(isinstance(label, bool) for label in labels):
+        raise StoreError("Expected labels that are True or False, found another: the store is damaged; restore a copy.")
+    return Labelled(
+        seq=np.array([row.seq for row in newest], dtype=np.int64),
+        traces=read_traces(traces, len(newest)),
+        labels=np.array(labels, dtype=np.int8),
+        hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
     )
 
 
