@@ -20,7 +20,7 @@ GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.arra
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
 NONE = [
     *(100, -1, 255, 2**70, 0.5, 1.0000001, float("nan"), float("inf"), 1j, None, "0", "1", "NG", "True", b"\x01", ""),
-    *(np.array([1]), np.array([]), np.array("1"), np.nan, np.float16("nan"), [True], (), {}, object(), torch.tensor(1)),
+    *(np.array([1]), np.array([]), np.array("1"), np.nan, np.float16("nan"), [True], (), {}, {1}, torch.tensor(1)),
 ]
 
 
@@ -196,7 +196,7 @@ UNSTORABLE = [
     *({"model_version": value} for value in (2**63, -1)),
     *({"action": value} for value in ("verify!", None, 0)),
     *({"reason": value} for value in ("because", None)),
-    *({"embedding": value} for value in ("z", ((object(),),), (("a",),), (1.0, 2.0))),
+    *({"embedding": value} for value in ("z", (({1},),), (("a",),), (1.0, 2.0))),
     {"audit": 2},
 ]
 
