@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import StoreError
 from ..records import Action, Decision, Reason, Source
 from .records import DecidedTrace, NewLabel
 
@@ -59,11 +60,17 @@ def to_bytes(record: Record) -> bytes:
 
 
 def from_bytes(blob: bytes) -> Record:
-    """Read what `to_bytes` wrote."""
-    (length,) = LENGTH.unpack_from(blob)
-    text_end = LENGTH.size + length
-    about = json.loads(blob[LENGTH.size : text_end])
-    return _READERS[about["kind"]](about, blob[text_end:])
+    """Read what `to_bytes` wrote; StoreError for anything else, which its sum says was written so."""
+    try:
+        (length,) = LENGTH.unpack_from(blob)
+        text_end = LENGTH.size + length
+        about = json.loads(blob[LENGTH.size : text_end])
+        return _READERS[about["kind"]](about, blob[text_end:])
+    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StoreError(
+            f"Expected a record of a journal, got what cannot be read ({error}); open the store with the dengine that wrote "
+            "it."
+        ) from error
 
 
 def _framed(about: dict[str, Any], rest: bytes = b"") -> bytes:

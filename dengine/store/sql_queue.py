@@ -203,8 +203,12 @@ class SqlDatabase(SqlConnections):
 
     def _close_at_exit(self) -> None:
         """Write what a program that forgot to close has queued; a fork of it has nothing of its own."""
-        if os.getpid() == self._pid:
+        if os.getpid() != self._pid:
+            return
+        try:
             self.close()
+        except StoreError as error:  # an engine has put into its journal what is missing here
+            log.warning("a store was left open at the end of the program: %s", error)
 
 
 def _nothing(connection: sa.Connection) -> None:

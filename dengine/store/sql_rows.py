@@ -134,7 +134,7 @@ def read_evidence(rows: Sequence[Any]) -> Evidence:
 def read_labelled(newest: Sequence[Any], traces: Iterable[Any]) -> Labelled:
     """Read rows of `label`, newest last, and those of their traces. StoreError for a label that a damaged file has made."""
     labels = [row.success for row in newest]
-    if not all(isinstance(label, bool) for label in labels):
+    if not all(label in (0, 1) for label in labels):
         raise StoreError("Expected labels that are True or False, found another: the store is damaged; restore a copy.")
     return Labelled(
         seq=np.array([row.seq for row in newest], dtype=np.int64),

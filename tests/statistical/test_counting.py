@@ -106,10 +106,12 @@ def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
-    def train_on(self: Any, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: Any) -> int:
+    def train_on(
+        self: Any, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: Any, least: int = 0
+    ) -> int:
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
         heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
-        steps = logistic._interleave(heads, max_iter, stop)
+        steps = logistic._interleave(heads, max_iter, stop, least)
         new, old, base = (
             np.mean([f(h) for h in heads])
             for f in (lambda h: h.leave_one_out_loss(), lambda h: h.first_loss, lambda h: h.base_rate_loss())

@@ -1,0 +1,117 @@
+"""Fault by fault: what is lost, what is decided wrongly, what reaches the cell, and how long it waits.
+
+    python training/benchmark_faults.py --trials 3 --kills 20
+    . .ci/postgres.sh && python training/benchmark_faults.py --kills 200 --others 100 --postgres "$DENGINE_TEST_POSTGRES"
+
+--program names a built dengine-cell, whose journal is then tried too (`dengine export-cpp`). A trial of a fault plays a
+cell before, in and after it, opens the store again, and compares labels with what was acknowledged and decisions with those
+of the engine before. Exit code 1 if anything was lost, decided otherwise, or raised.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import logging
+import shutil
+import sys
+import tempfile
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+from faults import inputs, kills, processes, stores
+from faults.harness import Outcome, Place
+from rich.console import Console
+from rich.table import Table
+
+Fault = Callable[[Outcome, Place], None]
+
+
+def title(fault: Fault) -> str:
+    """A fault in words: its docstring's first sentence."""
+    return (fault.__doc__ or "").split(".")[0].split(":")[0]
+
+
+def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Console) -> Outcome:
+    """Inject a fault so often, each time in a place of its own."""
+    outcome = Outcome()
+    for _ in range(trials):
+        try:
+            fault(outcome, place())
+        except Exception as error:  # the trial itself ended: that is counted, and the next fault is tried
+            outcome.tell(error)
+    for text in outcome.told[:3]:
+        console.print(f"  {text}", style="red", highlight=False)
+    return outcome
+
+
+def killing(of: Callable[..., None], child: Callable[..., None], words: str, times: int) -> Fault:
+    """Kills as a fault."""
+    fault = functools.partial(of, times=times) if child is None else functools.partial(of, times=times, child=child)
+    fault.__doc__ = words
+    return fault
+
+
+def faults(arguments: argparse.Namespace) -> list[tuple[str, Fault, int]]:
+    """Where, what, and how many trials."""
+    found = [("SQLite", each, arguments.trials) for each in (*stores.ON_SQLITE, *inputs.ON_SQLITE, *processes.ON_SQLITE)]
+    found += [
+        ("SQLite", killing(kills.kill_cells, kills.cell, "SIGKILL of the cell", arguments.kills), 1),
+        ("SQLite", killing(kills.kill_cells, kills.often, "SIGKILL, mostly as a version is stored", arguments.others), 1),
+        ("SQLite", killing(kills.kill_cells, kills.in_outage, "SIGKILL while the store is locked", arguments.others), 1),
+        ("SQLite", killing(kills.kill_imports, None, "SIGKILL of an import", arguments.others), 1),
+        ("SQLite", killing(kills.kill_exports, None, "SIGKILL of an export", arguments.others), 1),
+    ]
+    if arguments.program is not None:
+        journal = functools.partial(kills.kill_programs, times=arguments.others, program=arguments.program)
+        journal.__doc__ = "SIGKILL of the C++ program"
+        found.append(("C++", journal, 1))
+    if arguments.postgres:
+        found += [("PostgreSQL", each, arguments.trials) for each in stores.ON_POSTGRES]
+        found.append(("PostgreSQL", killing(kills.kill_cells, kills.cell, "SIGKILL of the cell", arguments.kills), 1))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--trials", type=int, default=3, help="of each fault but the kills")
+    parser.add_argument("--kills", type=int, default=20, help="of the cell")
+    parser.add_argument(
+        "--others", type=int, default=10, help="of a version's commit, an outage, imports, exports, programs"
+    )
+    parser.add_argument("--postgres", default="", metavar="URL", help="a server on which cells may be made")
+    parser.add_argument("--program", type=Path, help="a built dengine-cell")
+    parser.add_argument("--only", default="", help="faults whose words hold this")
+    parser.add_argument("--out", type=Path, help="write the table there, as Markdown")
+    arguments = parser.parse_args()
+    logging.disable(logging.CRITICAL)  # faults are what is asked for here
+    console, folder = Console(), Path(tempfile.mkdtemp(prefix="dengine-faults-"))
+    columns = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait")
+    rows = []
+    for where, fault, trials in faults(arguments):
+        if arguments.only not in title(fault):
+            continue
+        url = arguments.postgres if where == "PostgreSQL" else ""
+        console.print(f"{where}: {title(fault)}", highlight=False)
+
+        def place(url: str = url) -> Place:
+            name = uuid.uuid4().hex[:12]
+            return Place(url, name) if url else Place(str(folder / f"{name}.db"))
+
+        seen = tried(fault, place, trials, console)
+        counts = (seen.injected, seen.labels, seen.lost, seen.wrong, seen.raised)
+        rows.append((where, title(fault), *map(str, counts), f"{1000 * seen.longest:.0f} ms" if seen.longest else "-"))
+    shutil.rmtree(folder)
+    table = Table(*columns)
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+    if arguments.out is not None:
+        lines = ["| " + " | ".join(row) + " |" for row in (columns, ["---"] * len(columns), *rows)]
+        arguments.out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    sys.exit(any(row[4:7] != ("0", "0", "0") for row in rows))
+
+
+if __name__ == "__main__":
+    main()
