@@ -35,6 +35,7 @@ class ModelVersions:
         self.answering: EngineModel | None = None
         self.version, self.new_labels = 0, 0
         self.store_waiting: Callable[[], None] = _nothing_waits
+        self._newest = 0  # number that a version ever had; after damage an earlier one may answer
         self._news: RetrainReport | None = None
 
     @property
@@ -46,6 +47,7 @@ class ModelVersions:
         """Go on from the store."""
         resumed = resume(self.store, self.template, self.retrainer.window)
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
+        self._newest = max((report.version for report in self.store.retrains()), default=0)
 
     def reference_point(self, known: StoredDecision) -> Point | None:
         """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
@@ -108,7 +110,8 @@ class ModelVersions:
         if model is not None:
             model.prepare_safely(self.newest)
             self.retrainer.window.catch_up(model, int(seq[-1]))  # labels that came in meanwhile are in the new version
-            self.answering, self.version = model, self.version + 1  # one reference is swapped
+            self._newest += 1
+            self.answering, self.version = model, self._newest  # one reference is swapped
         report = RetrainReport(
             version=self.version,
             seconds=self.clock() - trained.begin,  # until the version answers; storing it comes on top

@@ -8,6 +8,8 @@ from .._lazy import lazy_names
 
 if TYPE_CHECKING:
     from .base import Store, open_store
+    from .history import HistoryReport, verify_history
+    from .kept_versions import StoredVersion
     from .memory import MemoryStore
     from .records import AddedPoints, Event, Evidence, Labelled, ModelVersion, NewLabel, Outcomes, StoredDecision
     from .sql import SqlStore
@@ -17,6 +19,8 @@ _WHERE = {
         "Store",
         "open_store",
     ),
+    "history": ("HistoryReport", "verify_history"),
+    "kept_versions": ("StoredVersion",),
     "memory": ("MemoryStore",),
     "records": (
         "AddedPoints",
@@ -35,6 +39,7 @@ __all__ = [
     "AddedPoints",
     "Event",
     "Evidence",
+    "HistoryReport",
     "Labelled",
     "MemoryStore",
     "ModelVersion",
@@ -43,7 +48,9 @@ __all__ = [
     "SqlStore",
     "Store",
     "StoredDecision",
+    "StoredVersion",
     "open_store",
+    "verify_history",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _WHERE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -23,6 +23,7 @@ from .checks import (
     check_state,
     duplicate_id,
 )
+from .kept_versions import KEEP, StoredVersion, keeps_state, not_kept
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
@@ -72,7 +73,9 @@ class MemoryStore:
         self._label_of: dict[str, _Label] = {}
         self._train: list[_Label] = []  # not quarantined
         self._retrains: list[RetrainReport] = []
+        self._retrained: list[StoredVersion] = []
         self._version: ModelVersion | None = None
+        self._states: dict[int, ModelVersion] = {}  # those that `keeps_state` keeps
         self._events: list[Event] = []
         self._silent = 0
         self._kinds: Counter[tuple[Action, Reason, bool]] = Counter()
@@ -174,18 +177,31 @@ class MemoryStore:
         return np.arange(first, first + len(given), dtype=np.int64)
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Record a retrain; only the newest accepted state is kept."""
+        """Record a retrain; of older versions few keep their states, as in a database."""
         copies = check_state(report, state)
         self._retrains.append(report)
+        n_bytes = sum(values.nbytes for values in (copies or {}).values())
+        kept = report.accepted and copies is not None
+        listed = StoredVersion(report.version, self._clock(), report.accepted, report.reason, n_bytes, kept)
+        self._retrained.append(listed)
         if report.accepted and copies is not None:
             self._version = ModelVersion(report.version, int(last_seq), copies)
+            held = self._states | {report.version: self._version}
+            self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version, with arrays of its own."""
-        last = self._version
-        if last is None:
-            return None
-        return ModelVersion(last.version, last.last_seq, {name: values.copy() for name, values in last.state.items()})
+        return None if self._version is None else _copied(self._version)
+
+    def load_version(self, version: int) -> ModelVersion:
+        """Return an accepted version by its number, with arrays of its own. StoreError where its state is not kept."""
+        if version not in self._states:
+            raise not_kept(version, self._states)
+        return _copied(self._states[version])
+
+    def versions(self) -> list[StoredVersion]:
+        """Return every retrain, oldest first, and whether its state is kept."""
+        return [row if not row.kept or row.version in self._states else _thinned(row) for row in self._retrained]
 
     def retrains(self) -> list[RetrainReport]:
         return list(self._retrains)
@@ -256,3 +272,11 @@ class MemoryStore:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _copied(held: ModelVersion) -> ModelVersion:
+    return replace(held, state={name: values.copy() for name, values in held.state.items()})
+
+
+def _thinned(row: StoredVersion) -> StoredVersion:
+    return replace(row, n_bytes=0, kept=False)

@@ -13,24 +13,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from ..errors import StoreError
-from ..records import Decision, RetrainReport, Source
+from ..records import Decision, Source
 from . import sql_queries as ask
-from .checks import as_channels, as_hash, as_part, as_text, check_import, check_parts, check_state, duplicate_id
+from .checks import as_channels, as_hash, as_part, as_text, check_import, check_parts, duplicate_id
+from .kept_versions import KEEP, check_keep
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
     DecidedTrace,
     Event,
     Evidence,
-    Labelled,
-    ModelVersion,
     NewLabel,
     Outcomes,
     StoredDecision,
@@ -43,16 +42,23 @@ from .records import (
     summary,
 )
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
-from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_rows import chunks, label_row, read_decision, read_evidence, unpack
+from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING
+from .sql_traces import SqlTraces, check_trace
+from .sql_versions import SqlVersions
+
+if TYPE_CHECKING:
+    from .history import HistoryReport
 
 
-class SqlStore:
+class SqlStore(SqlVersions, SqlTraces):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
+    keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
+        None: all keep them. A retrain itself stays listed for ever.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may
     open one cell: label numbers stay unique and increasing. Their labels then mix, and neither engine learns of
@@ -63,13 +69,21 @@ class SqlStore:
     The queue holds 64 MB of traces; beyond that `put_decision` writes them itself, or says that it cannot.
     """
 
-    def __init__(self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        url: str,
+        cell_id: str = "cell",
+        clock: Callable[[], float] = time.time,
+        *,
+        keep_versions: int | None = KEEP,
+    ) -> None:
         """Open or create the store, and start its writer thread."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
+        self.keep_versions = check_keep(keep_versions)
         self._clock = clock
-        self._database = SqlDatabase(str(url), cell_id)
+        self._database = SqlDatabase(str(url), cell_id, clock)
 
     # Settings
 
@@ -111,12 +125,18 @@ class SqlStore:
         self._database.flush()
 
     def get_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision with its trace, queued ones included; None where it is unknown."""
+        """Return the decision with its trace, queued ones included; None where it is unknown.
+
+        StoreError where the trace is not as it was stored.
+        """
         item = self._database.queued(decision_id)
         if item is not None:
             return stored_decision(item)
         rows = self._read(ask.decision_query(self.cell_id, decision_id))
-        return read_decision(rows[0]) if rows else None
+        if not rows:
+            return None
+        check_trace(rows[0], self._database.name)
+        return read_decision(rows[0])
 
     # Labels
 
@@ -189,20 +209,6 @@ class SqlStore:
             if known is not None:
                 raise duplicate_id(known.id)
 
-    def labelled(self, limit: int | None = None) -> Labelled:
-        """Return the newest `limit` labelled traces, oldest first; read along the index `label_training`."""
-        with self._database.transaction(write=False) as connection:
-            newest = connection.execute(ask.newest_query(self.cell_id, limit)).all()[::-1]
-            first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
-            traces = read_traces(rows, len(newest))
-        return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64),
-            traces=traces,
-            labels=np.array([row.success for row in newest], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-        )
-
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
         rows = self._read(ask.points_query(self.cell_id, int(seq), int(model_version)))
@@ -232,29 +238,6 @@ class SqlStore:
         with self._database.transaction(write=False) as connection:
             return connection.execute(query).all()
 
-    # Model versions
-
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Commit a retrain; a dropped candidate has no state."""
-        row = version_row(self.cell_id, report, int(last_seq), self._clock(), check_state(report, state))
-
-        def record(connection: sa.Connection) -> None:
-            retrain = self._database.next_number(connection, VERSION.c.retrain)
-            connection.execute(sa.insert(VERSION), row | {"retrain": retrain})
-
-        self._database.write(record)
-
-    def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version."""
-        rows = self._read(ask.version_query(self.cell_id))
-        if not rows:
-            return None
-        return ModelVersion(rows[0].version, rows[0].last_seq, from_npz(rows[0].state, self._database.name))
-
-    def retrains(self) -> list[RetrainReport]:
-        """Return every retrain, oldest first."""
-        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self.cell_id))]
-
     # Events
 
     def put_event(self, kind: str, text: str) -> None:
@@ -267,11 +250,23 @@ class SqlStore:
 
         self._database.write(log)
 
+    def _note(self, kind: str, text: str) -> None:
+        """Commit an event, unless one of these very words is there."""
+        if not self._read(ask.said_query(self.cell_id, as_text(kind), as_text(text))):
+            self.put_event(kind, text)
+
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest `limit` events, oldest first."""
         return [Event(*row) for row in self._read(ask.event_query(self.cell_id, limit))[::-1]]
 
     # Overview
+
+    def verify(self, expect: str | None = None) -> HistoryReport:
+        """Check this cell's history against its ledger; what is queued is written first. See `verify_history`."""
+        from .history import verify_history
+
+        self.flush()
+        return verify_history(self._database.url, self.cell_id, expect)
 
     def status(self) -> dict[str, Any]:
         """Count decisions, labels and versions, and show the newest events; what is queued is written first."""

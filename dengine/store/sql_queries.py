@@ -21,7 +21,8 @@ def decision_query(cell_id: str, decision_id: str) -> Query:
     """A decision with its trace, and with its label where it has one."""
     mine = (DECISION.c.cell_id == cell_id) & (DECISION.c.id == decision_id)
     traces = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
-    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], LABEL.c.success, LABEL.c.source)
+    stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
+    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], *stored, LABEL.c.success, LABEL.c.source)
     return sa.select(*columns).select_from(DECISION.join(TRACE, traces).outerjoin(LABEL, LABEL_OF_DECISION)).where(mine)
 
 
@@ -33,7 +34,7 @@ def held_query(cell_id: str, ids: Sequence[str]) -> Query:
 
 def newest_query(cell_id: str, limit: int | None) -> Query:
     """The newest labels that train, newest first, without their traces; along the index `label_training`."""
-    query = sa.select(*LABEL.c["seq", "success", "content_hash"])
+    query = sa.select(*LABEL.c["seq", "success", "content_hash", "decision_id"])
     query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false())
     return query.order_by(LABEL.c.seq.desc()).limit(limit)
 
@@ -41,7 +42,7 @@ def newest_query(cell_id: str, limit: int | None) -> Query:
 def trace_query(cell_id: str, first: int, last: int) -> Query:
     """The traces of the labels `first` to `last` that train, oldest first."""
     same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
-    query = sa.select(*TRACE.c["channels", "samples", "data"]).select_from(LABEL.join(TRACE, same))
+    query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same))
     mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
     return query.where(mine, LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
 
@@ -94,11 +95,30 @@ def source_query(cell_id: str) -> Query:
     return query.where(LABEL.c.cell_id == cell_id).group_by(LABEL.c.source)
 
 
-def version_query(cell_id: str) -> Query:
-    """The newest accepted version."""
-    query = sa.select(*VERSION.c["version", "last_seq", "state"])
+def version_query(cell_id: str, retrain: int) -> Query:
+    """An accepted version with its state."""
+    query = sa.select(*VERSION.c["version", "last_seq", "state", "state_sum"])
+    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.retrain == retrain)
+
+
+def accepted_query(cell_id: str) -> Query:
+    """The accepted versions, newest first, and whether each has its state."""
+    query = sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
     query = query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true())
-    return query.order_by(VERSION.c.retrain.desc()).limit(1)
+    return query.order_by(VERSION.c.retrain.desc())
+
+
+def held_states_query(cell_id: str) -> Query:
+    """The accepted versions that have their states."""
+    query = sa.select(*VERSION.c["retrain", "version"])
+    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true(), VERSION.c.state.is_not(None))
+
+
+def versions_query(cell_id: str) -> Query:
+    """Every retrain, oldest first, with the size of its state, NULL where it has none."""
+    size = sa.func.length(VERSION.c.state).label("n_bytes")
+    query = sa.select(*VERSION.c["version", "time", "accepted", "reason"], size)
+    return query.where(VERSION.c.cell_id == cell_id).order_by(VERSION.c.retrain)
 
 
 def retrain_query(cell_id: str) -> Query:
@@ -111,3 +131,9 @@ def event_query(cell_id: str, limit: int | None) -> Query:
     """The newest events, newest first, with the fields of `Event`."""
     query = sa.select(*EVENT.c["number", "time", "kind", "text"]).where(EVENT.c.cell_id == cell_id)
     return query.order_by(EVENT.c.number.desc()).limit(limit)
+
+
+def said_query(cell_id: str, kind: str, text: str) -> Query:
+    """Whether an event of these words is there."""
+    said = (EVENT.c.cell_id == cell_id) & (EVENT.c.kind == kind) & (EVENT.c.text == text)
+    return sa.select(EVENT.c.number).where(said).limit(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from ..errors import StoreError
 from .checks import duplicate_id
 from .records import DecidedTrace
 from .sql_engine import advice, make_engine
+from .sql_ledger import LedgerEntry, chain_writes
 from .sql_rows import chunks, decision_row, trace_row
 from .sql_tables import DECISION, SCHEMA_KEY, SETTING, TRACE, prepare_tables
 
@@ -30,16 +32,20 @@ class SqlDatabase:
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose decisions these are.
-    name : the URL without its password, for errors.
+    clock : the time in seconds that entries of the ledger are stamped with.
+    name : the URL without its password, for errors.  url : with it, to connect again.
     failures : how many writes failed so far.
     """
 
-    def __init__(self, url: str, cell_id: str) -> None:
+    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time) -> None:
         """Open or create the database, and start its writer thread."""
         self.cell_id = cell_id
         self.failures = 0
+        self._clock = clock
         self._engine = make_engine(url)
+        chain_writes(self._engine)
         self.name = self._engine.url.render_as_string(hide_password=True)
+        self.url = self._engine.url.render_as_string(hide_password=False)
         self._queue: dict[str, DecidedTrace] = {}
         self._queue_bytes = 0
         self._doubtful = False  # the last write failed, and may have been committed all the same
@@ -76,9 +82,12 @@ class SqlDatabase:
         """Begin a transaction that is committed at its end, or rolled back by an error."""
         self._check_open()
         with self._told("write to" if write else "read", write), self._engine.connect() as plain:
-            connection = plain.execution_options(dengine_write=write)
+            entry = LedgerEntry(self.cell_id, self._clock) if write else None
+            connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
             with connection.begin():
                 yield connection
+                if entry is not None:
+                    entry.append(connection)  # chains what the transaction added
 
     def write(self, work: Callable[[sa.Connection], T]) -> T:
         """Commit the queued decisions and `work` in one transaction."""

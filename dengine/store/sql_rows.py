@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .checks import mixed_shapes
 from .records import DecidedTrace, Evidence, NewLabel, StoredDecision
 
 CHUNK = 500  # rows sent or fetched at a time
@@ -123,18 +122,6 @@ def read_evidence(rows: Sequence[Any]) -> Evidence:
         novel=np.array([row.reason == Reason.NOVEL for row in rows], dtype=bool),
         silent=np.array([row.silent for row in rows], dtype=np.int64),
     )
-
-
-def read_traces(rows: Iterable[Any], n: int) -> NDArray[np.float32]:
-    """Read n rows of `trace` as (n, C, T), one at a time; (0, 0, 0) where there is none."""
-    traces = np.zeros((0, 0, 0), dtype=np.float32)
-    for i, row in enumerate(rows):
-        if i == 0:
-            traces = np.empty((n, row.channels, row.samples), dtype=np.float32)
-        if (row.channels, row.samples) != traces.shape[1:]:
-            raise mixed_shapes({traces.shape[1:], (row.channels, row.samples)})
-        traces[i] = unpack_trace(row)
-    return traces
 
 
 def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
