@@ -51,6 +51,7 @@ HEAVY = {  # at the top of a module only in those dedicated to it, which are the
     "matplotlib": ("experiments.figures",),
     "sqlalchemy": (
         "store.cell_history",
+        "store.dump",
         "store.history",
         "store.migrations",
         "store.migrations.versions.v0001_schema_1",

@@ -18,6 +18,7 @@ from ..errors import DengineError
 from .data import data
 from .export import export, import_labels
 from .interrupting import end_interrupted
+from .keeping import dump, verify
 from .options import example
 from .replaying import compare, replay
 from .running import run
@@ -63,5 +64,5 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (data, replay, compare, train, run, simulate, status, verify, dump, export, import_labels):
     main.add_command(verb)

@@ -8,6 +8,7 @@ from .._lazy import lazy_names
 
 if TYPE_CHECKING:
     from .base import Store, open_store
+    from .dump import Dump, dump_store
     from .history import HistoryReport, verify_history
     from .kept_versions import StoredVersion
     from .memory import MemoryStore
@@ -19,6 +20,7 @@ _WHERE = {
         "Store",
         "open_store",
     ),
+    "dump": ("Dump", "dump_store"),
     "history": ("HistoryReport", "verify_history"),
     "kept_versions": ("StoredVersion",),
     "memory": ("MemoryStore",),
@@ -37,6 +39,7 @@ _WHERE = {
 
 __all__ = [
     "AddedPoints",
+    "Dump",
     "Event",
     "Evidence",
     "HistoryReport",
@@ -49,6 +52,7 @@ __all__ = [
     "Store",
     "StoredDecision",
     "StoredVersion",
+    "dump_store",
     "open_store",
     "verify_history",
 ]

@@ -10,6 +10,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 START = bytes(32)  # what the first entry of a cell follows
@@ -22,22 +23,45 @@ def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
     The same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no booleans), NaN is nothing and -0.0
     is 0.0 (SQLite keeps neither).
     """
-    sum_ = hashlib.sha256(b"%s\n" % table.encode())
-    sum_.update(b"".join(_piece(name, row[name]) for name in sorted(row) if name not in APART))
-    return sum_.digest()
+    pieces = [table.encode(), b"\n"]
+    for name, begin in _columns(tuple(row)):  # the commonest kinds in line: a thousand rows a second pass here
+        value = row[name]
+        kind = type(value)
+        if value is None or value != value:
+            continue
+        if kind is int or kind is bool:
+            pieces.append(b"%bi%d;" % (begin, value))
+        elif kind is str:
+            data = value.encode("utf-8", "surrogatepass")  # never raises; two texts never share their bytes
+            pieces += (b"%bs%d:" % (begin, len(data)), data)
+        elif kind is float:
+            pieces += (begin, b"f", _DOUBLE(value + 0.0))
+        elif kind is bytes:
+            pieces += (b"%bb%d:" % (begin, len(value)), value)
+        else:
+            raise TypeError(f"Expected a plain value of column {name!r}, got {kind.__name__}; see `plain_row`.")
+    return hashlib.sha256(b"".join(pieces)).digest()
 
 
-def _piece(name: str, value: Any) -> bytes:
-    if value is None or value != value:
-        return b""
-    if isinstance(value, str):
-        data = value.encode("utf-8", "surrogatepass")  # never raises; two texts never share their bytes
-        return b"%s=s%d:%s" % (name.encode(), len(data), data)
-    if isinstance(value, float):
-        return b"%s=f%s" % (name.encode(), struct.pack(">d", value + 0.0))
-    if isinstance(value, bytes):
-        return b"%s=b%d:%s" % (name.encode(), len(value), value)
-    return b"%s=i%d;" % (name.encode(), value)
+@lru_cache(256)
+def _columns(names: tuple[str, ...]) -> list[tuple[str, bytes]]:
+    return [(name, name.encode() + b"=") for name in sorted(names) if name not in APART]
+
+
+_DOUBLE = struct.Struct(">d").pack
+PLAIN = (int, float, str, bytes)
+
+
+def plain_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row whose values are Python's own: a NumPy number, an enum's text, a view of bytes are made so."""
+    return {name: _plain(value) for name, value in row.items()}
+
+
+def _plain(value: Any) -> Any:
+    if value is None or type(value) in PLAIN:
+        return value
+    kind = next((kind for kind in (str, float, bytes) if isinstance(value, kind)), None)
+    return kind(value) if kind else bytes(value) if isinstance(value, bytearray | memoryview) else int(value)
 
 
 def state_sum(state: bytes | None) -> bytes | None:

@@ -12,7 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .chain import START, added_text, entry_digest, row_sum, settings_text, state_sum
+from .chain import START, added_text, entry_digest, plain_row, row_sum, settings_text, state_sum
 from .sql_tables import CHAINED, LEDGER, SCHEMA_KEY, SETTING
 
 DOUBLES = {
@@ -45,11 +45,16 @@ class LedgerEntry:
     def _summed(self, table: str, row: Row) -> dict[str, Any]:
         full = {**row, "entry": self._number}
         for name in DOUBLES[table]:  # an integer comes back as a float
-            if full.get(name) is not None:
-                full[name] = float(full[name])
+            if name in full and type(full[name]) is not float:
+                full[name] = None if full[name] is None else float(full[name])
         if "state" in row:
             full["state_sum"] = state_sum(row["state"])
-        return {**full, "sum": row_sum(table, full)}
+        try:
+            full["sum"] = row_sum(table, full)
+        except TypeError:
+            full = plain_row(full)
+            full["sum"] = row_sum(table, full)
+        return full
 
     def take_settings(self, connection: sa.Connection) -> None:
         """Note that the settings change."""

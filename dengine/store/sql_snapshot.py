@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,8 @@ def snapshot(url: str) -> Iterator[sa.Connection]:
         sa.event.listen(engine, "connect", _take_any_text)
     options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
     try:
-        with engine.connect() as plain, (connection := plain.execution_options(**options)).begin():
+        with engine.connect() as connection:  # rolled back at its end: there is nothing to commit
+            connection.execution_options(**options)
             _check(connection, name)
             yield connection
     except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
@@ -55,9 +56,12 @@ def _check(connection: sa.Connection, name: str) -> None:
 
 
 def cells_of(connection: sa.Connection) -> list[str]:
-    """Return the cells that any table names, in order."""
-    queries = [sa.select(table.c.cell_id) for table in TABLES.values()]
-    return sorted(connection.execute(sa.union(*queries)).scalars())
+    """Return the cells that any table names, in order; of a table that is damaged nothing is asked."""
+    cells: set[str] = set()
+    for table in TABLES.values():
+        with suppress(sa.exc.DatabaseError):  # on PostgreSQL, where an error ends the transaction, the next one raises
+            cells |= set(connection.execute(sa.select(table.c.cell_id).distinct()).scalars())
+    return sorted(cells)
 
 
 def chosen_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -75,3 +79,15 @@ def raw_rows(connection: sa.Connection, table: str, cell_id: str) -> Iterator[di
     )
     for row in found:
         yield dict(row._mapping)
+
+
+def count_rows(url: str, cell_id: str | None = None) -> int:
+    """Return how many rows a store holds, of one cell or of all; those of a damaged table are not counted."""
+    n = 0
+    with snapshot(url) as connection:
+        chosen_cells(connection, cell_id)
+        for table in TABLES.values():
+            query = sa.select(sa.func.count()).select_from(table)
+            with suppress(sa.exc.DatabaseError):
+                n += connection.execute(query if cell_id is None else query.where(table.c.cell_id == cell_id)).scalar_one()
+    return n
