@@ -31,12 +31,12 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     labelled = store.labelled(window.capacity)
     window.extend(labelled)
     version = store.last_version()
-    if version is None:
+    model = None if version is None else _restored(store, template, version.state, window.newest_seq)
+    if version is None or model is None:
         if len(labelled.seq) >= MANY:
             template.look_ahead_safely(labelled.traces)
         _tell(template, store, 0)
         return Resumed(None, 0, len(labelled.seq))
-    model = _restored(store, template, version.state, window.newest_seq)
     model.prepare_safely(template)
     model.look_ahead_safely(labelled.traces)
     trained_to = int(version.state["trained_on"][-1])
@@ -47,12 +47,15 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
-def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel:
+def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel | None:
+    """The model of a version; None where it is refitted, and a trace that it was fitted on is damaged."""
     model = template.successor()
     if model.needs_refit(state):  # on the very traces that it was fitted on
         trained_on = state["trained_on"]
         data = store.labelled(newest - int(trained_on[0]) + 1)
         kept = np.isin(data.seq, trained_on)
+        if kept.sum() < len(trained_on):  # fitted on the others, its references would lie elsewhere
+            return None
         model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
     return model.set_state(state)
 

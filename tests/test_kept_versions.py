@@ -11,6 +11,7 @@ import pytest
 
 from dengine import DataEngine, Dataset
 from dengine.errors import StoreError
+from dengine.experiments.rivals.neighbours import AgreeingNeighbours
 from dengine.records import RetrainReport
 from dengine.store import MemoryStore, SqlStore, Store
 from dengine.store.kept_versions import KEEP, keeps_state
@@ -181,5 +182,22 @@ def test_an_engine_whose_only_version_is_damaged_verifies_and_learns_anew(data: 
     damage(file, 1)
     with DataEngine.open(str(file)) as engine:
         assert (engine.version, engine.model) == (0, None)
+        engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
+        assert engine.version == 2
+
+
+def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(data: Dataset, tmp_path: Path) -> None:
+    """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns anew."""
+    file = tmp_path / "engine.db"
+    rival = AgreeingNeighbours(0.1, 0.9)
+    with DataEngine(model=rival, store=file, retrain_every=40) as engine:
+        for x, y in zip(data.X[:50], data.y[:50], strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        assert engine.version == 1
+    with sqlite3.connect(file) as connection:
+        connection.execute("UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
+    with DataEngine.open(str(file), model=AgreeingNeighbours(0.1, 0.9)) as engine:
+        assert (engine.version, engine.model) == (0, None)
+        assert [event.kind for event in engine.store.events()] == ["damaged"]
         engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
         assert engine.version == 2

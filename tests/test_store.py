@@ -808,8 +808,11 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     SqlStore(str(file)).close()
     with sqlite3.connect(file) as connection:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
+    connection.close()  # and the last one to close empties the journal into the file
+    before = file.read_bytes()
     with pytest.raises(StoreError, match="schema 3, found schema 99"):
         SqlStore(str(file), "another cell")
+    assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
@@ -817,10 +820,11 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     file = tmp_path / "a.db"
     with sqlite3.connect(file) as connection:
         connection.execute(f"CREATE TABLE {table}")
+    before = file.read_bytes()
     with pytest.raises(StoreError, match="schema 3, found tables of another program"):
         SqlStore(str(file))
-    with sqlite3.connect(file) as connection:
-        assert connection.execute("SELECT count(*) FROM sqlite_master").fetchone() == (1,)
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path: Path) -> None:

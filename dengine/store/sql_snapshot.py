@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +59,19 @@ def cells_of(connection: sa.Connection) -> list[str]:
     """Return the cells that any table names, in order; of a table that is damaged nothing is asked."""
     cells: set[str] = set()
     for table in TABLES.values():
-        with suppress(sa.exc.DatabaseError):  # on PostgreSQL, where an error ends the transaction, the next one raises
+        with _damage_aside(connection):
             cells |= set(connection.execute(sa.select(table.c.cell_id).distinct()).scalars())
     return sorted(cells)
+
+
+@contextmanager
+def _damage_aside(connection: sa.Connection) -> Iterator[None]:
+    """Go on after a table of a file that cannot be read; on PostgreSQL the whole transaction is over then."""
+    try:
+        yield
+    except sa.exc.DatabaseError:
+        if connection.dialect.name != "sqlite":
+            raise
 
 
 def chosen_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -88,6 +98,6 @@ def count_rows(url: str, cell_id: str | None = None) -> int:
         chosen_cells(connection, cell_id)
         for table in TABLES.values():
             query = sa.select(sa.func.count()).select_from(table)
-            with suppress(sa.exc.DatabaseError):
+            with _damage_aside(connection):
                 n += connection.execute(query if cell_id is None else query.where(table.c.cell_id == cell_id)).scalar_one()
     return n
