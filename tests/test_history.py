@@ -245,6 +245,30 @@ def test_one_byte_changed_in_the_files_pages_within_a_trace_is_found(written: Pa
         assert [(fault.table, fault.what) for fault in found] == [("trace", "was changed")]
 
 
+def content(file: Path) -> dict[str, list[str]]:
+    """Every value of every table, as SQLite reads it."""
+    connection = sqlite3.connect(file)
+    connection.text_factory = bytes
+    found = {table: sorted(map(repr, connection.execute(f"SELECT * FROM {table}"))) for table in TABLES}
+    connection.close()
+    return found
+
+
+def test_one_byte_changed_anywhere_in_the_file_is_found_or_changed_no_value(written: Path, tmp_path: Path) -> None:
+    rng, stored, whole, found = random.Random(2), written.read_bytes(), content(written), 0
+    for i in range(200):
+        changed = bytearray(stored)
+        changed[rng.randrange(len(stored))] ^= 1 << rng.randrange(8)
+        file = tmp_path / f"changed{i}.db"
+        file.write_bytes(changed)
+        if found_wrong(file):
+            found += 1
+        else:
+            assert content(file) == whole
+        file.unlink()
+    assert found > 20
+
+
 @pytest.mark.parametrize("table", TABLES)
 def test_a_row_that_was_deleted_is_found(file: Path, table: str) -> None:
     execute(file, f"DELETE FROM {table} WHERE rowid = (SELECT max(rowid) FROM {table})")

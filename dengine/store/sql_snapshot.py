@@ -35,7 +35,7 @@ def snapshot(url: str) -> Iterator[sa.Connection]:
             connection.execution_options(**options)
             _check(connection, name)
             yield connection
-    except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError) as error:
+    except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, UnicodeDecodeError) as error:  # the last of damaged names
         raise StoreError(f"Could not read {name}: {getattr(error, 'orig', None) or error}. {advice(error)}") from error
     finally:
         engine.dispose()
@@ -53,6 +53,10 @@ def _check(connection: sa.Connection, name: str) -> None:
             f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
             "open an older one once, as `dengine status` does, to bring it up to date."
         )
+    for table in TABLES.values():
+        missing = set(table.c.keys()) - {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
+        if missing:
+            raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")
 
 
 def cells_of(connection: sa.Connection) -> list[str]:
@@ -60,7 +64,7 @@ def cells_of(connection: sa.Connection) -> list[str]:
     cells: set[str] = set()
     for table in TABLES.values():
         with _damage_aside(connection):
-            cells |= set(connection.execute(sa.select(table.c.cell_id).distinct()).scalars())
+            cells |= {str(cell) for cell in connection.execute(sa.select(table.c.cell_id).distinct()).scalars()}
     return sorted(cells)
 
 
