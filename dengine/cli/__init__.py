@@ -22,6 +22,7 @@ from .explaining import explain
 from .export import export, import_labels
 from .history import history
 from .interrupting import end_interrupted
+from .keeping import dump, verify
 from .options import example
 from .replaying import compare, replay
 from .running import run
@@ -72,7 +73,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, history, explain, export, import_labels),
+    *(data, replay, compare, train, run, simulate, status, history, explain, verify, dump, export, import_labels),
     *(correct, forget, rollback, set_policy, retrain),
 ):
     main.add_command(verb)
