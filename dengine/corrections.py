@@ -109,9 +109,9 @@ class Corrections:
         self._make_ready()
         if version == self._versions.version and version > 0:
             return self._unchanged("rollback", f"Version {version} answers already; nothing changed.")
-        before = self._versions.version
-        text = f"version {version} answers again, as version {before + 1} after {before}"
-        event = Change("rollback", text, {"to": int(version), "was": before, "now": before + 1}, author)
+        before, now = self._versions.version, self._versions.next_number
+        text = f"version {version} answers again, as version {now} after {before}"
+        event = Change("rollback", text, {"to": int(version), "was": before, "now": now}, author)
         self._versions.roll_back(int(version), event)
         return self._done(event)
 
@@ -158,7 +158,7 @@ class Corrections:
     def _under(self, policy: Policy, anew: bool) -> EngineSettings:
         """The settings under another policy; anew : whether its rule begins without evidence."""
         now = self._settings
-        since = self._versions.version + (self._versions.answering is not None)
+        since = 0 if self._versions.answering is None else self._versions.next_number
         settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since)
         return replace(settings, told_since=since, began_in=SAFE_MODE.index(self._feedback.safe_mode)) if anew else settings
 

@@ -20,6 +20,7 @@ from .store.base import Store
 from .store.records import Correction, Evidence, ModelVersion
 from .window import Window
 
+RULE = ("rule.", "untold")  # of a version's state: what its rule knew
 MANY = 500  # labels and no retrain yet: they were imported
 
 
@@ -75,18 +76,21 @@ def resume(store: Store, template: EngineModel, window: Window, telling: Telling
     labelled = store.labelled(window.capacity)
     window.extend(labelled)
     version = store.last_version()
-    if version is None:
+    state = {} if version is None else _own_rule(version, telling)
+    model = None if version is None else _restored(store, template, state)
+    if version is None or model is None:
         if len(labelled.seq) >= MANY:
             template.look_ahead_safely(labelled.traces)
         template.begin_safely_in(telling.began_in)
         _tell(template, store.evidence_since(0, telling.since))
         corrections = store.corrections()
         return Resumed(None, 0, len(labelled.seq), corrected_to=corrections[-1].number if corrections else 0)
-    model, origin = _restored(store, template, version.state), Origin.from_state(version.state)
+    origin = Origin.from_state(version.state)
     model.prepare_safely(template)
     model.look_ahead_safely(labelled.traces)
     references, corrected_to = join_since(model, store, version, window.capacity)
-    if "untold" in version.state or corrected_to > corrected_at(version):
+    anew = "untold" in version.state or version.version < telling.since
+    if anew or corrected_to > corrected_at(version):
         tell_all(model, store.evidence_since(0, telling.since), telling)
     else:
         _tell(model, store.evidence_since(version.last_seq, telling.since))
@@ -94,19 +98,38 @@ def resume(store: Store, template: EngineModel, window: Window, telling: Telling
     return Resumed(model, version.version, new_labels, references, origin, corrected_to)
 
 
-def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel:
+def _own_rule(version: ModelVersion, telling: Telling) -> Mapping[str, NDArray[Any]]:
+    """A version's state, without what its rule knew where that is of an earlier policy: the later versions are damaged."""
+    return version.state if version.version >= telling.since else without_rule(version.state)
+
+
+def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """A version's state without what its rule knew."""
+    return {name: values for name, values in state.items() if not name.startswith(RULE)}
+
+
+def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
+    """The model of a version; None where it is refitted, and a trace that it was fitted on is damaged."""
     model = template.successor()
-    if model.needs_refit(state):  # on the very traces that it was fitted on, with the labels that these had
-        refit(model, store, Origin.from_state(state))
+    # On the very traces that it was fitted on, with the labels that these had.
+    if model.needs_refit(state) and not refit(model, store, Origin.from_state(state)):
+        return None
     return model.set_state(state)
 
 
-def refit(model: EngineModel, store: Store, origin: Origin, corrected_to: int | None = None) -> None:
-    """Train a model on what another was trained on, with the labels as they stood then, or after another correction."""
-    as_of = origin.corrected_to if corrected_to is None else corrected_to
-    data = store.labelled(first=int(origin.seq[0]), last=int(origin.seq[-1]), corrected_to=as_of)
+def refit(model: EngineModel, store: Store, origin: Origin) -> bool:
+    """Train a model on what another was trained on, with the labels as they stood then.
+
+    False where a trace of these is damaged: fitted on the others, its references would lie elsewhere.
+    """
+    data = store.labelled(first=int(origin.seq[0]), last=int(origin.seq[-1]), corrected_to=origin.corrected_to)
     kept = np.isin(data.seq, origin.seq)
+    said = {each.seq: each.success for each in store.corrections() if each.number <= origin.corrected_to}
+    forgotten = sum(said.get(seq, True) is None for seq in origin.seq.tolist())  # not among them, and not damaged
+    if kept.sum() + forgotten < len(origin.seq):
+        return False
     model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
+    return True
 
 
 def corrected_at(version: ModelVersion) -> int:
@@ -154,7 +177,7 @@ def change(model: EngineModel, references: References, store: Store, correction:
 
     A reference gets its new label, or leaves. What was forgotten and counts again joins as the newest.
     """
-    known = store.get_decision(correction.decision_id)
+    known = store.past_decision(correction.decision_id)
     if known is None or known.quarantined or not model.keeps_references:
         return True
     age, label = references.age(correction.seq), correction.success
@@ -164,7 +187,9 @@ def change(model: EngineModel, references: References, store: Store, correction:
             references.remove(age)
         return done
     if label is not None and correction.was is None:
-        point = model.place_safely(known.trace, known.content_hash)
+        # Nothing where the trace is damaged.
+        data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=correction.number)
+        point = model.place_safely(data.traces[0], known.content_hash) if len(data.seq) else None
         if model.add_safely(point, int(label), known.content_hash):
             references.add(correction.seq)
     return True

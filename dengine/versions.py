@@ -17,7 +17,7 @@ from .pending import HUNG
 from .records import Reason, RetrainReport
 from .reducers.base import State
 from .references import References
-from .resuming import Origin, Telling, change, join_since, refit, resume, tell_all
+from .resuming import Origin, Telling, change, join_since, refit, resume, tell_all, without_rule
 from .retraining import Retrainer, Trained
 from .store.base import Store
 from .store.records import Change, StoredDecision
@@ -26,7 +26,6 @@ log = logging.getLogger("dengine")
 
 Point = NDArray[np.float32]
 TELL_ALL = Telling()
-RULE = ("rule.", "untold")  # of a version's state: what its rule knew, which goes on
 
 
 class ModelVersions:
@@ -58,12 +57,18 @@ class ModelVersions:
         self.store_waiting: Callable[[], None] = _nothing_waits
         self._references, self._corrected_to = References(), 0
         self._origin: Origin | None = None
+        self._newest = 0  # number that a version ever had; after damage an earlier one may answer
         self._news: RetrainReport | None = None
 
     @property
     def store(self) -> Store:
         """What the keeper keeps; asked without a time limit, so not while the cell waits."""
         return self.keeper.store
+
+    @property
+    def next_number(self) -> int:
+        """What the next version will be called."""
+        return self._newest + 1
 
     @property
     def newest(self) -> EngineModel:
@@ -76,6 +81,7 @@ class ModelVersions:
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
         self._references, self._origin = resumed.references, resumed.origin
         self._corrected_to = resumed.corrected_to
+        self._newest = max((report.version for report in self.store.retrains()), default=0)
 
     def reference_point(self, known: StoredDecision) -> Point | None:
         """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
@@ -131,19 +137,22 @@ class ModelVersions:
     def roll_back(self, number: int, event: Change) -> RetrainReport:
         """Let an earlier version answer again, as a new one, with what came since among its references."""
         begin, version = self.clock(), self.store.load_version(number)
-        state = {name: values for name, values in version.state.items() if not name.startswith(RULE)}
+        state = without_rule(version.state)  # which goes on
         model, origin = self.template.successor(), Origin.from_state(version.state)
         if not model.keeps_references:
             # A rival cannot take a label back: it learns from the same traces as they are labelled now.
             origin = replace(origin, corrected_to=self._corrected_to)
-        if model.needs_refit(state):
-            refit(model, self.store, origin)
+        if model.needs_refit(state) and not refit(model, self.store, origin):
+            raise StoreError(
+                f"Expected the traces that version {number} was fitted on as they were stored, some have changed; "
+                "see `dengine verify`, and restore the store from a copy."
+            )
         model.set_state(state)
         model.prepare_safely(self.newest)
         references, _ = join_since(model, self.store, version, self.retrainer.window.capacity)
         origin = replace(origin, counts_from=self.retrainer.window.newest_seq)
         n = len(origin.seq)
-        report = RetrainReport(self.version + 1, self.clock() - begin, n, 0, True, f"rolled back to version {number}")
+        report = RetrainReport(self.next_number, self.clock() - begin, n, 0, True, f"rolled back to version {number}")
         self._record(event, report, model, references, origin)
         self.new_labels = 0
         return report
@@ -164,7 +173,7 @@ class ModelVersions:
             self.store.record(event)
         else:
             reason = "another policy, the same model"
-            report = RetrainReport(self.version + 1, 0.0, len(self._origin.seq), 0, True, reason)
+            report = RetrainReport(self.next_number, 0.0, len(self._origin.seq), 0, True, reason)
             self._record(event, report, model, self._references, self._origin)
         self.template, self.telling = template, telling
 
@@ -175,6 +184,7 @@ class ModelVersions:
         state = self._state(model, references, origin)
         self.store.record(replace(event, version=(report, self.retrainer.window.newest_seq, state)))
         self.answering, self.version, self._news = model, report.version, report
+        self._newest = report.version
         self._references, self._origin = references, origin
 
     def _state(self, model: EngineModel, references: References, origin: Origin) -> State:
@@ -242,12 +252,13 @@ class ModelVersions:
             # Labels that came in meanwhile are in the new version.
             references = References([*seq, *self.retrainer.window.catch_up(model, int(seq[-1]))])
             origin = Origin(seq, self._corrected_to, int(seq[-1]))
-            report = replace(report, version=self.version + 1, accepted=True)
+            report = replace(report, version=self.next_number, accepted=True)
             state = self._state(model, references, origin)
         # Until the version could answer; storing it comes on top.
         report = replace(report, seconds=self.clock() - trained.begin)
         self.keeper.version(report, self.retrainer.window.newest_seq, state)
         if model is not None:
+            self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
             self._references, self._origin = references, origin
         return report

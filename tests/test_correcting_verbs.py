@@ -98,7 +98,7 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
     assert document("status", store)["last_version"] == 3
     failed = dengine("rollback", store, 9)
     assert failed.exit_code == 1
-    assert "it keeps 1, 2, 3" in " ".join(failed.stderr.split())
+    assert "load one of these: 1, 2, 3" in " ".join(failed.stderr.split())
 
 
 def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path) -> None:

@@ -417,7 +417,7 @@ def test_a_version_that_is_not_kept_is_refused_and_those_that_are_named(number: 
     engine = make()
     play(engine, data, slice(0, 90))
     before = state(engine)
-    with pytest.raises(StoreError, match=f"got {number}; it keeps 1, 2"):
+    with pytest.raises(StoreError, match=f"got {number}, which is not kept; load one of these: 1, 2"):
         engine.rollback(number)
     assert (state(engine), engine.store.events()) == (before, [])
 

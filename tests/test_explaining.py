@@ -138,9 +138,12 @@ def test_a_version_that_is_not_kept_gives_way_to_the_present_one_and_that_is_sai
     assert again.bound == first.bound  # the recorded counts stand; LB needs no version
 
 
-def test_in_memory_an_old_decision_is_explained_by_the_present_version(make_data: Callable[..., Dataset]) -> None:
-    with played(MemoryStore(), make_data(200, samples=60), RECIPES["pooled"]) as engine:
+def test_in_memory_too_a_version_that_is_not_kept_gives_way_to_the_present_one(make_data: Callable[..., Dataset]) -> None:
+    store = MemoryStore()
+    with played(store, make_data(200, samples=60), RECIPES["pooled"]) as engine:
         old = next(past for past in engine.history() if past.model_version == 1 and past.reason is Reason.UNCERTAIN)
+        assert engine.explain(old.id).neighbours_version == 1
+        del store._states[1]
         found = engine.explain(old.id)
         assert found.neighbours_version == engine.version > 1
         assert found.bound is not None

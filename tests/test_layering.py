@@ -71,9 +71,22 @@ HEAVY = {  # at the top of a module only in those dedicated to it, which are the
     "umap": (),
     "mujoco": ("cells.simulation.world",),
     "matplotlib": ("experiments.figures",),
-    "sqlalchemy": tuple(
-        f"store.sql{name}"
-        for name in ("", "_connections", "_engine", "_history", "_owning", "_queries", "_queue", "_tables", "_views")
+    "sqlalchemy": (
+        *("store.cell_history", "store.dump", "store.history"),
+        "store.migrations",
+        "store.migrations.versions.v0001_schema_1",
+        "store.migrations.versions.v0002_part_silent_event",
+        "store.migrations.versions.v0003_ledger",
+        *("store.sql", "store.sql_connections", "store.sql_engine", "store.sql_history", "store.sql_ledger"),
+        *("store.sql_owning", "store.sql_queries", "store.sql_queue", "store.sql_snapshot", "store.sql_tables"),
+        *("store.sql_versions", "store.sql_views"),
+    ),
+    "alembic": (
+        "store.migrations",
+        "store.migrations.env",
+        "store.migrations.versions.v0001_schema_1",
+        "store.migrations.versions.v0002_part_silent_event",
+        "store.migrations.versions.v0003_ledger",
     ),
     "pandas": (),
     "torchmetrics": (),

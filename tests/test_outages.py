@@ -1,6 +1,7 @@
 """The store fails while the cell runs: nothing is lost, nothing raises, nobody waits long, and two never own one cell."""
 
 import contextlib
+import itertools
 import os
 import shutil
 import signal
@@ -75,6 +76,14 @@ def locked(file: Path) -> Iterator[None]:
 def full(engine: DataEngine) -> Iterator[None]:
     """SQLite's own error for a full disk: the file may not grow by another page."""
     database = engine.store._database
+    engine.flush()
+    with contextlib.closing(sqlite3.connect(database.url.database)) as connection:
+        connection.isolation_level = None
+        connection.execute("VACUUM")  # states of versions that are not kept any more left free pages
+        connection.execute("PRAGMA max_page_count = 1")
+        with contextlib.suppress(sqlite3.OperationalError):  # every write ends with a row here: not one more fits
+            for number in itertools.count():
+                connection.execute("INSERT INTO ledger VALUES ('filler', ?, 0, '', NULL, x'')", (number,))
 
     def keep_small(connection, *_: object) -> None:
         connection.execute("PRAGMA max_page_count = 1")

@@ -1,5 +1,6 @@
 """One contract over every store: in memory, SQLite in a file, PostgreSQL where DENGINE_TEST_POSTGRES names one."""
 
+import hashlib
 import os
 import sqlite3
 import subprocess
@@ -807,8 +808,11 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     SqlStore(str(file)).close()
     with sqlite3.connect(file) as connection:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
+    connection.close()  # and the last one to close empties the journal into the file
+    before = file.read_bytes()
     with pytest.raises(StoreError, match="schema 3, found schema 99"):
         SqlStore(str(file), "another cell")
+    assert file.read_bytes() == before
 
 
 @pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
@@ -816,10 +820,11 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     file = tmp_path / "a.db"
     with sqlite3.connect(file) as connection:
         connection.execute(f"CREATE TABLE {table}")
+    before = file.read_bytes()
     with pytest.raises(StoreError, match="schema 3, found tables of another program"):
         SqlStore(str(file))
-    with sqlite3.connect(file) as connection:
-        assert connection.execute("SELECT count(*) FROM sqlite_master").fetchone() == (1,)
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path: Path) -> None:
@@ -856,6 +861,10 @@ def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
     np.savez(evil, w=np.array([{}], dtype=object))
     assert zipfile.is_zipfile(evil)
     with sqlite3.connect(file) as connection:
-        connection.execute("UPDATE model_version SET state = ?", (evil.read_bytes(),))
-    with SqlStore(str(file)) as store, pytest.raises(StoreError, match="plain arrays"):
-        store.last_version()
+        sum_ = hashlib.sha256(evil.read_bytes()).digest()
+        connection.execute("UPDATE model_version SET state = ?, state_sum = ?", (evil.read_bytes(), sum_))
+    with SqlStore(str(file)) as store:
+        with pytest.raises(StoreError, match="plain arrays"):
+            store.load_version(1)
+        assert store.last_version() is None
+        assert "plain arrays" in store.events()[0].text

@@ -1,12 +1,13 @@
-"""A store of schema 1, as dengine 0.2 wrote it, is brought to schema 3 when it is opened; nothing in it changes."""
+"""A store of schema 1 or 2, as earlier dengines wrote it, is brought to schema 3 when it is opened; nothing is lost."""
 
 import io
 import os
+import signal
 import subprocess
 import sys
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ import sqlalchemy as sa
 
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import SqlStore, sql_tables
+from dengine.store import SqlStore, chain, verify_history
+from dengine.store.migrations import migrate
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 
@@ -115,6 +117,27 @@ def empty(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 def old(empty: str) -> str:
     write_schema_1(empty)
     return empty
+
+
+@pytest.fixture
+def second(old: str) -> str:
+    return to_schema_2(old)
+
+
+def to_schema_2(old: str) -> str:
+    """What dengine 0.3 made of a store of schema 1, and an event."""
+    real = "DOUBLE PRECISION" if old.startswith("postgresql") else "DOUBLE"
+    execute(
+        old,
+        "ALTER TABLE decision ADD COLUMN part VARCHAR",
+        "ALTER TABLE label ADD COLUMN silent BIGINT DEFAULT 0 NOT NULL",
+        f"CREATE TABLE event (cell_id VARCHAR NOT NULL, number BIGINT NOT NULL, time {real} NOT NULL,"
+        " kind VARCHAR NOT NULL, text TEXT NOT NULL, PRIMARY KEY (cell_id, number))",
+        "UPDATE setting SET value = '2' WHERE key = 'schema_version'",
+        "INSERT INTO event VALUES ('other', 1, 5.5, 'note', 'of schema 2')",
+        "UPDATE decision SET part = 'SN-7' WHERE id = 'c'",
+    )
+    return old
 
 
 def execute(url: str, *statements: str) -> None:
@@ -247,17 +270,29 @@ def test_processes_that_open_schema_1_at_once_all_succeed(old: str) -> None:
 
 
 def test_a_change_that_fails_halfway_leaves_schema_1_as_it_was(old: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(connection: sa.Connection) -> None:
-        raise sa.exc.OperationalError("CREATE TABLE", {}, OSError("database or disk is full"))
+    def fail(*chained: object) -> None:
+        raise sa.exc.OperationalError("INSERT INTO ledger", {}, OSError("database or disk is full"))
 
     before = shape(old)
     with monkeypatch.context() as patch:
-        patch.setattr(sql_tables.EVENT, "create", fail)
+        patch.setattr(chain, "entry_digest", fail)  # after all tables are changed, before the first entry is written
         with pytest.raises(StoreError, match=r"disk is full.*Free some space"):
             SqlStore(old)
     assert (shape(old), schemas(old)) == (before, {"cell": "1", "other": "1"})
     with SqlStore(old) as store:
         assert len(store.labelled().seq) == 1
+
+
+def test_a_process_that_is_killed_halfway_leaves_schema_1_as_it_was(old: str) -> None:
+    code = (
+        "import os, signal, sys\nfrom dengine.store import SqlStore, chain\n"
+        "chain.entry_digest = lambda *chained: os.kill(os.getpid(), signal.SIGKILL)\nSqlStore(sys.argv[1])"
+    )
+    before = shape(old)
+    assert subprocess.run([sys.executable, "-c", code, old], timeout=60).returncode == -signal.SIGKILL
+    assert (shape(old), schemas(old)) == (before, {"cell": "1", "other": "1"})
+    with SqlStore(old) as store:
+        assert store.verify().ok
 
 
 def test_schema_1_beside_another_programs_event_table_is_refused_and_left_alone(old: str) -> None:
@@ -269,8 +304,8 @@ def test_schema_1_beside_another_programs_event_table_is_refused_and_left_alone(
 
 
 def test_cells_of_two_schemas_are_refused(old: str) -> None:
-    execute(old, "UPDATE setting SET value = '3' WHERE key = 'schema_version' AND cell_id = 'other'")
-    with pytest.raises(StoreError, match="schema 3, found schema 1, 3"):
+    execute(old, "UPDATE setting SET value = '4' WHERE key = 'schema_version' AND cell_id = 'other'")
+    with pytest.raises(StoreError, match="schema 3, found schema 1, 4"):
         SqlStore(old)
 
 
@@ -284,3 +319,59 @@ def test_an_engine_of_schema_1_that_still_runs_may_go_on_writing(old: str) -> No
         )
         assert store.evidence_since(2).silent.tolist() == [0]
         assert (store.get_decision("b").success, store.outcomes().stops) == (False, 1)
+        (fault,) = store.verify().faults
+        assert (fault.table, fault.key, "not chained" in fault.what) == ("label", "b", True)
+
+
+def test_a_store_of_schema_2_is_read_back_and_gets_the_tables_of_a_new_one(second: str) -> None:
+    with SqlStore(second, "other") as store:
+        assert (store.get_decision("c").part, store.get_decision("a").part) == ("SN-7", None)
+        assert [event.text for event in store.events()] == ["of schema 2"]
+        np.testing.assert_array_equal(store.get_decision("a").trace, TRACE)
+        assert (store.labelled().seq.tolist(), store.last_version().version) == ([1], 1)
+    assert schemas(second) == {"cell": "3", "other": "3"}
+    changed = shape(second)
+    execute(second, *(f"DROP TABLE {table}" for table in changed))
+    SqlStore(second).close()
+    assert changed == shape(second)
+
+
+@pytest.mark.parametrize("brought", [str, to_schema_2], ids=["schema 1", "schema 2"])
+def test_all_that_was_there_is_the_first_entry_and_what_follows_is_chained_to_it(
+    brought: Callable[[str], str], old: str
+) -> None:
+    url = brought(old)
+    for cell in CELLS:
+        with SqlStore(url, cell) as store:
+            store.put_event("note", "after")
+    report = verify_history(url)
+    assert report.ok
+    assert [(cell.cell_id, cell.entries) for cell in report.cells] == [("cell", 2), ("other", 2)]
+    for change in (
+        "UPDATE decision SET upper = 0.99 WHERE id = 'b' AND cell_id = 'other'",
+        "DELETE FROM label WHERE decision_id = 'c' AND cell_id = 'other'",
+        "UPDATE setting SET value = 'a = 2' WHERE key = 'recipe' AND cell_id = 'other'",
+    ):
+        execute(url, change)
+        found = verify_history(url)
+        assert {fault.cell_id for fault in found.faults} == {"other"}
+
+
+def test_the_migrations_from_nothing_make_the_tables_of_a_new_store(empty: str) -> None:
+    engine = sa.create_engine(empty)
+    with engine.begin() as connection:
+        migrate(connection, None, "0003")
+    engine.dispose()
+    made = shape(empty)
+    execute(empty, *(f"DROP TABLE {table}" for table in made))
+    SqlStore(empty).close()
+    assert made == shape(empty)
+
+
+def test_alembic_is_imported_for_a_migration_alone(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom dengine.store import SqlStore\n"
+        "for _ in range(2): SqlStore(sys.argv[1]).close()\nprint('alembic' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.db")], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

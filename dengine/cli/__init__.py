@@ -22,6 +22,7 @@ from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
 from .history import history
 from .interrupting import end_interrupted
+from .keeping import dump, verify
 from .options import example
 from .replaying import compare, replay
 from .running import run
@@ -72,7 +73,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, history, explain),
+    *(data, replay, compare, train, run, simulate, status, history, explain, verify, dump),
     *(correct, forget, rollback, set_policy, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

@@ -8,6 +8,9 @@ from .._lazy import lazy_names
 
 if TYPE_CHECKING:
     from .base import Store, open_store
+    from .dump import Dump, dump_store
+    from .history import HistoryReport, verify_history
+    from .kept_versions import StoredVersion
     from .memory import MemoryStore
     from .records import (
         AddedPoints,
@@ -28,6 +31,9 @@ _WHERE = {
         "Store",
         "open_store",
     ),
+    "dump": ("Dump", "dump_store"),
+    "history": ("HistoryReport", "verify_history"),
+    "kept_versions": ("StoredVersion",),
     "memory": ("MemoryStore",),
     "records": (
         "AddedPoints",
@@ -48,8 +54,10 @@ __all__ = [
     "AddedPoints",
     "Change",
     "Correction",
+    "Dump",
     "Event",
     "Evidence",
+    "HistoryReport",
     "Labelled",
     "MemoryStore",
     "ModelVersion",
@@ -58,7 +66,10 @@ __all__ = [
     "SqlStore",
     "Store",
     "StoredDecision",
+    "StoredVersion",
+    "dump_store",
     "open_store",
+    "verify_history",
 ]
 
 __getattr__, __dir__ = lazy_names(__name__, _WHERE)

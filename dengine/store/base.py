@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
+from .kept_versions import StoredVersion
 from .memory import MemoryStore
 from .records import (
     AddedPoints,
@@ -46,6 +47,7 @@ __all__ = [
     "Outcomes",
     "Store",
     "StoredDecision",
+    "StoredVersion",
     "open_store",
 ]
 
@@ -118,10 +120,13 @@ class Store(StoreViews, Protocol):
         """Record a retrain; a dropped candidate has no state."""
 
     def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version."""
+        """Return the newest accepted version; of a damaged one an event tells, and the one before it is returned."""
 
-    def load_version(self, number: int) -> ModelVersion:
-        """Return the accepted version of this number; StoreError, which names those that are kept, where it is not."""
+    def load_version(self, version: int) -> ModelVersion:
+        """Return an accepted version by its number. StoreError, naming those that can be loaded, where it cannot."""
+
+    def versions(self) -> list[StoredVersion]:
+        """Return every retrain, oldest first: its number, time, reason, and whether its state is kept."""
 
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""

@@ -43,12 +43,6 @@ def nothing_to_correct(decision_id: str) -> ReportError:
     )
 
 
-def no_such_version(number: int, kept: Sequence[int]) -> StoreError:
-    """Return the error for a version that is not kept; it names those that are."""
-    there = ", ".join(map(str, kept)) or "none: nothing was trained yet"
-    return StoreError(f"Expected a version that this cell's store keeps, got {number!r}; it keeps {there}.")
-
-
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
     if data is None:

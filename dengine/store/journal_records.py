@@ -68,8 +68,8 @@ def from_bytes(blob: bytes) -> Record:
         return _READERS[about["kind"]](about, blob[text_end:])
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(
-            f"Expected a record of a journal, got what cannot be read ({error}); open the store with the dengine that wrote "
-            "it."
+            f"Expected a record of a journal, got what cannot be read ({error}); "
+            "open the store with the dengine that wrote it."
         ) from error
 
 

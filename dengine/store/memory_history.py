@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
 
 from ..records import Action, RetrainReport
-from .checks import as_data, as_text, check_state, no_such_version, nothing_to_correct, unknown_decision
+from .checks import as_data, as_text, check_state, nothing_to_correct, unknown_decision
+from .kept_versions import KEEP, StoredVersion, keeps_state, not_kept
 from .records import FORGOTTEN, Change, Correction, DecidedTrace, Event, ModelVersion, NewLabel
 
 
@@ -25,9 +26,8 @@ class StoredLabel:
 
 
 class MemoryHistory:
-    """The part of `MemoryStore` that is about its history. Of versions only the newest `KEEP_VERSIONS` states are kept."""
+    """The part of `MemoryStore` that is about its history. Of versions it keeps the states that a database keeps."""
 
-    KEEP_VERSIONS = 5
     _clock: Callable[[], float]
     _open: dict[str, DecidedTrace]
     _labels: list[StoredLabel]
@@ -37,7 +37,8 @@ class MemoryHistory:
     def __init__(self) -> None:
         self._retrains: list[RetrainReport] = []
         self._retrained: list[tuple[float, int]] = []  # when each of them was, and the newest label that it knew of
-        self._versions: dict[int, ModelVersion] = {}
+        self._listed: list[StoredVersion] = []
+        self._states: dict[int, ModelVersion] = {}  # those that `keeps_state` keeps, the newest last
         self._events: list[Event] = []
         self._corrections: list[Correction] = []
         self._said: dict[str, bool | None] = {}  # by decision, what its newest correction says
@@ -47,24 +48,34 @@ class MemoryHistory:
     # Model versions
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Record a retrain; a dropped candidate has no state."""
-        copies = check_state(report, state)
+        """Record a retrain; of older versions few keep their states, as in a database. A dropped candidate has none."""
+        copies, now = check_state(report, state), self._clock()
         self._retrains.append(report)
-        self._retrained.append((self._clock(), int(last_seq)))
+        self._retrained.append((now, int(last_seq)))
+        n_bytes = sum(values.nbytes for values in (copies or {}).values())
+        kept = report.accepted and copies is not None
+        self._listed.append(StoredVersion(report.version, now, report.accepted, report.reason, n_bytes, kept))
         if report.accepted and copies is not None:
-            self._versions[report.version] = ModelVersion(report.version, int(last_seq), copies)
-        if len(self._versions) > self.KEEP_VERSIONS:
-            del self._versions[next(iter(self._versions))]
+            held = self._states | {report.version: ModelVersion(report.version, int(last_seq), copies)}
+            self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version, with arrays of its own."""
-        return _copied(self._versions[next(reversed(self._versions))]) if self._versions else None
+        return _copied(self._states[next(reversed(self._states))]) if self._states else None
 
-    def load_version(self, number: int) -> ModelVersion:
-        """Return the accepted version of this number, with arrays of its own; StoreError where it is not kept."""
-        if number not in self._versions:
-            raise no_such_version(number, sorted(self._versions))
-        return _copied(self._versions[number])
+    def load_version(self, version: int) -> ModelVersion:
+        """Return an accepted version by its number, with arrays of its own; StoreError where its state is not kept."""
+        if version not in self._states:
+            raise not_kept(version, self._states)
+        return _copied(self._states[version])
+
+    def kept_version(self, version: int) -> ModelVersion | None:
+        """Return an accepted version; None where it is not kept."""
+        return _copied(self._states[version]) if version in self._states else None
+
+    def versions(self) -> list[StoredVersion]:
+        """Return every retrain, oldest first, and whether its state is kept."""
+        return [row if not row.kept or row.version in self._states else _thinned(row) for row in self._listed]
 
     def retrains(self) -> list[RetrainReport]:
         return list(self._retrains)
@@ -126,6 +137,10 @@ class MemoryHistory:
     def _corrected(self) -> dict[str, int]:
         forgotten = sum(success is None for success in self._said.values())
         return {"forgotten": forgotten, "corrected": len(self._said) - forgotten}
+
+
+def _thinned(row: StoredVersion) -> StoredVersion:
+    return replace(row, n_bytes=0, kept=False)
 
 
 def _copied(version: ModelVersion) -> ModelVersion:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..records import RetrainReport
-from .records import DecidedTrace, Labelled, ModelVersion, as_label
+from .records import DecidedTrace, Labelled, as_label
 from .views import (
     HistoryFilter,
     Key,
@@ -20,10 +20,7 @@ from .views import (
 
 
 class MemoryViews:
-    """`StoreViews` in plain dicts; decisions that were forgotten are not among them.
-
-    Of the model's versions only the newest is kept.
-    """
+    """`StoreViews` in plain dicts; decisions that were forgotten are not among them."""
 
     _open: dict[str, DecidedTrace]
     _done: dict[str, DecidedTrace]
@@ -35,7 +32,6 @@ class MemoryViews:
     if TYPE_CHECKING:  # the store's own
 
         def counted(self, label: Any) -> int: ...
-        def last_version(self) -> ModelVersion | None: ...
         def labelled(self, limit: int | None = None) -> Labelled: ...
 
     def _every(self) -> list[PastDecision]:
@@ -108,11 +104,6 @@ class MemoryViews:
         """Return every retrain, oldest first."""
         both = zip(self._retrained, self._retrains, strict=True)
         return [PastRetrain(i, time, last_seq, report) for i, ((time, last_seq), report) in enumerate(both, start=1)]
-
-    def kept_version(self, version: int) -> ModelVersion | None:
-        """Return an accepted version; None where it is not the newest."""
-        newest = self.last_version()
-        return newest if newest is not None and newest.version == version else None
 
     def labelled_upto(self, seq: int, limit: int) -> Labelled:
         """Return the newest `limit` labelled traces among the labels up to number `seq`."""

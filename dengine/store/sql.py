@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sqlalchemy as sa
@@ -25,12 +25,12 @@ from . import sql_queries as ask
 from .checks import as_hash, check_import, check_parts, duplicate_id
 from .counting import count_outcomes, summary
 from .intake import check_decision, decided_trace
+from .kept_versions import KEEP, check_keep
 from .records import (
     STATUS_EVENTS,
     AddedPoints,
     DecidedTrace,
     Evidence,
-    Labelled,
     NewLabel,
     Outcomes,
     StoredDecision,
@@ -43,18 +43,24 @@ from .records import (
 from .sql_history import SqlHistory, replacing
 from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, label_row, read_decision, read_evidence, read_labelled, unpack
+from .sql_rows import chunks, label_row, read_decision, read_evidence, unpack
 from .sql_tables import LABEL, SCHEMA_KEY, SETTING
+from .sql_traces import SqlTraces, check_trace
 from .sql_views import SqlViews
 
+if TYPE_CHECKING:
+    from .history import HistoryReport
 
-class SqlStore(SqlOwning, SqlHistory, SqlViews):
+
+class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
     wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
+    keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
+        None: all keep them. A retrain itself stays listed for ever.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
     cell: label numbers stay unique and increasing. Engines own their cell (`own`): a second one is refused.
@@ -65,7 +71,13 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
     """
 
     def __init__(
-        self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time, *, wait: float = WAIT
+        self,
+        url: str,
+        cell_id: str = "cell",
+        clock: Callable[[], float] = time.time,
+        *,
+        wait: float = WAIT,
+        keep_versions: int | None = KEEP,
     ) -> None:
         """Open or create the store, and start its writer thread."""
         if not cell_id:
@@ -73,8 +85,9 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
         self.cell_id = cell_id
         if not wait > 0.0:
             raise StoreError(f"Expected a wait above 0 seconds, got {wait!r}; 0.4 is the default.")
+        self.keep_versions = check_keep(keep_versions)
         self._clock, self.wait = clock, wait
-        self._database = SqlDatabase(str(url), cell_id)
+        self._database = SqlDatabase(str(url), cell_id, clock)
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
@@ -103,12 +116,18 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
         self._database.flush()
 
     def get_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision with its trace, queued ones included; None where it is unknown."""
+        """Return the decision with its trace, queued ones included; None where it is unknown.
+
+        StoreError where the trace is not as it was stored.
+        """
         item = self._database.queued(decision_id)
         if item is not None:
             return stored_decision(item)
         rows = self._read(ask.decision_query(self.cell_id, decision_id))
-        return read_decision(rows[0]) if rows else None
+        if not rows:
+            return None
+        check_trace(rows[0], self._database.name)
+        return read_decision(rows[0])
 
     # Labels
 
@@ -182,18 +201,6 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
             if known is not None:
                 raise duplicate_id(known.id)
 
-    def labelled(
-        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
-    ) -> Labelled:
-        """Return the newest `limit` labelled traces, oldest first; read along the index `label_training`."""
-        query = ask.newest_query(self.cell_id, limit, int(first), last, corrected_to)
-        with self._database.transaction(write=False) as connection:
-            newest = connection.execute(query).all()[::-1]
-            begin, end = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, begin, end).execution_options(yield_per=CHUNK))
-            known = {row.seq for row in newest}  # the forgotten are not among them
-            return read_labelled(newest, (row for row in rows if row.seq in known))
-
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
         rows = self._read(ask.points_query(self.cell_id, int(seq), int(model_version)))
@@ -221,6 +228,13 @@ class SqlStore(SqlOwning, SqlHistory, SqlViews):
         return count_outcomes(tuple(row) for row in self._read(ask.outcome_query(self.cell_id, int(since_version))))
 
     # Overview
+
+    def verify(self, expect: str | None = None) -> HistoryReport:
+        """Check this cell's history against its ledger; what is queued is written first. See `verify_history`."""
+        from .history import verify_history
+
+        self.flush()
+        return verify_history(self._database.url.render_as_string(hide_password=False), self.cell_id, expect)
 
     def status(self) -> dict[str, Any]:
         """Count decisions, labels and versions, and show the newest events; what is queued is written first."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -12,6 +13,7 @@ import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError
 from .sql_engine import WatchedFile, advice, make_engine
+from .sql_ledger import LedgerEntry, chain_writes
 from .sql_tables import prepare_tables
 
 OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)  # the database itself is well
@@ -21,14 +23,17 @@ class SqlConnections:
     """An open database, prepared for a cell.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
+    clock : the time in seconds that entries of the ledger are stamped with.
     name : the URL without its password, for errors.
     failures : how many writes failed so far.
     """
 
-    def __init__(self, url: str, cell_id: str) -> None:
+    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time) -> None:
         self.cell_id = cell_id
         self.failures = 0
+        self._clock = clock
         self._engine = make_engine(url)
+        chain_writes(self._engine)
         self.name = self._engine.url.render_as_string(hide_password=True)
         self._doubtful = False  # the last write failed, and may have been committed all the same
         self._closed = False
@@ -77,13 +82,19 @@ class SqlConnections:
         """Begin a transaction that is committed at its end, or rolled back by an error."""
         self._check_open()
         with self._told("write to" if write else "read", write), self._connected(write) as plain:
-            connection = plain.execution_options(dengine_write=write)
+            entry = self._entry() if write else None
+            connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
             with connection.begin():
                 if write:
                     self._file.check()
                 yield connection
+                if entry is not None:
+                    entry.append(connection)  # chains what the transaction added
             if write:
                 self._file.check()  # nobody is told that a file holds what went into another one
+
+    def _entry(self) -> LedgerEntry:
+        return LedgerEntry(self.cell_id, self._clock)
 
     @contextmanager
     def _connected(self, write: bool) -> Iterator[sa.Connection]:

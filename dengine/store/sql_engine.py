@@ -87,7 +87,9 @@ def _unusable(url: str, said: str) -> StoreError:
 def _set_pragmas(connection: Any, record: Any) -> None:
     connection.isolation_level = None  # `_begin` says when a transaction starts, not the driver
     try:
-        connection.execute("PRAGMA journal_mode = WAL")
+        tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+        if not tables or {"setting", "decision"} <= tables:  # another program's file is refused, and left as it is
+            connection.execute("PRAGMA journal_mode = WAL")
     except UnicodeDecodeError as error:  # SQLite quotes a damaged table's name in what it says
         raise sqlite3.DatabaseError("the database is malformed") from error
     connection.execute("PRAGMA synchronous = FULL")  # a returned commit survives lost power; NORMAL would not

@@ -2,71 +2,37 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
 from ..errors import StoreError
-from ..records import RetrainReport
 from . import sql_queries as ask
-from .checks import as_data, as_text, check_state, no_such_version, nothing_to_correct, unknown_decision
-from .records import Change, Correction, Event, ModelVersion, as_label
-from .sql_queue import SqlDatabase
-from .sql_rows import chunks, from_npz, read_event, version_row
-from .sql_tables import CORRECTION, EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .checks import as_data, as_text, check_state, nothing_to_correct, unknown_decision
+from .records import Change, Correction, Event, as_label
+from .sql_rows import chunks, event_row, read_event, version_row
+from .sql_tables import CORRECTION, EVENT, LABEL, SCHEMA_KEY, SETTING
+from .sql_versions import SqlVersions
 
 
-class SqlHistory:
+class SqlHistory(SqlVersions):
     """The part of `SqlStore` that is about its history."""
-
-    cell_id: str
-    _clock: Callable[[], float]
-    _database: SqlDatabase
 
     def _read(self, query: sa.Select[Any]) -> Sequence[Any]:
         with self._database.transaction(write=False) as connection:
             return connection.execute(query).all()
-
-    # Model versions
-
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Commit a retrain; a dropped candidate has no state."""
-        row = version_row(self.cell_id, report, int(last_seq), self._clock(), check_state(report, state))
-        self._database.write(lambda connection: self._add_version(connection, row))
-
-    def _add_version(self, connection: sa.Connection, row: dict[str, Any]) -> None:
-        retrain = self._database.next_number(connection, VERSION.c.retrain)
-        connection.execute(sa.insert(VERSION), row | {"retrain": retrain})
-
-    def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version."""
-        rows = self._read(ask.version_query(self.cell_id))
-        return self._version(rows[0]) if rows else None
-
-    def load_version(self, number: int) -> ModelVersion:
-        """Return the accepted version of this number; StoreError where none is kept."""
-        rows = self._read(ask.version_query(self.cell_id, int(number)))
-        if not rows or rows[0].state is None:
-            kept = sa.select(VERSION.c.version).where(VERSION.c.cell_id == self.cell_id, VERSION.c.accepted == sa.true())
-            kept = kept.where(VERSION.c.state.is_not(None)).order_by(VERSION.c.version)
-            raise no_such_version(number, [row.version for row in self._read(kept)])
-        return self._version(rows[0])
-
-    def _version(self, row: Any) -> ModelVersion:
-        return ModelVersion(row.version, row.last_seq, from_npz(row.state, self._database.name))
-
-    def retrains(self) -> list[RetrainReport]:
-        """Return every retrain, oldest first."""
-        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self.cell_id))]
 
     # Events
 
     def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
         """Commit what happened to the cell's log."""
         self.record(Change(kind, text, data, author))
+
+    def _note(self, kind: str, text: str) -> None:
+        """Commit an event, unless one of these very words is there."""
+        if not self._read(ask.said_query(self.cell_id, as_text(kind), as_text(text))):
+            self.put_event(kind, text)
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest `limit` events, oldest first."""
@@ -76,15 +42,8 @@ class SqlHistory:
 
     def record(self, change: Change) -> int:
         """Commit what a person changed, in one transaction with its event, whose number it returns."""
-        data, now = as_data(change.data), self._clock()
-        event: dict[str, Any] = {
-            "cell_id": self.cell_id,
-            "time": now,
-            "kind": as_text(change.kind),
-            "text": as_text(change.text),
-            "data": None if data is None else json.dumps(data),
-            "author": as_text(change.author),
-        }
+        now, author = self._clock(), as_text(change.author)
+        said = (now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         version: dict[str, Any] | None = None
         if change.version is not None:
             report, last_seq, state = change.version
@@ -93,9 +52,9 @@ class SqlHistory:
 
         def add(connection: sa.Connection) -> int:
             number = self._database.next_number(connection, EVENT.c.number)
-            connection.execute(sa.insert(EVENT), event | {"number": number})
+            connection.execute(sa.insert(EVENT), event_row(self.cell_id, number, *said))
             if change.decisions:
-                self._correct(connection, change, event["author"], number, now)
+                self._correct(connection, change, author, number, now)
             if version is not None:
                 self._add_version(connection, version)
             if replace is not None:
@@ -104,7 +63,7 @@ class SqlHistory:
 
         return self._database.write(add)
 
-    def _correct(self, connection: sa.Connection, change: Change, author: str | None, event: int, now: float) -> None:
+    def _correct(self, connection: sa.Connection, change: Change, author: str, event: int, now: float) -> None:
         found = [row for part in chunks(change.decisions) for row in connection.execute(ask.held_query(self.cell_id, part))]
         was = {row.id: row.counted for row in found}
         for name in change.decisions:

@@ -17,7 +17,7 @@ from .journal_records import LateEvent, LateLabel, Record
 from .records import DecidedTrace
 from .sql_queries import held_query
 from .sql_queue import SqlDatabase
-from .sql_rows import chunks, label_row
+from .sql_rows import chunks, event_row, label_row
 from .sql_tables import EVENT, LABEL
 
 WAIT = 0.4  # seconds that an engine waits for the database
@@ -104,8 +104,8 @@ def _write_events(database: SqlDatabase, connection: sa.Connection, events: Sequ
     number = database.next_number(connection, EVENT.c.number)
     for event in events:
         if _is_new(connection, database.cell_id, event):
-            row = {"cell_id": database.cell_id, "number": number, "time": event.time}
-            connection.execute(sa.insert(EVENT), row | {"kind": event.kind, "text": event.text})
+            row = event_row(database.cell_id, number, event.time, event.kind, event.text)
+            connection.execute(sa.insert(EVENT), row)
             number += 1
 
 

@@ -43,7 +43,9 @@ def decision_query(cell_id: str, decision_id: str) -> Query:
     """A decision with its trace, and with its label where it has one."""
     mine = (DECISION.c.cell_id == cell_id) & (DECISION.c.id == decision_id)
     traces = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
-    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], counted().label("success"), LABEL.c.source)
+    stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
+    label = (counted().label("success"), LABEL.c.source)
+    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], *stored, *label)
     return sa.select(*columns).select_from(DECISION.join(TRACE, traces).outerjoin(LABEL, LABEL_OF_DECISION)).where(mine)
 
 
@@ -65,7 +67,8 @@ def newest_query(
 
     first, last : sequence numbers between which they lie.  corrected_to : as in `corrected`.
     """
-    query = sa.select(LABEL.c.seq, counted(corrected_to).label("success"), LABEL.c.content_hash)
+    success = counted(corrected_to).label("success")
+    query = sa.select(LABEL.c.seq, success, *LABEL.c["content_hash", "decision_id"])
     query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false(), remembered(corrected_to))
     query = query if first <= 1 else query.where(LABEL.c.seq >= first)
     query = query if last is None else query.where(LABEL.c.seq <= last)
@@ -75,7 +78,7 @@ def newest_query(
 def trace_query(cell_id: str, first: int, last: int) -> Query:
     """The traces of the labels `first` to `last`, the forgotten too, oldest first."""
     same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
-    query = sa.select(LABEL.c.seq, *TRACE.c["channels", "samples", "data"]).select_from(LABEL.join(TRACE, same))
+    query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same))
     mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
     return query.where(mine, LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
 
@@ -136,12 +139,30 @@ def source_query(cell_id: str) -> Query:
     return query.where(LABEL.c.cell_id == cell_id, remembered()).group_by(LABEL.c.source)
 
 
-def version_query(cell_id: str, number: int | None = None) -> Query:
-    """The newest accepted version, or the one of this number."""
-    query = sa.select(*VERSION.c["version", "last_seq", "state"])
+def version_query(cell_id: str, retrain: int) -> Query:
+    """An accepted version with its state."""
+    query = sa.select(*VERSION.c["version", "last_seq", "state", "state_sum"])
+    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.retrain == retrain)
+
+
+def accepted_query(cell_id: str) -> Query:
+    """The accepted versions, newest first, and whether each has its state."""
+    query = sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
     query = query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true())
-    query = query if number is None else query.where(VERSION.c.version == number)
-    return query.order_by(VERSION.c.retrain.desc()).limit(1)
+    return query.order_by(VERSION.c.retrain.desc())
+
+
+def held_states_query(cell_id: str) -> Query:
+    """The accepted versions that have their states."""
+    query = sa.select(*VERSION.c["retrain", "version"])
+    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true(), VERSION.c.state.is_not(None))
+
+
+def versions_query(cell_id: str) -> Query:
+    """Every retrain, oldest first, with the size of its state, NULL where it has none."""
+    size = sa.func.length(VERSION.c.state).label("n_bytes")
+    query = sa.select(*VERSION.c["version", "time", "accepted", "reason"], size)
+    return query.where(VERSION.c.cell_id == cell_id).order_by(VERSION.c.retrain)
 
 
 def retrain_query(cell_id: str) -> Query:
@@ -171,3 +192,9 @@ def corrected_query(cell_id: str) -> Query:
     newest = ~sa.exists().where(newer, later.c.number > CORRECTION.c.number)
     query = sa.select(CORRECTION.c.success, sa.func.count()).where(CORRECTION.c.cell_id == cell_id, newest)
     return query.group_by(CORRECTION.c.success)
+
+
+def said_query(cell_id: str, kind: str, text: str) -> Query:
+    """Whether an event of these words is there."""
+    said = (EVENT.c.cell_id == cell_id) & (EVENT.c.kind == kind) & (EVENT.c.text == text)
+    return sa.select(EVENT.c.number).where(said).limit(1)

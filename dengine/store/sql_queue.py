@@ -16,7 +16,7 @@ from ..errors import StoreError
 from .checks import as_text, duplicate_id
 from .records import DecidedTrace
 from .sql_connections import OF_A_ROW, SqlConnections
-from .sql_rows import chunks, decision_row, trace_row
+from .sql_rows import chunks, decision_row, event_row, trace_row
 from .sql_tables import DECISION, EVENT, SCHEMA_KEY, SETTING, TRACE
 
 log = logging.getLogger("dengine")
@@ -30,10 +30,10 @@ T = TypeVar("T")
 class SqlDatabase(SqlConnections):
     """An open database, and the decisions on their way to it."""
 
-    def __init__(self, url: str, cell_id: str) -> None:
+    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time) -> None:
         """Open or create the database, and start its writer thread."""
         self._queue: dict[str, DecidedTrace] = {}
-        super().__init__(url, cell_id)
+        super().__init__(url, cell_id, clock)
         self._queue_bytes = 0
         self._clash: StoreError | None = None
         self._lock = threading.Condition()  # guards the queue
@@ -68,7 +68,7 @@ class SqlDatabase(SqlConnections):
         """Return which rows the database refuses for what they hold, each with the reason; nothing is written."""
         refused: dict[str, str] = {}
         with self._told("write to"), self._connected(write=True) as plain:
-            connection = plain.execution_options(dengine_write=True)
+            connection = plain.execution_options(dengine_write=True, dengine_entry=self._entry())
             with connection.begin() as tried:
                 for item in self._not_yet_stored(connection, batch):
                     try:
@@ -90,8 +90,7 @@ class SqlDatabase(SqlConnections):
             first = self.next_number(connection, EVENT.c.number)
             for number, (name, reason) in enumerate(refused.items(), first):
                 text = as_text(f"a decision that the database refused, {name!r}: {reason}")
-                row = {"cell_id": self.cell_id, "number": number, "time": now, "kind": "set aside", "text": text}
-                connection.execute(sa.insert(EVENT), row)
+                connection.execute(sa.insert(EVENT), event_row(self.cell_id, number, now, "set aside", text))
                 log.error("%s", text)
 
         self._commit(record, [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..archives import read_archive
 from ..errors import DataError, StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .checks import mixed_shapes
-from .records import DecidedTrace, Event, Evidence, Labelled, NewLabel, StoredDecision, as_label
+from .records import DecidedTrace, Event, Evidence, NewLabel, StoredDecision, as_label
 
 CHUNK = 500  # rows sent or fetched at a time
 
@@ -93,6 +92,15 @@ def version_row(
     }
 
 
+def event_row(
+    cell_id: str, number: int, time: float, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
+) -> dict[str, Any]:
+    """Return the row of the table `event`, whole: a default that the database fills in would not be in the row's sum."""
+    said = None if data is None else json.dumps(data)
+    row = {"cell_id": cell_id, "number": number, "time": time, "kind": kind, "text": text}
+    return row | {"data": said, "author": author}
+
+
 def read_decision(row: Any) -> StoredDecision:
     """Read a row of `decision` joined with its trace, and with its label where it has one."""
     return StoredDecision(
@@ -129,31 +137,6 @@ def read_evidence(rows: Sequence[Any]) -> Evidence:
         novel=np.array([row.reason == Reason.NOVEL for row in rows], dtype=bool),
         silent=np.array([row.silent for row in rows], dtype=np.int64),
     )
-
-
-def read_labelled(newest: Sequence[Any], traces: Iterable[Any]) -> Labelled:
-    """Read rows of `label`, newest last, and those of their traces. StoreError for a label that a damaged file has made."""
-    labels = [row.success for row in newest]
-    if not all(label in (0, 1) for label in labels):
-        raise StoreError("Expected labels that are True or False, found another: the store is damaged; restore a copy.")
-    return Labelled(
-        seq=np.array([row.seq for row in newest], dtype=np.int64),
-        traces=read_traces(traces, len(newest)),
-        labels=np.array(labels, dtype=np.int8),
-        hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-    )
-
-
-def read_traces(rows: Iterable[Any], n: int) -> NDArray[np.float32]:
-    """Read n rows of `trace` as (n, C, T), one at a time; (0, 0, 0) where there is none."""
-    traces = np.zeros((0, 0, 0), dtype=np.float32)
-    for i, row in enumerate(rows):
-        if i == 0:
-            traces = np.empty((n, row.channels, row.samples), dtype=np.float32)
-        if (row.channels, row.samples) != traces.shape[1:]:
-            raise mixed_shapes({traces.shape[1:], (row.channels, row.samples)})
-        traces[i] = unpack_trace(row)
-    return traces
 
 
 def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import sqlalchemy as sa
 
 from ..errors import StoreError
@@ -12,6 +10,13 @@ SCHEMA = "3"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
 
 METADATA = sa.MetaData()
+
+
+def _chained() -> tuple[sa.Column[int], sa.Column[bytes]]:
+    """Where a row stands in the cell's ledger, and its SHA-256 (`chain.row_sum`); since schema 3. NULL: not chained."""
+    return sa.Column("entry", sa.BigInteger), sa.Column("sum", sa.LargeBinary)
+
+
 SETTING = sa.Table(
     "setting",
     METADATA,
@@ -40,6 +45,7 @@ DECISION = sa.Table(
     sa.Column("content_hash", sa.BigInteger, nullable=False),
     sa.Column("quarantined", sa.Boolean, nullable=False),
     sa.Column("part", sa.String),  # serial number of the part that the trace was recorded on; since schema 2
+    *_chained(),
 )
 HISTORY = sa.Index("decision_time", *DECISION.c["cell_id", "time", "id"])  # made where it is missing: no change of schema
 TRACE = sa.Table(  # apart from `decision`, so that counting decisions does not read traces
@@ -50,6 +56,7 @@ TRACE = sa.Table(  # apart from `decision`, so that counting decisions does not 
     sa.Column("channels", sa.Integer, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
     sa.Column("data", sa.LargeBinary, nullable=False),  # float32, little-endian, (channels, samples)
+    *_chained(),
 )
 LABEL = sa.Table(
     "label",
@@ -66,6 +73,7 @@ LABEL = sa.Table(
     sa.Column("quarantined", sa.Boolean, nullable=False),
     # Accepted parts of which nothing was heard since the previous label; since schema 2.
     sa.Column("silent", sa.BigInteger, nullable=False, server_default=sa.text("0")),
+    *_chained(),
     sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
     sa.Index("label_training", "cell_id", "quarantined", "seq"),
 )
@@ -82,7 +90,9 @@ VERSION = sa.Table(  # every retrain, dropped candidates included
     sa.Column("accepted", sa.Boolean, nullable=False),
     sa.Column("reason", sa.Text, nullable=False),
     sa.Column("last_seq", sa.BigInteger, nullable=False),
-    sa.Column("state", sa.LargeBinary),  # npz without pickles
+    sa.Column("state", sa.LargeBinary),  # npz without pickles; NULL where it was thinned out
+    *_chained(),
+    sa.Column("state_sum", sa.LargeBinary),  # SHA-256 of the state, which stays where the state goes; since schema 3
     sa.Index("version_accepted", "cell_id", "accepted", "retrain"),
 )
 EVENT = sa.Table(  # since schema 2
@@ -95,6 +105,7 @@ EVENT = sa.Table(  # since schema 2
     sa.Column("text", sa.Text, nullable=False),
     sa.Column("data", sa.Text),  # JSON; this and the next since schema 3
     sa.Column("author", sa.String, nullable=False, server_default=sa.text("''")),
+    *_chained(),
 )
 CORRECTION = sa.Table(  # later words on labels; the newest of a decision counts; since schema 3
     "correction",
@@ -108,14 +119,31 @@ CORRECTION = sa.Table(  # later words on labels; the newest of a decision counts
     sa.Column("author", sa.String, nullable=False),
     sa.Column("event", sa.BigInteger, nullable=False),
     sa.Column("newest_seq", sa.BigInteger, nullable=False),  # of the cell's labels at that moment
+    *_chained(),
     sa.Index("correction_of", "cell_id", "decision_id", "number"),
 )
 
-Columns = tuple[sa.Column[Any], ...]
-NEW_SINCE: dict[str, tuple[Columns, tuple[sa.Table, ...]]] = {  # what an older schema lacks
-    "schema 1": ((DECISION.c.part, LABEL.c.silent), (EVENT, CORRECTION)),
-    "schema 2": ((EVENT.c.data, EVENT.c.author), (CORRECTION,)),
-}
+CHAINED = {table.name: table for table in (DECISION, TRACE, LABEL, VERSION, EVENT, CORRECTION)}  # rows the ledger chains
+LEDGER = sa.Table(  # since schema 3: an entry for every transaction that added rows or changed settings
+    "ledger",
+    METADATA,
+    sa.Column("cell_id", sa.String, primary_key=True),
+    sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    sa.Column("time", sa.Double, nullable=False),
+    sa.Column("added", sa.Text, nullable=False),  # JSON: how many rows of each table
+    sa.Column("settings", sa.Text),  # JSON: all settings, where they changed
+    sa.Column("digest", sa.LargeBinary, nullable=False),  # SHA-256 over the one before and this entry's rows
+)
+MIGRATION = sa.Table(  # Alembic's: how far the tables are brought up to date
+    "dengine_migration",
+    METADATA,
+    sa.Column("version_num", sa.String(32), nullable=False),
+    sa.PrimaryKeyConstraint("version_num", name="dengine_migration_pkc"),
+)
+
+EARLIER = {"schema 1": "1", "schema 2": "2"}
+NEW = {"schema 2": {CORRECTION.name, LEDGER.name, MIGRATION.name}}  # tables that later schemas have
+NEW["schema 1"] = {EVENT.name} | NEW["schema 2"]
 
 
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
@@ -131,22 +159,25 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         _bring_up_to_date(connection, found, name)
     else:
         METADATA.create_all(connection)
+        connection.execute(sa.insert(MIGRATION), {"version_num": revision(SCHEMA)})
     HISTORY.create(connection, checkfirst=True)
     entered = sa.select(SETTING).where(SETTING.c.cell_id == cell_id, SETTING.c.key == SCHEMA_KEY)
     if connection.execute(entered).first() is None:
         connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": SCHEMA_KEY, "value": SCHEMA})
 
 
+def revision(schema: str) -> str:
+    """Return what Alembic calls a schema."""
+    return f"{int(schema):04}"
+
+
 def _bring_up_to_date(connection: sa.Connection, found: set[str], name: str) -> None:
-    """Change tables of an older schema to the present one, for all cells at once; refuse any other."""
-    held = _held(connection, found)
-    if held in NEW_SINCE:
-        columns, tables = NEW_SINCE[held]
-        for column in columns:
-            new = sa.schema.CreateColumn(column).compile(dialect=connection.dialect)
-            connection.exec_driver_sql(f"ALTER TABLE {column.table.name} ADD COLUMN {new}")
-        for table in tables:
-            table.create(connection)
+    """Change tables of an earlier schema to the present one, for all cells at once; refuse any other."""
+    held = held_schema(connection, found)
+    if held in EARLIER:
+        from .migrations import migrate  # Alembic takes its time: only where there is something to change
+
+        migrate(connection, revision(EARLIER[held]), revision(SCHEMA))
         connection.execute(sa.update(SETTING).where(SETTING.c.key == SCHEMA_KEY).values(value=SCHEMA))
     elif held != f"schema {SCHEMA}":
         raise StoreError(
@@ -155,12 +186,12 @@ def _bring_up_to_date(connection: sa.Connection, found: set[str], name: str) -> 
         )
 
 
-def _held(connection: sa.Connection, found: set[str]) -> str:
+def held_schema(connection: sa.Connection, found: set[str]) -> str:
     """Say what a database holds: the schema of the tables that its cells have in common, or another program's."""
     columns = {c["name"] for c in sa.inspect(connection).get_columns("setting")} if "setting" in found else set()
     if columns != set(SETTING.c.keys()):
         return "tables of another program: " + ", ".join(sorted(found))
     query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
     schema = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
-    beside = [table.name for table in NEW_SINCE.get(schema, ((), ()))[1] if table.name in found]  # it had none such
+    beside = sorted(found & NEW.get(schema, set()))  # it had none such
     return f"{schema} and a table {beside[0]!r} of another program" if beside else schema

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 
 from ..records import Action, Reason, RetrainReport, Source
 from . import sql_queries as ask
-from .records import FORGOTTEN, Labelled, ModelVersion, as_label
+from .records import FORGOTTEN, as_label
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, from_npz, read_traces, unpack
+from .sql_rows import unpack
 from .sql_tables import DECISION, LABEL, VERSION
 from .views import (
     LABELS,
@@ -117,7 +116,7 @@ def stretch_query(cell_id: str, length: int) -> Query:
 
 
 class SqlViews:
-    """`StoreViews` in a database."""
+    """`StoreViews` in a database, but for versions and traces, which `SqlVersions` and `SqlTraces` read."""
 
     cell_id: str
     _database: SqlDatabase
@@ -146,27 +145,6 @@ class SqlViews:
             PastRetrain(row[0], row[1], row[2], RetrainReport(*row[3:]))
             for row in self._look(query.order_by(VERSION.c.retrain))
         ]
-
-    def kept_version(self, version: int) -> ModelVersion | None:
-        """Return an accepted version; None where it is not kept."""
-        query = sa.select(*VERSION.c["version", "last_seq", "state"]).where(VERSION.c.cell_id == self.cell_id)
-        kept = query.where(VERSION.c.accepted == sa.true(), VERSION.c.version == version, VERSION.c.state.is_not(None))
-        rows = self._look(kept.order_by(VERSION.c.retrain.desc()).limit(1))
-        return ModelVersion(version, rows[0].last_seq, from_npz(rows[0].state, self._database.name)) if rows else None
-
-    def labelled_upto(self, seq: int, limit: int) -> Labelled:
-        """Return the newest `limit` labelled traces among the labels up to number `seq`."""
-        with self._database.transaction(write=False) as connection:
-            newest = connection.execute(ask.newest_query(self.cell_id, limit).where(LABEL.c.seq <= seq)).all()[::-1]
-            first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
-            traces = read_traces(rows, len(newest))
-        return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64),
-            traces=traces,
-            labels=np.array([row.success for row in newest], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-        )
 
     def tally(self, last: int | None = None) -> Tally:
         """Count the newest `last` decisions, all where it is None."""

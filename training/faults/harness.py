@@ -1,4 +1,4 @@
-"""A small cell under test: it decides and reports, notes what was acknowledged and how long it waited, and is looked at after."""
+"""A small cell under test: it notes what was acknowledged and how long it waited, and is looked at afterwards."""
 
 from __future__ import annotations
 

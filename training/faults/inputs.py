@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dengine import Action, DataEngine, Policy, Reason, export_torchscript, load_exported
+from dengine import Action, DataEngine, Reason, export_torchscript, load_exported
 from dengine.errors import DengineError, ReportError, TraceError
 
 from .harness import RECIPE, Cell, Outcome, Place, refused, stream
@@ -98,7 +98,7 @@ class _Rival:
 def rivals(outcome: Outcome, place: Place) -> None:
     """A rival that counts 2^70 successes, and one that raises."""
     for i, raises in enumerate((False, True)):
-        engine = DataEngine(model=_Rival(raises), store=Place(f"{place.url}-{i}").store(), policy=Policy(0.1, 0.9))
+        engine = DataEngine(model=_Rival(raises), store=Place(f"{place.url}-{i}").store())
         for j in range(30):
             try:
                 decision = engine.decide(stream().X[j])

@@ -112,7 +112,7 @@ def killed(child: Callable[..., None], place: Place, seed: int, most: float = 0.
 
 
 def check_cell(outcome: Outcome, place: Place, told: list[list[str]]) -> None:
-    """Every acknowledged label is there; where nothing came after the last probe, the reopened engine says the same of it."""
+    """Every acknowledged label is there; where nothing came after the last probe, the engine says the same of it."""
     labels = {words[1]: words[2] == "1" for words in told if words[0] == "label"}
     probes = [words[1:] for words in told if words[0] == "probe"]
     with DataEngine.open(place.store()) as engine:

@@ -1,0 +1,218 @@
+"""The check of one cell's history: every row is read once, then the ledger is gone through."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from .chain import START, entry_digest, row_sum, state_sum
+from .sql_ledger import held_settings
+from .sql_snapshot import CHUNK, raw_rows
+from .sql_tables import CHAINED, DECISION, LABEL, LEDGER, SCHEMA_KEY, SETTING, TRACE, VERSION
+
+SUM = 32  # bytes
+KEY = {name: next(c.name for c in table.primary_key if c.name != "cell_id") for name, table in CHAINED.items()}
+NUMBER = {name: key for name, key in KEY.items() if isinstance(CHAINED[name].c[key].type, sa.BigInteger)}
+NUMBER |= {LABEL.name: LABEL.c.seq.name}  # columns that count 1, 2, ... in each cell, without a gap
+NEEDS = ((DECISION, TRACE), (TRACE, DECISION), (LABEL, DECISION))  # a row of the first has one of the second
+SHOWN = 20  # numbers of missing rows that are named one by one
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryFault:
+    """What is wrong in a store's history; key : which row of the table, as far as is known."""
+
+    cell_id: str
+    table: str
+    key: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True)
+class CellHistory:
+    """A cell's history: entries of its ledger, rows that they chain, and the newest digest, "" without an entry."""
+
+    cell_id: str
+    entries: int
+    rows: int
+    digest: str
+
+
+class RowSums:
+    """Sums of a table's rows, by the entry that each is of: 40 bytes a row."""
+
+    def __init__(self) -> None:
+        self._entries = array("q")
+        self._sums = bytearray()
+        self._now: dict[int, bytes] = {}  # of rows that do not give their sum
+        self._order: Any = None
+        self._sorted: Any = None
+
+    def add(self, entry: int, stored: bytes, now: bytes) -> None:
+        """Take in a row."""
+        if stored != now:
+            self._now[len(self._entries)] = now
+        self._entries.append(entry)
+        self._sums += stored[:SUM].ljust(SUM, b"\0")
+
+    def of(self, entry: int) -> tuple[list[bytes], list[bytes]]:
+        """The sums of the rows of an entry: as they stand there, and as they come out now."""
+        if self._order is None:
+            entries = np.array(self._entries, dtype=np.int64)
+            self._order = np.argsort(entries, kind="stable")
+            self._sorted = entries[self._order]
+        first, last = np.searchsorted(self._sorted, [entry, entry + 1])
+        rows = self._order[first:last].tolist()
+        stored = [bytes(self._sums[SUM * i : SUM * (i + 1)]) for i in rows]
+        return stored, [self._now.get(i, sum_) for i, sum_ in zip(rows, stored, strict=True)]
+
+    def beyond(self, known: Iterable[int]) -> list[int]:
+        """Entries that rows name and the ledger does not hold."""
+        return sorted(set(np.unique(np.array(self._entries, dtype=np.int64)).tolist()) - set(known))
+
+
+class CellCheck:
+    """The check of one cell.
+
+    digests : of its entries, oldest first, in hexadecimal, once it ran.
+    """
+
+    def __init__(self, connection: sa.Connection, cell_id: str, on_rows: Callable[[int], None]) -> None:
+        self.connection, self.cell_id, self.on_rows = connection, cell_id, on_rows
+        self.digests: list[str] = []
+        self._rows = 0
+        self._sums = {table: RowSums() for table in CHAINED}
+        self._unread: list[str] = []
+
+    def history(self) -> CellHistory:
+        """What there is."""
+        return CellHistory(self.cell_id, len(self.digests), self._rows, self.digests[-1] if self.digests else "")
+
+    def run(self) -> list[HistoryFault]:
+        """Read everything, and say what is wrong."""
+        faults = [fault for table in CHAINED for fault in self._guarded(table, self._check_rows(table))]
+        faults += self._guarded(LEDGER.name, self._check_ledger())
+        faults += self._guarded(SETTING.name, self._check_entered())
+        if not self._unread:  # else all that could not be read would be missing
+            faults += [fault for pair in NEEDS for fault in self._guarded(pair[0].name, self._check_pairs(*pair))]
+        return faults
+
+    def _guarded(self, table: str, faults: Iterator[HistoryFault]) -> Iterator[HistoryFault]:
+        try:
+            yield from faults
+        except sa.exc.DatabaseError as error:
+            self._unread.append(table)
+            yield self._fault(table, "", f"cannot be read to its end: {error.orig}")
+
+    def _fault(self, table: str, key: object, what: str) -> HistoryFault:
+        return HistoryFault(self.cell_id, table, str(key), what)
+
+    def _check_rows(self, table: str) -> Iterator[HistoryFault]:
+        numbers: list[Any] = []
+        for n, row in enumerate(raw_rows(self.connection, table, self.cell_id), start=1):
+            yield from self._check_row(table, row)
+            if table in NUMBER:
+                numbers.append(row[NUMBER[table]])
+            if n % CHUNK == 0:
+                self.on_rows(CHUNK)
+        yield from self._gaps(table, NUMBER.get(table, ""), numbers)
+
+    def _check_row(self, table: str, row: Mapping[str, Any]) -> Iterator[HistoryFault]:
+        self._rows += 1
+        key, entry, stored = row[KEY[table]], row["entry"], row["sum"]
+        if entry is None and stored is None:
+            yield self._fault(table, key, "is not chained: something beside dengine wrote it, or an older dengine")
+            return
+        now = row_sum(table, row)
+        if now != stored:
+            yield self._fault(table, key, "was changed")
+        if table == VERSION.name and row["state"] is not None and state_sum(_bytes(row["state"])) != row["state_sum"]:
+            yield self._fault(table, key, "its state was changed")
+        if isinstance(entry, int):
+            self._sums[table].add(entry, _bytes(stored), now)
+
+    def _gaps(self, table: str, column: str, numbers: list[Any]) -> Iterator[HistoryFault]:
+        held = {number for number in numbers if isinstance(number, int)}
+        missing = sorted(set(range(1, max(held, default=0) + 1)) - held) if len(held) < max(held, default=0) else []
+        for number in missing[:SHOWN]:
+            yield self._fault(table, f"{column} {number}", "is missing")
+        if len(missing) > SHOWN:
+            yield self._fault(table, f"{column} {missing[SHOWN]} to {missing[-1]}", "are missing, or some of them")
+
+    def _check_pairs(self, having: sa.Table, needed: sa.Table) -> Iterator[HistoryFault]:
+        key, other = having.c[KEY[having.name]], needed.c[KEY[needed.name]]
+        both = having.outerjoin(needed, (needed.c.cell_id == having.c.cell_id) & (other == key))
+        query = sa.select(key).select_from(both).where(having.c.cell_id == self.cell_id, other.is_(None))
+        for id_ in self.connection.execute(query).scalars():
+            yield self._fault(needed.name, id_, f"is missing: a row of {having.name} is there")
+
+    def _check_ledger(self) -> Iterator[HistoryFault]:
+        rows = sorted(raw_rows(self.connection, LEDGER.name, self.cell_id), key=lambda row: _integer(row["number"]))
+        previous, settings = {START}, None
+        for row in rows:
+            head = {name: value for name, value in row.items() if name != "digest"}
+            sums = {table: each.of(_integer(row["number"])) for table, each in self._sums.items()}
+            stored, now = ({table: both[i] for table, both in sums.items() if both[i]} for i in (0, 1))
+            # After an entry that was changed the chain goes on from what it said, or from what it should have said.
+            told, found = _bytes(row["digest"]), {entry_digest(p, head, s) for p in previous for s in (stored, now)}
+            if told not in found:
+                yield self._fault(LEDGER.name, f"entry {row['number']}", _entry_fault(row["added"], now))
+            previous = {told, entry_digest(min(previous), head, now)}
+            settings = row if row["settings"] is not None else settings
+            self.digests.append(told.hex())
+        numbers = [row["number"] for row in rows]
+        yield from self._gaps(LEDGER.name, "entry", numbers)
+        yield from self._check_beyond(numbers)
+        yield from self._check_settings(settings)
+
+    def _check_beyond(self, numbers: list[Any]) -> Iterator[HistoryFault]:
+        for table, sums in self._sums.items():
+            for entry in sums.beyond(number for number in numbers if isinstance(number, int))[:SHOWN]:
+                yield self._fault(table, f"entry {entry}", "the ledger does not hold the entry that rows are of")
+
+    def _check_settings(self, newest: Mapping[str, Any] | None) -> Iterator[HistoryFault]:
+        held = held_settings(self.connection, self.cell_id)
+        try:
+            chained = {} if newest is None else json.loads(newest["settings"])
+        except (TypeError, ValueError):
+            chained = {}  # the entry itself was named
+        for key in sorted(held.keys() | chained.keys(), key=str):
+            if key not in chained:
+                yield self._fault(SETTING.name, key, "is not chained")
+            elif key not in held:
+                yield self._fault(SETTING.name, key, "is missing")
+            elif held[key] != chained[key]:
+                yield self._fault(SETTING.name, key, "was changed")
+
+    def _check_entered(self) -> Iterator[HistoryFault]:
+        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
+        if self.connection.execute(sa.select(SETTING.c.key).where(mine)).first() is None:
+            yield self._fault(SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell")
+
+
+def _entry_fault(added: Any, found: Mapping[str, list[bytes]]) -> str:
+    """Say why an entry's digest does not come out."""
+    try:
+        counts = dict(json.loads(added))
+    except (TypeError, ValueError):
+        counts = {}
+    differing = [
+        f"{counts.get(table, 0)} of {table}, {len(found.get(table, ()))} found"
+        for table in sorted(counts.keys() | found.keys())
+        if counts.get(table, 0) != len(found.get(table, ()))
+    ]
+    return "chained " + "; ".join(differing) if differing else "was changed, or rows that it chains were"
+
+
+def _bytes(value: Any) -> bytes:
+    return bytes(value) if isinstance(value, bytes | bytearray | memoryview) else b""
+
+
+def _integer(value: Any) -> int:
+    return value if isinstance(value, int) else -1
