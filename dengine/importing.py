@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from .backlog import OwnedStore
 from .datasets import Dataset, load_dataset
 from .deciding import source_of
 from .decision.policy import Policy
@@ -111,9 +112,12 @@ def import_journal(
     Parts keep their numbers, the bounds that they were decided by and the sources of their labels, so that the rule and the
     certificate count them as the engine's own. The report counts labels.
     any_model : take a journal of a model that the store has not noted as exported from it.
-    Raises DataError, before anything is stored, for a journal that is damaged, or of a model of another store.
+    Raises DataError, before anything is stored, for a journal that is damaged, or of a model of another store; StoreError
+    while an engine runs on the cell.
     """
     with opening(store, must_exist=True) as opened:
+        if isinstance(opened, OwnedStore):
+            opened.own()  # an engine that runs would never learn of these labels
         known = opened.settings()
         spec = trace_in(known)
         if spec is None or "recipe" not in known:

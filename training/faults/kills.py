@@ -148,7 +148,7 @@ def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
     n = len(stream())
     for seed in range(times):
         own = replace(place, url=f"{place.url}.{seed}")
-        told = killed(importing, own, seed, most=0.6)
+        told = killed(importing, own, seed, most=1.5)
         outcome.injected += 1
         done = max((int(words[1]) for words in told), default=0)
         outcome.labels += done
