@@ -24,6 +24,7 @@ from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
 from .errors import StoreError
 from .feedback import Feedback, unknown_stop
+from .fleet import agreed, as_sisters, sisters_trace
 from .loop import drive
 from .model.base import EngineModel, Exportable, Model
 from .recipe import Recipe
@@ -87,8 +88,9 @@ class DataEngine:
         with opening(store) as opened:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
-            self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
+            self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
             self.store.save_settings(self._settings.to_store())
+            self._versions.join()
 
     def _start(
         self,
@@ -144,7 +146,7 @@ class DataEngine:
         """
         with opening(store) as opened:
             if not opened.settings():
-                return cls(store=opened, seed=seed or 0, **settings)
+                return cls(store=opened, **as_sisters(settings | {"seed": seed}, opened))
             options = {name: settings.pop(name) for name in OPTIONS if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
             engine._settings.must_agree_with(settings | {"seed": seed})
@@ -168,8 +170,8 @@ class DataEngine:
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_trace(trace, self.trace)
-        if self.trace is None:
-            self.agree_on(spec_of(x, trace))
+        if self.trace is None and (own := spec_of(x, trace)) != self.agree_on(own):
+            return as_trace(trace, self.trace)  # a sister's trace came first
         return x
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:
@@ -291,6 +293,7 @@ class DataEngine:
     def agree_on(self, trace: TraceSpec) -> TraceSpec:
         """Set the traces' contract, where none is set yet; returns the one in force."""
         if self.trace is None:
+            trace = sisters_trace(self.store) or trace
             self._settings = replace(self._settings, trace=trace)
             self._maker.agree_on(trace)
             self.store.save_settings(self._settings.to_store())

@@ -96,7 +96,6 @@ class Feedback:
         self._learn(known, label, point)
         self.versions.keep(known, success, int(seq))
         if late:  # its success stays among the references until the next retrain
-            self.versions.new_labels -= 1
             self.versions.tell_anew()
         self._announce()
 

@@ -13,6 +13,7 @@ from .model.base import EngineModel, Told
 from .retraining import Window
 from .store.base import Store
 from .store.records import Labelled, ModelVersion
+from .store.shared import is_shared
 
 MANY = 500  # labels and no retrain yet: they were imported
 
@@ -36,22 +37,31 @@ def resume(store: Store, template: EngineModel, window: Window) -> Resumed:
             template.look_ahead_safely(labelled.traces)
         _tell(template, store, 0)
         return Resumed(None, 0, len(labelled.seq))
-    model = _restored(store, template, version.state, window.newest_seq)
+    model = restored(store, template, version.state, window.newest_seq)
     model.prepare_safely(template)
     model.look_ahead_safely(labelled.traces)
     trained_to = int(version.state["trained_on"][-1])
     # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
     known_to = version.last_seq if "points" in version.state else trained_to
     _add_since(model, store, version, labelled, known_to)
-    _tell(model, store, 0 if "untold" in version.state else version.last_seq)
+    _tell(model, store, _told_to(version))
     return Resumed(model, version.version, int((labelled.seq > trained_to).sum()))
 
 
-def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel:
+def _told_to(version: ModelVersion) -> int:
+    """The newest label that the rule in a stored version was told of."""
+    # A rule that missed something is told all anew; where cells share versions, it knows of this cell's own parts alone.
+    return 0 if "untold" in version.state else int(version.state.get("told_to", version.last_seq))
+
+
+def restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]], newest: int) -> EngineModel:
+    """The model of a stored version; newest : label in the store."""
     model = template.successor()
     if model.needs_refit(state):  # on the very traces that it was fitted on
         trained_on = state["trained_on"]
-        data = store.labelled(newest - int(trained_on[0]) + 1)
+        first, n = int(trained_on[0]), newest - int(trained_on[0]) + 1
+        # Of a product's labels the newest may have come a moment ago: counted from the first one none is missed.
+        data = store.news_since(first - 1, n).labelled if is_shared(store) else store.labelled(n)
         kept = np.isin(data.seq, trained_on)
         model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept])
     return model.set_state(state)

@@ -7,12 +7,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from .fleet import Fleet
 from .model.base import EngineModel, Told
 from .records import Reason, RetrainReport
 from .resuming import resume, tell_all
 from .retraining import Retrainer, Trained
 from .store.base import Store
 from .store.records import StoredDecision
+from .store.shared import is_shared
 
 Point = NDArray[np.float32]
 
@@ -35,6 +37,7 @@ class ModelVersions:
         self.answering: EngineModel | None = None
         self.version, self.new_labels = 0, 0
         self.store_waiting: Callable[[], None] = _nothing_waits
+        self.fleet = Fleet(store, self) if is_shared(store) else None
         self._news: RetrainReport | None = None
 
     @property
@@ -46,6 +49,13 @@ class ModelVersions:
         """Go on from the store."""
         resumed = resume(self.store, self.template, self.retrainer.window)
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
+        if self.fleet is not None:
+            self.fleet.resume()
+
+    def join(self) -> None:
+        """Start a new cell on what the others of its product learned; without a product there is nothing."""
+        if self.fleet is not None:
+            self.resume()
 
     def reference_point(self, known: StoredDecision) -> Point | None:
         """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
@@ -60,26 +70,38 @@ class ModelVersions:
         novel = known.reason is Reason.NOVEL
         self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
         self.newest.add_safely(point, int(success), known.content_hash)
-        self.new_labels += 1
+        self.new_labels += self.fleet is None  # a product's labels are counted in their order, when they are kept
 
     def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
         """Give a label that is stored to the next retrain."""
+        if self.fleet is not None:
+            self.fleet.keep(known.trace, int(success), known.content_hash, seq)
+            return
         self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
 
     def tell_anew(self) -> None:
-        """Tell the rule everything again: what it was told was not what happened."""
+        """Tell the rule everything again: what it was told of a part was not what happened; that counts as one label."""
+        self.new_labels -= self.fleet is None
         tell_all(self.newest, self.store)
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
         self.collect(wait=True)
-        self.store_waiting()
-        self.new_labels = 0
+        self._begin()
         return self._swap(self.retrainer.train(self.newest))
+
+    def _begin(self) -> None:
+        self.store_waiting()
+        if self.fleet is not None:
+            self.fleet.begin()
+        self.new_labels = 0
+
+    def _due(self, retrain_every: int) -> bool:
+        return self.new_labels >= retrain_every if self.fleet is None else self.fleet.due(retrain_every)
 
     def work(self, retrain_every: int) -> RetrainReport | None:
         """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training."""
-        if self.new_labels >= retrain_every:
+        if self._due(retrain_every):
             return self.start_retrain()
         if self.answering is not None:
             self.retrainer.improve(self.answering)
@@ -91,8 +113,7 @@ class ModelVersions:
             return self.retrain()
         self.collect()
         if not self.retrainer.busy:
-            self.store_waiting()
-            self.new_labels = 0
+            self._begin()
             self.retrainer.start(self.newest)
         return None
 
@@ -118,7 +139,10 @@ class ModelVersions:
             reason=trained.candidate.reason,
         )
         state = None if model is None else model.get_state() | {"trained_on": seq}
-        self.store.put_version(report, self.retrainer.window.newest_seq, state)
+        if self.fleet is not None:
+            report = self.fleet.put_version(report, state)
+        else:
+            self.store.put_version(report, self.retrainer.window.newest_seq, state)
         self._news = report
         return report
 

@@ -15,6 +15,7 @@ import click
 
 from .. import __version__
 from ..errors import DengineError
+from .cells import cells
 from .data import data
 from .export import export, import_labels
 from .interrupting import end_interrupted
@@ -63,5 +64,5 @@ def main() -> None:
     """
 
 
-for verb in (data, replay, compare, train, run, simulate, status, export, import_labels):
+for verb in (data, replay, compare, train, run, simulate, status, cells, export, import_labels):
     main.add_command(verb)

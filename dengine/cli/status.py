@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import example, json_option
+from .options import cell_options, example, json_option
 from .output import certificate_record, duration, show, write_json
 
 if TYPE_CHECKING:
     from ..decision.certificate import Certificate
     from ..recipe import Recipe
     from ..records import RetrainReport
-    from ..store.base import Event, Store
+    from ..store.base import Event, Evidence, Store
 
 RECENT = 200  # labels
 GUARANTEES = {
@@ -32,6 +32,7 @@ STOPS = {
 
 @click.command(epilog=example("dengine status engine.db"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @json_option
 def status(store: str, as_json: bool) -> None:
     """Say what a store holds, and what can be certified by it.
@@ -88,7 +89,7 @@ def _held(store: Store, settings: dict[str, str]) -> Held:
     from ..recipe import Recipe
 
     recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
-    newest = store.evidence_since(counts["labels"] - RECENT)  # labels are numbered from 1
+    newest = _newest(store, counts["labels"])
     modes = [event for event in store.events() if event.kind == "safe mode"]
     return Held(
         settings=settings,
@@ -100,6 +101,15 @@ def _held(store: Store, settings: dict[str, str]) -> Held:
         recent=len(newest.seq) + int(newest.silent.sum()),
         mode=modes[-1] if modes else None,
     )
+
+
+def _newest(store: Store, labels: int) -> Evidence:
+    """What became of the decisions with the newest labels, RECENT at most."""
+    from ..store.records import Evidence
+    from ..store.shared import is_shared
+
+    known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
+    return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
 
 
 def _record(held: Held) -> dict[str, Any]:
@@ -181,6 +191,8 @@ def _contract(trace: str | None) -> str:
 def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
     counts = held.counts
     yield "cell", counts["cell_id"]
+    if "product" in counts:
+        yield "product", f"{counts['product']}: labels and versions are shared with its other cells"
     yield "decisions", f"{counts['decisions']}: {_listed(counts['actions'])}"
     yield "reasons", _listed(counts["reasons"])
     yield "quarantined", str(counts["quarantined"])

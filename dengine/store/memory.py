@@ -173,12 +173,13 @@ class MemoryStore:
             self._take(label)  # at once, or the import would be forgotten
         return np.arange(first, first + len(given), dtype=np.int64)
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
         """Record a retrain; only the newest accepted state is kept."""
         copies = check_state(report, state)
         self._retrains.append(report)
         if report.accepted and copies is not None:
             self._version = ModelVersion(report.version, int(last_seq), copies)
+        return report.version
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version, with arrays of its own."""

@@ -42,17 +42,20 @@ from .records import (
     stored_decision,
     summary,
 )
+from .sql_fleet import ProductShare
 from .sql_queue import SqlDatabase
-from .sql_rows import CHUNK, chunks, from_npz, label_row, read_decision, read_evidence, read_traces, unpack, version_row
-from .sql_tables import EVENT, LABEL, SCHEMA_KEY, SETTING, VERSION
+from .sql_rows import chunks, label_row, read_decision, read_evidence, unpack, version_row
+from .sql_tables import EVENT, LABEL, RESERVED, SETTING, VERSION
 
 
-class SqlStore:
+class SqlStore(ProductShare):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
+    product : what the cell makes; cells of one product share labels and versions. None: as a known cell has it, or
+        nothing is shared.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may
     open one cell: label numbers stay unique and increasing. Their labels then mix, and neither engine learns of
@@ -63,29 +66,32 @@ class SqlStore:
     The queue holds 64 MB of traces; beyond that `put_decision` writes them itself, or says that it cannot.
     """
 
-    def __init__(self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self, url: str, cell_id: str = "cell", clock: Callable[[], float] = time.time, product: str | None = None
+    ) -> None:
         """Open or create the store, and start its writer thread."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
         self._clock = clock
-        self._database = SqlDatabase(str(url), cell_id)
+        self._database = SqlDatabase(str(url), cell_id, product)
 
     # Settings
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
-        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key != SCHEMA_KEY)
+        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key.not_in(RESERVED))
         return {row.key: row.value for row in self._read(query)}
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
         """Replace the settings by these."""
-        if SCHEMA_KEY in settings:
-            raise StoreError(f"Expected settings of the engine, got {SCHEMA_KEY!r}, which is the store's; rename it.")
+        for key in sorted(settings.keys() & set(RESERVED)):
+            raise StoreError(f"Expected settings of the engine, got {key!r}, which is the store's; rename it.")
         rows = [{"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()]
-        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key != SCHEMA_KEY)
+        mine = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
 
         def replace(connection: sa.Connection) -> None:
+            self._refuse_disagreement(connection, settings)
             connection.execute(sa.delete(SETTING).where(mine))
             if rows:
                 connection.execute(sa.insert(SETTING), rows)
@@ -192,16 +198,7 @@ class SqlStore:
     def labelled(self, limit: int | None = None) -> Labelled:
         """Return the newest `limit` labelled traces, oldest first; read along the index `label_training`."""
         with self._database.transaction(write=False) as connection:
-            newest = connection.execute(ask.newest_query(self.cell_id, limit)).all()[::-1]
-            first, last = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, first, last).execution_options(yield_per=CHUNK))
-            traces = read_traces(rows, len(newest))
-        return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64),
-            traces=traces,
-            labels=np.array([row.success for row in newest], dtype=np.int8),
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64),
-        )
+            return self._with_traces(connection, self._newest_labels(connection, limit)[::-1])
 
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         """Return the points of `model_version` that came with labels after `seq`."""
@@ -234,26 +231,26 @@ class SqlStore:
 
     # Model versions
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Commit a retrain; a dropped candidate has no state."""
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
+        """Commit a retrain; a dropped candidate has no state. Returns the version's number."""
         row = version_row(self.cell_id, report, int(last_seq), self._clock(), check_state(report, state))
 
-        def record(connection: sa.Connection) -> None:
+        def record(connection: sa.Connection) -> int:
             retrain = self._database.next_number(connection, VERSION.c.retrain)
-            connection.execute(sa.insert(VERSION), row | {"retrain": retrain})
+            number = self._database.scope.next_version(connection, report)
+            connection.execute(sa.insert(VERSION), row | {"retrain": retrain, "version": number})
+            return number
 
-        self._database.write(record)
+        return self._database.write(record)
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version."""
-        rows = self._read(ask.version_query(self.cell_id))
-        if not rows:
-            return None
-        return ModelVersion(rows[0].version, rows[0].last_seq, from_npz(rows[0].state, self._database.name))
+        rows = self._read(ask.version_query(self._database.scope))
+        return self._with_own_rule(rows[0]) if rows else None
 
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""
-        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self.cell_id))]
+        return [RetrainReport(*row) for row in self._read(ask.retrain_query(self._database.scope))]
 
     # Events
 
@@ -286,7 +283,7 @@ class SqlStore:
             max((row.last for row in sources), default=None),
             self.events(STATUS_EVENTS),
             self._database.failures,
-        )
+        ) | ({} if self.product is None else {"product": self.product})
 
     def close(self) -> None:
         """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""

@@ -8,6 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..records import Action
+from .sql_scope import Scope, newest_of
 from .sql_tables import DECISION, EVENT, LABEL, TRACE, VERSION
 
 Query = sa.Select[Any]
@@ -31,19 +32,25 @@ def held_query(cell_id: str, ids: Sequence[str]) -> Query:
     return sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id, DECISION.c.id.in_(ids))
 
 
-def newest_query(cell_id: str, limit: int | None) -> Query:
+def newest_query(scope: Scope, limit: int | None) -> Query:
     """The newest labels that train, newest first, without their traces; along the index `label_training`."""
     query = sa.select(*LABEL.c["seq", "success", "content_hash"])
-    query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false())
+    query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
     return query.order_by(LABEL.c.seq.desc()).limit(limit)
 
 
-def trace_query(cell_id: str, first: int, last: int) -> Query:
+def trace_query(scope: Scope, first: int, last: int) -> Query:
     """The traces of the labels `first` to `last` that train, oldest first."""
     same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
     query = sa.select(*TRACE.c["channels", "samples", "data"]).select_from(LABEL.join(TRACE, same))
-    mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
+    mine = scope.shared(LABEL.c.cell_id) & (LABEL.c.quarantined == sa.false())
     return query.where(mine, LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
+
+
+def news_query(scope: Scope, seq: int, limit: int) -> Query:
+    """The first labels after `seq` that train, oldest first, without their traces."""
+    mine = scope.shared(LABEL.c.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > seq)
+    return sa.select(*LABEL.c["seq", "success", "content_hash"]).where(mine).order_by(LABEL.c.seq).limit(limit)
 
 
 def points_query(cell_id: str, seq: int, model_version: int) -> Query:
@@ -94,17 +101,20 @@ def source_query(cell_id: str) -> Query:
     return query.where(LABEL.c.cell_id == cell_id).group_by(LABEL.c.source)
 
 
-def version_query(cell_id: str) -> Query:
+def version_query(scope: Scope) -> Query:
     """The newest accepted version."""
-    query = sa.select(*VERSION.c["version", "last_seq", "state"])
-    query = query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true())
+    query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state"])
+    query = query.where(scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
+    if scope.product is not None:  # by its number, or the arrays of all versions would be read to be sorted
+        newest = newest_of(scope.product, VERSION.c.retrain, VERSION.c.accepted == sa.true())
+        query = query.where(VERSION.c.retrain == newest.scalar_subquery())
     return query.order_by(VERSION.c.retrain.desc()).limit(1)
 
 
-def retrain_query(cell_id: str) -> Query:
+def retrain_query(scope: Scope) -> Query:
     """Every retrain, oldest first, with the fields of `RetrainReport`."""
     query = sa.select(*VERSION.c["version", "seconds", "n_traces", "n_steps", "accepted", "reason"])
-    return query.where(VERSION.c.cell_id == cell_id).order_by(VERSION.c.retrain)
+    return query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain)
 
 
 def event_query(cell_id: str, limit: int | None) -> Query:

@@ -16,7 +16,8 @@ from .checks import duplicate_id
 from .records import DecidedTrace
 from .sql_engine import advice, make_engine
 from .sql_rows import chunks, decision_row, trace_row
-from .sql_tables import DECISION, SCHEMA_KEY, SETTING, TRACE, prepare_tables
+from .sql_scope import Scope, join_product
+from .sql_tables import DECISION, TRACE, prepare_tables
 
 LINGER = 0.05  # seconds that a decision waits for company before it is committed
 RETRY = 1.0  # seconds before the writer tries again after a failure
@@ -30,11 +31,12 @@ class SqlDatabase:
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose decisions these are.
+    scope : the cell and its product.
     name : the URL without its password, for errors.
     failures : how many writes failed so far.
     """
 
-    def __init__(self, url: str, cell_id: str) -> None:
+    def __init__(self, url: str, cell_id: str, product: str | None = None) -> None:
         """Open or create the database, and start its writer thread."""
         self.cell_id = cell_id
         self.failures = 0
@@ -48,7 +50,7 @@ class SqlDatabase:
         self._lock = threading.Condition()  # guards the queue
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._stop = threading.Event()
-        self._open()
+        self.scope = self._open(product)
         self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
         self._writer.start()
         atexit.register(self._close_at_exit)
@@ -93,11 +95,8 @@ class SqlDatabase:
             return result
 
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
-        """Lock the cell (PostgreSQL; SQLite's BEGIN IMMEDIATE did it already), then number the next row of a table."""
-        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-        connection.execute(sa.select(SETTING).where(mine).with_for_update())
-        newest = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
-        return (connection.execute(newest).scalar() or 0) + 1
+        """Lock the cell, or its product, then number the next row of a table."""
+        return self.scope.next_number(connection, column)
 
     # The queue
 
@@ -169,12 +168,13 @@ class SqlDatabase:
 
     # Opening and closing
 
-    def _open(self) -> None:
+    def _open(self, product: str | None) -> Scope:
         try:
             with self._told("open"), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
                 with connection.begin():
                     prepare_tables(connection, self.cell_id, self.name)
+                    return Scope(self.cell_id, join_product(connection, self.cell_id, product))
         except StoreError:
             self._engine.dispose()
             raise
