@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DengineError, StoreError
+from .errors import StoreError
 from .recipe import Recipe
 from .records import RetrainReport, TraceSpec
 from .resuming import restored
@@ -176,9 +176,9 @@ class Fleet:
             state = without_rule(version.state)
             newest = max(window.newest_seq, version.last_seq)
             model = restored(self.store, versions.template, state, newest)
-        except (DengineError, ValueError, KeyError, RuntimeError, TypeError):
+        except Exception as error:  # what fails in a model is recorded, and the version before goes on answering
             log.exception("version %d of product %s cannot be taken over", version.version, self.store.product)
-            self._refused = version.version
+            self._refused = self._refused if isinstance(error, StoreError) else version.version
             return
         model.prepare_safely(versions.newest)
         window.catch_up(model, version.last_seq)

@@ -32,6 +32,7 @@ DATABASES = [
 ]
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
+CONV = Recipe.load("conv").with_settings(retrain_every=EVERY, max_steps=10)
 POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
 
 
@@ -129,8 +130,9 @@ def test_labels_of_one_cell_become_references_of_the_other(fleet: Fleet, parts: 
     assert said(second, probe) == said(first, probe)
 
 
-def test_one_retrain_serves_all(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
-    cells = [fleet.engine(name) for name in "abc"]
+@pytest.mark.parametrize("recipe", [RECIPE, CONV], ids=["pca", "conv"])
+def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
     for i in range(150):
         learn(cells[i % 3], parts, [i])
     for engine in cells:

@@ -24,14 +24,14 @@ def cells(store: str, as_json: bool) -> None:
     a cell without a product shares nothing. Other verbs name one of them by --cell.
     """
     from ..store.base import must_be_there
-    from ..store.sql_fleet import list_cells
+    from ..store.sql_fleet import list_cells, without_password
 
     must_be_there(store)
-    found = list_cells(store)
+    found, name = list_cells(store), without_password(store)
     if as_json:
-        write_json({"verb": "cells", "store": store, "cells": found})
+        write_json({"verb": "cells", "store": name, "cells": found})
         return
-    show(_table(store, found))
+    show(_table(name, found))
 
 
 def _table(store: str, found: list[CellSummary]) -> Any:

@@ -207,7 +207,11 @@ class SqlStore(ProductShare):
         return AddedPoints(seqs, stack([unpack(row.point) for row in rows], (0, 0)))
 
     def evidence_since(self, seq: int) -> Evidence:
-        """Return what became of the decisions whose labels came after `seq`, without the quarantined ones."""
+        """Return what became of this cell's decisions whose labels came after `seq`, without the quarantined ones.
+
+        A product's other cells are left out: a level that their streams certify says nothing certain of this one's, and
+        a watch that counts them would notice too late that this cell has changed.
+        """
         return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq))))
 
     def unreported_accepts(self) -> list[str]:

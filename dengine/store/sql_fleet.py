@@ -118,10 +118,16 @@ def _reading(url: str) -> Iterator[sa.Connection]:
         with engine.connect() as connection:
             yield connection
     except (sa.exc.SQLAlchemyError, OSError) as error:
-        name = engine.url.render_as_string(hide_password=True)
-        raise StoreError(f"Could not read {name}: {getattr(error, 'orig', None) or error}. {advice(error)}") from error
+        raise StoreError(
+            f"Could not read {without_password(url)}: {getattr(error, 'orig', None) or error}. {advice(error)}"
+        ) from error
     finally:
         engine.dispose()
+
+
+def without_password(url: str) -> str:
+    """A file or URL as it may be shown."""
+    return sa.make_url(url).render_as_string(hide_password=True) if "://" in url else url
 
 
 def cell_names(url: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -64,6 +65,7 @@ def cells_of(product: str) -> sa.Select[Any]:
     return sa.select(SETTING.c.cell_id).where(SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product)
 
 
+@lru_cache(maxsize=100)  # of a few products and columns: to write the statement takes longer than to answer it
 def newest_of(product: str, column: sa.Column[Any], *more: sa.ColumnElement[bool]) -> sa.Select[Any]:
     """The largest number in a column over a product's cells: a step down the index for each, of however many rows."""
     table, sister = column.table, cells_of(product).subquery()
