@@ -7,12 +7,14 @@ from pathlib import Path
 
 import click
 
+from .naming import cell_options
 from .options import example, force_option, json_option
 from .output import imported_line, show, size, write_json
 
 
 @click.command(epilog=example("dengine export engine.db --out model.ts"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @click.option(
     "--out",
     required=True,
@@ -52,6 +54,7 @@ def export(store: str, out: Path, form: str, force: bool, as_json: bool) -> None
 @click.command("import-labels", epilog=example("dengine import-labels cell.csv --store engine.db"))
 @click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
+@cell_options()
 @json_option
 def import_labels(journal: Path, store: str, as_json: bool) -> None:
     """Take a cell program's labels back into the store.
