@@ -167,6 +167,8 @@ class Corrections:
         self._keeper.check()
         self._versions.collect(HUNG)
         self._feedback.store_all()
+        if self._versions.fleet is not None:
+            self._versions.fleet.complete()
 
     def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
         self._make_ready()

@@ -29,6 +29,7 @@ from .decision.policy import Policy
 from .errors import StoreError
 from .facts import EngineFacts
 from .feedback import Feedback, unknown_stop
+from .fleet import agreed, as_sisters, trace_of_sisters
 from .interrupts import uninterrupted
 from .keeping import CLOSE, Keeper
 from .labels import as_id, as_success
@@ -98,9 +99,10 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
         with opening(store) as opened:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
-            self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
+            self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
                 self.store.save_settings(self._settings.to_store())
+                self._versions.join()
 
     def _start(
         self,
@@ -172,7 +174,7 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
         """
         with opening(store) as opened:
             if not opened.settings():
-                return cls(store=opened, seed=seed or 0, **settings)
+                return cls(store=opened, **as_sisters(settings | {"seed": seed}, opened))
             options = {name: settings.pop(name) for name in OPTIONS if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
             with engine._closed_on_failure():
@@ -202,7 +204,8 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
         if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
-            self.agree_on(spec, inferred=True)
+            if self.agree_on(spec, inferred=True) != spec:  # a sister's trace came first
+                return as_agreed(trace, self.trace, False)
         elif self._settings_waiting:
             self._save_settings()
         return x
@@ -277,6 +280,7 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
     def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
         """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
         if self.trace is None:
+            trace = trace_of_sisters(self._keeper) or trace
             self._settings = replace(self._settings, trace=trace, inferred=inferred)
             self._maker.agree_on(trace)
             self._save_settings()

@@ -48,6 +48,7 @@ class Feedback:
         self._mode = ""
         self._untrue = False  # whether the rule was told what did not happen
         versions.store_waiting = self.store_all
+        versions.journal_cleared = self.journal_cleared
 
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
@@ -112,7 +113,7 @@ class Feedback:
         self._learn(known, label, point)
         self._keep(known, success, int(seq))
         if late:
-            self.versions.new_labels -= 1
+            self.versions.new_labels -= self.versions.fleet is None
             self._untrue = True
         self.arrive()
         self.announce()
@@ -149,6 +150,10 @@ class Feedback:
     def store_all(self) -> None:
         """Have every label in the store; StoreError while some wait in its journal."""
         self.store_waiting()
+        self.journal_cleared()
+
+    def journal_cleared(self) -> None:
+        """StoreError while a label of this cell waits in the journal: of a product's news one may be that very label."""
         self.arrive()
         if self._in_journal:
             raise StoreError(f"{len(self._in_journal)} labels wait in the journal until the store is back.")

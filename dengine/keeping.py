@@ -146,9 +146,9 @@ class Keeper:
                 self._recent[label.decision_id] = replace(known, success=label.success, source=label.source)
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
-    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Commit a retrain; StoreError where the store does not take it now."""
-        self._commit(lambda: self.store.put_version(report, last_seq, state))
+    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
+        """Commit a retrain; returns the version's number. StoreError where the store does not take it now."""
+        return self._commit(lambda: self.store.put_version(report, last_seq, state))
 
     def event(self, kind: str, text: str) -> None:
         """Record what happened, in the journal where the store is away."""

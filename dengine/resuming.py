@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from .model.base import EngineModel, Told
 from .references import References
 from .store.base import Store
+from .store.fleet import without_rule
 from .store.records import Correction, Evidence, ModelVersion
 from .window import Window
 
-RULE = ("rule.", "untold")  # of a version's state: what its rule knew
 MANY = 500  # labels and no retrain yet: they were imported
 
 
@@ -73,11 +73,11 @@ class Resumed:
 
 def resume(store: Store, template: EngineModel, window: Window, telling: Telling) -> Resumed:
     """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
+    version = store.last_version()  # before the labels: a sister may store both meanwhile
     labelled = store.labelled(window.capacity)
     window.extend(labelled)
-    version = store.last_version()
     state = {} if version is None else _own_rule(version, telling)
-    model = None if version is None else _restored(store, template, state)
+    model = None if version is None else restored(store, template, state)
     if version is None or model is None:
         if len(labelled.seq) >= MANY:
             template.look_ahead_safely(labelled.traces)
@@ -88,12 +88,13 @@ def resume(store: Store, template: EngineModel, window: Window, telling: Telling
     origin = Origin.from_state(version.state)
     model.prepare_safely(template)
     model.look_ahead_safely(labelled.traces)
-    references, corrected_to = join_since(model, store, version, window.capacity)
-    anew = "untold" in version.state or version.version < telling.since
+    references, corrected_to = join_since(model, store, version, window)
+    told_to = int(version.state.get("told_to", version.last_seq))  # 0: a sister's, whose rule knows nothing of this cell
+    anew = not told_to or "untold" in version.state or version.version < telling.since
     if anew or corrected_to > corrected_at(version):
         tell_all(model, store.evidence_since(0, telling.since), telling)
     else:
-        _tell(model, store.evidence_since(version.last_seq, telling.since))
+        _tell(model, store.evidence_since(told_to, telling.since))
     new_labels = int((labelled.seq > origin.counts_from).sum())
     return Resumed(model, version.version, new_labels, references, origin, corrected_to)
 
@@ -103,12 +104,7 @@ def _own_rule(version: ModelVersion, telling: Telling) -> Mapping[str, NDArray[A
     return version.state if version.version >= telling.since else without_rule(version.state)
 
 
-def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """A version's state without what its rule knew."""
-    return {name: values for name, values in state.items() if not name.startswith(RULE)}
-
-
-def _restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
+def restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
     """The model of a version; None where it is refitted, and a trace that it was fitted on is damaged."""
     model = template.successor()
     # On the very traces that it was fitted on, with the labels that these had.
@@ -132,21 +128,26 @@ def refit(model: EngineModel, store: Store, origin: Origin) -> bool:
     return True
 
 
+def known_to(version: ModelVersion) -> int:
+    """The newest label that a version's references held when it was stored."""
+    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
+    return version.last_seq if "points" in version.state else int(version.state["trained_on"][-1])
+
+
 def corrected_at(version: ModelVersion) -> int:
     """The newest correction that a version's references had when it was stored."""
     return int(version.state.get("corrected_to", 0))
 
 
-def join_since(model: EngineModel, store: Store, version: ModelVersion, capacity: int) -> tuple[References, int]:
+def join_since(model: EngineModel, store: Store, version: ModelVersion, window: Window) -> tuple[References, int]:
     """Let a version's model learn what happened since it was stored, in that order: labels join, corrections change them.
 
     Returns the labels behind its references, and the newest correction.
     """
-    # A stored state holds what came in during its retrain; a rival, which has none, was refitted without that.
-    known_to = version.last_seq if "points" in version.state else int(version.state["trained_on"][-1])
     corrected_to = corrected_at(version)
     as_of = corrected_to if model.keeps_references else None  # a rival cannot be corrected afterwards
-    since = store.labelled(capacity, first=known_to + 1, corrected_to=as_of)
+    # Up to the newest in the window: what sisters stored since comes as their news.
+    since = store.labelled(window.capacity, first=known_to(version) + 1, last=window.newest_seq, corrected_to=as_of)
     references, corrections = _references(store, version), deque(store.corrections(corrected_to))
     newest = corrections[-1].number if corrections else corrected_to
     added = store.points_since(version.last_seq, version.version)
@@ -177,20 +178,23 @@ def change(model: EngineModel, references: References, store: Store, correction:
 
     A reference gets its new label, or leaves. What was forgotten and counts again joins as the newest.
     """
-    known = store.past_decision(correction.decision_id)
-    if known is None or known.quarantined or not model.keeps_references:
+    if not model.keeps_references:
         return True
+    # As reported, of whichever cell; nothing where the part was quarantined, or the trace is damaged.
+    data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=0)
+    known = None if len(data.seq) else store.past_decision(correction.decision_id)
+    if not len(data.seq) and (known is None or known.quarantined):
+        return True
+    hash_ = int(data.hashes[0]) if known is None else known.content_hash
     age, label = references.age(correction.seq), correction.success
     if age is not None:
-        done = model.change_reference(age, known.content_hash, None if label is None else int(label))
+        done = model.change_reference(age, hash_, None if label is None else int(label))
         if label is None:
             references.remove(age)
         return done
     if label is not None and correction.was is None:
-        # Nothing where the trace is damaged.
-        data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=correction.number)
-        point = model.place_safely(data.traces[0], known.content_hash) if len(data.seq) else None
-        if model.add_safely(point, int(label), known.content_hash):
+        point = model.place_safely(data.traces[0], hash_) if len(data.seq) else None
+        if model.add_safely(point, int(label), hash_):
             references.add(correction.seq)
     return True
 

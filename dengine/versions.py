@@ -9,35 +9,29 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .current import TELL_ALL, CurrentVersion
 from .decision.policy import Policy
 from .errors import StoreError
+from .fleet import Fleet
 from .keeping import Keeper
-from .model.base import EngineModel, Told
+from .model.base import EngineModel
 from .pending import HUNG
-from .records import Reason, RetrainReport
+from .records import RetrainReport
 from .reducers.base import State
 from .references import References
-from .resuming import Origin, Telling, change, join_since, refit, resume, tell_all, without_rule
+from .resuming import Origin, Telling, change, join_since, refit
 from .retraining import Retrainer, Trained
-from .store.base import Store
-from .store.records import Change, StoredDecision
+from .store.fleet import without_rule
+from .store.records import Change
+from .store.shared import is_shared
 
 log = logging.getLogger("dengine")
 
 Point = NDArray[np.float32]
-TELL_ALL = Telling()
 
 
-class ModelVersions:
-    """The versions of one engine's model: at most one answers, at most one is being trained.
-
-    template : untrained; what the first version is trained from.
-    answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
-    new_labels : since the last retrain began.
-    keeper : asks the store.
-    store_waiting : stores what the rule was told of and the store not yet, StoreError where it cannot; called before any
-        training or swap, since a version is stored after all that its rule was told of.
-    """
+class ModelVersions(CurrentVersion):
+    """The versions of one engine's model: at most one answers, at most one is being trained."""
 
     def __init__(
         self,
@@ -47,91 +41,29 @@ class ModelVersions:
         clock: Callable[[], float],
         telling: Telling = TELL_ALL,
     ) -> None:
-        self.template = template
-        self.telling = telling
-        self.retrainer = retrainer
-        self.keeper = keeper
-        self.clock = clock
-        self.answering: EngineModel | None = None
-        self.version, self.new_labels = 0, 0
-        self.store_waiting: Callable[[], None] = _nothing_waits
-        self._references, self._corrected_to = References(), 0
-        self._origin: Origin | None = None
-        self._newest = 0  # number that a version ever had; after damage an earlier one may answer
-        self._news: RetrainReport | None = None
+        super().__init__(template, retrainer, keeper, clock, telling)
+        if is_shared(keeper.store):
+            self.fleet = Fleet(keeper.store, self)
 
-    @property
-    def store(self) -> Store:
-        """What the keeper keeps; asked without a time limit, so not while the cell waits."""
-        return self.keeper.store
-
-    @property
-    def next_number(self) -> int:
-        """What the next version will be called."""
-        return self._newest + 1
-
-    @property
-    def newest(self) -> EngineModel:
-        """The model that answers, or the untrained one."""
-        return self.answering or self.template
-
-    def resume(self) -> None:
-        """Go on from the store."""
-        resumed = resume(self.store, self.template, self.retrainer.window, self.telling)
-        self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
-        self._references, self._origin = resumed.references, resumed.origin
-        self._corrected_to = resumed.corrected_to
-        self._newest = max((report.version for report in self.store.retrains()), default=0)
-
-    def reference_point(self, known: StoredDecision) -> Point | None:
-        """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
-        if self.answering is None:
-            return None
-        # What this very version embedded when it decided need not be embedded again.
-        embedding = known.embedding if known.model_version == self.version else None
-        return self.answering.place_safely(known.trace, known.content_hash, embedding)
-
-    def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
-        """Take in what became of a part: tell the rule, and make the trace a reference."""
-        novel = known.reason is Reason.NOVEL
-        if known.model_version >= self.telling.since:
-            self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
-        if self.newest.add_safely(point, int(success), known.content_hash):
-            self._references.add(known.id)
-        self.new_labels += 1
-
-    def unlearn(self, known: StoredDecision) -> None:
-        """Take out the reference of a part whose label waits for the store: it was not what happened."""
-        age = self._references.age(known.id)
-        if age is not None:
-            self.newest.change_reference(age, known.content_hash, None)
-            self._references.remove(age)
-
-    def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
-        """Give a label that is stored to the next retrain."""
-        self._references.number(known.id, seq)
-        self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
-
-    def tell_anew(self) -> None:
-        """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.keeper.ask(lambda: self.store.evidence_since(0, self.telling.since))
-        tell_all(self.newest, known, self.telling)
-
-    def correct(self) -> None:
+    def correct(self, own: bool = True) -> None:
         """Learn what the store's newest corrections say: references, window and rule, before the next decision.
 
-        What keeps references of its own, a rival, is trained anew at once.
+        What keeps references of its own, a rival, is trained anew at once; by the cell that corrected.
         """
         window = self.retrainer.window
-        window.refill(self.store.labelled(window.capacity))
+        last = None if self.fleet is None else window.newest_seq  # what sisters stored since comes as their news
+        window.refill(self.store.labelled(window.capacity, last=last))
         done = self.newest.keeps_references or self.answering is None
         for each in self.store.corrections(self._corrected_to):
             if self.answering is not None:
                 done &= change(self.answering, self._references, self.store, each)
             self._corrected_to = each.number
-        self.new_labels = window.after(0 if self._origin is None else self._origin.counts_from)
+        if self.fleet is None:
+            self.new_labels = window.after(0 if self._origin is None else self._origin.counts_from)
+        else:
+            self.fleet.recount()
         self.tell_anew()
-        if not done:
+        if own and not done:
             self.retrain()
 
     def roll_back(self, number: int, event: Change) -> RetrainReport:
@@ -149,12 +81,14 @@ class ModelVersions:
             )
         model.set_state(state)
         model.prepare_safely(self.newest)
-        references, _ = join_since(model, self.store, version, self.retrainer.window.capacity)
+        references, _ = join_since(model, self.store, version, self.retrainer.window)
         origin = replace(origin, counts_from=self.retrainer.window.newest_seq)
         n = len(origin.seq)
         report = RetrainReport(self.next_number, self.clock() - begin, n, 0, True, f"rolled back to version {number}")
         self._record(event, report, model, references, origin)
         self.new_labels = 0
+        if self.fleet is not None:
+            self.fleet.begin_counting()
         return report
 
     def set_policy(self, policy: Policy | None, telling: Telling, event: Change) -> None:
@@ -189,21 +123,30 @@ class ModelVersions:
 
     def _state(self, model: EngineModel, references: References, origin: Origin) -> State:
         own = {"references": references.seqs()} if model.keeps_references else {}
+        own |= {} if self.fleet is None else {"told_to": np.array(self.fleet.told_to)}
         return model.get_state() | origin.to_state() | own | {"corrected_to": np.array(self._corrected_to)}
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
         self.collect(HUNG)
-        self.store_waiting()
-        self.new_labels = 0
+        self._begin()
         return self._swap(self.retrainer.train(self.newest))
+
+    def _begin(self) -> None:
+        self.store_waiting()
+        if self.fleet is not None:
+            self.fleet.begin()
+        self.new_labels = 0
+
+    def _due(self, retrain_every: int) -> bool:
+        return self.new_labels >= retrain_every if self.fleet is None else self.fleet.due(retrain_every)
 
     def work(self, retrain_every: int) -> RetrainReport | None:
         """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training.
 
         While the store is away nothing is retrained: a version answers only once it is stored.
         """
-        if self.new_labels >= retrain_every and self._ready():
+        if self._due(retrain_every) and self._ready():
             return self.start_retrain()
         if self.answering is not None:
             self.retrainer.improve(self.answering)
@@ -222,9 +165,8 @@ class ModelVersions:
         if self.retrainer.busy:
             return None
         if self.retrainer.executor is not None:
-            self.store_waiting()
+            self._begin()
             if self.retrainer.start(self.newest):
-                self.new_labels = 0
                 return None
         return self.retrain()
 
@@ -256,11 +198,13 @@ class ModelVersions:
             state = self._state(model, references, origin)
         # Until the version could answer; storing it comes on top.
         report = replace(report, seconds=self.clock() - trained.begin)
-        self.keeper.version(report, self.retrainer.window.newest_seq, state)
+        report = replace(report, version=self.keeper.version(report, self.retrainer.window.newest_seq, state))
         if model is not None:
             self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
             self._references, self._origin = references, origin
+            if self.fleet is not None:
+                self.fleet.swapped(model)
         return report
 
     def _not_stored(self, report: RetrainReport, error: StoreError) -> RetrainReport:
@@ -274,7 +218,3 @@ class ModelVersions:
         """The newest retrain, once."""
         news, self._news = self._news, None
         return news
-
-
-def _nothing_waits() -> None:
-    """No label waits for the store."""

@@ -22,6 +22,7 @@ from hypothesis.extra import numpy as hnp
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, open_store, sql_queries, sql_queue
+from dengine.store.sql_scope import Scope
 
 C, T = 2, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -780,8 +781,8 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
 def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
         for query in (
-            sql_queries.newest_query("cell", 100),
-            sql_queries.trace_query("cell", 5, 10),
+            sql_queries.newest_query(Scope("cell"), 100),
+            sql_queries.trace_query(Scope("cell"), 5, 10),
             sql_queries.decision_query("cell", "a"),
             sql_queries.evidence_query("cell", 5),
             sql_queries.held_query("cell", ["a", "b"]),

@@ -15,6 +15,7 @@ from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import Change, MemoryStore, NewLabel, SqlStore, Store
 from dengine.store import sql_queries as ask
+from dengine.store.sql_scope import Scope
 
 C, T = 1, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -243,7 +244,9 @@ def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(t
         fill(store)
         correct(store, None, "0")
         with store._database.transaction(write=False) as connection:
-            text = str(ask.newest_query("cell", 3).compile(connection.engine, compile_kwargs={"literal_binds": True}))
+            text = str(
+                ask.newest_query(Scope("cell"), 3).compile(connection.engine, compile_kwargs={"literal_binds": True})
+            )
             plan = " | ".join(row.detail for row in connection.execute(sa.text(f"EXPLAIN QUERY PLAN {text}")))
     assert "USING INDEX label_training" in plan
     assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan

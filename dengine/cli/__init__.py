@@ -16,6 +16,7 @@ import click
 from .. import __version__
 from ..errors import DengineError
 from ..wording import without_password
+from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy
 from .data import data
 from .explaining import explain
@@ -73,7 +74,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, history, explain, verify, dump),
+    *(data, replay, compare, train, run, simulate, status, cells, history, explain, verify, dump),
     *(correct, forget, rollback, set_policy, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

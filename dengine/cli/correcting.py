@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .naming import cell_options
 from .options import SETTINGS, example, json_option
 from .output import certificate_record, show, write_json
 
@@ -20,7 +21,13 @@ Command = Callable[..., Any]
 LABELS = {"good": True, "bad": False}
 INTERVALS = ("binomial", "wilson", "clopper_pearson", "jeffreys")  # whose functions are not imported to parse
 POLICY = ("alpha", "lower_bound", "guarantee", "stops", "audit_rate")
-store_argument = click.argument("store", metavar="STORE")
+
+
+def store_argument(command: Command) -> Command:
+    """STORE, and whose rows of it."""
+    return click.argument("store", metavar="STORE")(cell_options()(command))
+
+
 author_option = click.option("--author", help="Who says so, for the record.  [default: the login name]")
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .naming import cell_options
 from .options import example, json_option, out_file_option
 from .output import show, when, write_json
 
@@ -20,6 +21,7 @@ MOST = 5  # excesses that are named
 
 @click.command(epilog=example("dengine explain engine.db last --out why.png"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @click.argument("decision", metavar="DECISION")
 @click.option(
     "--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references that are shown."

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import click
 
+from .naming import cell_options
 from .options import example, force_option, json_option
 from .output import imported_line, show, size, write_json
 
 
 @click.command(epilog=example("dengine export engine.db --out model.ts"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @click.option(
     "--out",
     required=True,
@@ -63,6 +65,7 @@ def export(store: str, out: Path, form: str, key: Path | None, force: bool, as_j
 @click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
 @click.option("--any-model", is_flag=True, help="Take a journal of a model that the store does not know as its export.")
+@cell_options()
 @json_option
 def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> None:
     """Take a cell program's labels back into the store.

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..records import Action, Reason
+from .naming import cell_options
 from .options import example, json_option
 from .output import duration, write_json
 
@@ -50,6 +51,7 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 
 @click.command(epilog=example("dengine history engine.db --last 20 --events"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
 @click.option("--action", type=click.Choice([each.value for each in Action]), help="Only what was decided so.")
 @click.option("--reason", type=click.Choice([each.value for each in Reason]), metavar="REASON", help=(

@@ -6,10 +6,12 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import click
 
 from .interrupting import EndAskedError, end_interrupted, interruptible
+from .naming import cell_options
 from .options import (
     DataChoice,
     OutFolder,
@@ -49,6 +51,7 @@ STRETCHES = 6
 @scenario_option
 @click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
 @click.option("--store", metavar="FILE|URL", help="Remembers everything; without one the run is forgotten.")
+@cell_options("--cell-id", product=True)
 @recipe_options
 @click.option(
     "--seed", type=click.IntRange(0), help="An integer, of a new store's engine and of the simulated cell.  [default: 0]"
@@ -146,9 +149,12 @@ def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
 
 def _simulated(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
+    from ..store.shared import is_shared
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]
+    if is_shared(store):  # sisters have one seed, and parts of their own all the same
+        seed += crc32(store.cell_id.encode())
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
 
@@ -158,10 +164,12 @@ def _recorded(store: Store, seed: int, source: DataChoice, scenario: str, cycles
     from ..cells.replay import ReplayCell
     from ..errors import SettingError
     from ..folds import content_hash
+    from ..store.shared import is_shared
 
     dataset = source.load()
     # By content: of a part that comes twice the store's own hash would name both.
-    hashes = content_hash(store.labelled().traces)
+    played = store.own_labelled() if is_shared(store) else store.labelled()
+    hashes = content_hash(played.traces)
     for id_ in store.unreported_accepts()[-1:]:
         newest = store.get_decision(id_)
         hashes = hashes if newest is None else np.append(hashes, content_hash(newest.trace[None]))

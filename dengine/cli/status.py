@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import click
 
 from ..wording import without_password
 from .doing import Doing, doing_record, doing_table, drawn
+from .naming import cell_options
 from .options import example, json_option, out_file_option
 from .output import certificate_record, duration, show, when, write_json
 from .watching import redraw
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from ..decision.certificate import Certificate
     from ..recipe import Recipe
     from ..records import RetrainReport
-    from ..store.base import Event, Store
+    from ..store.base import Event, Evidence, Store
 
 RECENT = 200  # labels
 GUARANTEES = {
@@ -34,6 +35,7 @@ STOPS = {
 
 @click.command(epilog=example("dengine status engine.db --last 500"))
 @click.argument("store", metavar="STORE")
+@cell_options()
 @click.option(
     "--last", type=click.IntRange(1), default=500, show_default=True, help="The newest so many decisions, looked at apart."
 )
@@ -123,7 +125,7 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
     from ..standing import standing, watch
 
     recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
-    newest = store.evidence_since(counts["labels"] - RECENT)  # labels are numbered from 1
+    newest = _newest(store, counts["labels"])
     modes = [event for event in store.events() if event.kind == "safe mode"]
     return Held(
         settings=settings,
@@ -136,6 +138,15 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
         mode=modes[-1] if modes else None,
         doing=Doing(standing(store, recipe, last), watch(store, recipe), recipe.policy.alpha, last),
     )
+
+
+def _newest(store: Store, labels: int) -> Evidence:
+    """What became of the decisions with the newest labels, RECENT at most."""
+    from ..store.records import Evidence
+    from ..store.shared import is_shared
+
+    known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
+    return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
 
 
 def _record(held: Held) -> dict[str, Any]:
@@ -217,6 +228,8 @@ def _contract(settings: dict[str, str]) -> str:
 def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
     counts = held.counts
     yield "cell", counts["cell_id"]
+    if "product" in counts:
+        yield "product", f"{counts['product']}: labels and versions are shared with its other cells"
     yield "decisions", f"{counts['decisions']}: {_listed(counts['actions'])}"
     yield "reasons", _listed(counts["reasons"])
     yield "quarantined", str(counts["quarantined"])

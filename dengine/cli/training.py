@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .interrupting import Asked, EndAskedError, end_interrupted, interruptible
+from .naming import cell_options
 from .options import DataChoice, RecipeChoice, data_options, example, json_option, recipe_options, short_name
 from .output import imported_line, progress, show, write_json
 
@@ -23,6 +24,7 @@ RETRAINS = 10
 @click.command(epilog=example("dengine train --data insertion --store engine.db --reducer conv"))
 @data_options(None)
 @click.option("--store", required=True, metavar="FILE|URL", help="Where the engine remembers; made if need be.")
+@cell_options(product=True)
 @recipe_options
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
 @click.option(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
+from .fleet import CellAddress
 from .kept_versions import StoredVersion
 from .memory import MemoryStore
 from .records import (
@@ -116,8 +117,11 @@ class Store(StoreViews, Protocol):
         parts : serial number of the part of each trace, as in `put_decision`; None: of all unknown.
         """
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
-        """Record a retrain; a dropped candidate has no state."""
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
+        """Record a retrain; a dropped candidate has no state. Returns the version's number.
+
+        That is the report's, but where cells share versions and a sister's was stored meanwhile: then the next.
+        """
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version; of a damaged one an event tells, and the one before it is returned."""
@@ -186,22 +190,33 @@ class Store(StoreViews, Protocol):
 def open_store(store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False) -> Store:
     """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
 
-    must_exist : a file that is not there is a StoreError; by default it is made.
+    A file or URL may say whose rows it means, and what that cell makes: `fleet.address`.
+    must_exist : a file or a cell that is not there is a StoreError; by default it is made.
     """
     if store is None:
         return MemoryStore()
     if isinstance(store, str | os.PathLike):
-        if must_exist and "://" not in str(store) and not Path(store).is_file():
-            raise StoreError(
-                f"Expected a store that an engine has used, found no file {store}; "
-                "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
-            )
+        if must_exist:
+            must_be_there(store)
         from .sql import SqlStore  # SQLAlchemy is imported where it is used
+        from .sql_fleet import must_have_cell
 
-        return SqlStore(os.fspath(store))
+        cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
+        if must_exist:
+            must_have_cell(os.fspath(store), cell_id)
+        return SqlStore(os.fspath(store), cell_id, product=product)
     if not isinstance(store, Store):
         raise StoreError(f"Expected None, a file, a URL or a Store, got {type(store).__name__}; see `Store`.")
     return store
+
+
+def must_be_there(store: str | os.PathLike[str]) -> None:
+    """StoreError for a file that is not there; of a database behind a URL nothing is asked."""
+    if "://" not in str(store) and not Path(store).is_file():
+        raise StoreError(
+            f"Expected a store that an engine has used, found no file {store}; "
+            "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
+        )
 
 
 @contextmanager

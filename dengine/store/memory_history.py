@@ -47,7 +47,7 @@ class MemoryHistory:
 
     # Model versions
 
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> None:
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
         """Record a retrain; of older versions few keep their states, as in a database. A dropped candidate has none."""
         copies, now = check_state(report, state), self._clock()
         self._retrains.append(report)
@@ -58,6 +58,7 @@ class MemoryHistory:
         if report.accepted and copies is not None:
             held = self._states | {report.version: ModelVersion(report.version, int(last_seq), copies)}
             self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
+        return report.version
 
     def last_version(self) -> ModelVersion | None:
         """Return the newest accepted version, with arrays of its own."""

@@ -44,7 +44,7 @@ from .sql_history import SqlHistory, replacing
 from .sql_owning import WAIT, SqlOwning
 from .sql_queue import SqlDatabase
 from .sql_rows import chunks, label_row, read_decision, read_evidence, unpack
-from .sql_tables import LABEL, SCHEMA_KEY, SETTING
+from .sql_tables import LABEL, RESERVED, SETTING
 from .sql_traces import SqlTraces, check_trace
 from .sql_views import SqlViews
 
@@ -58,6 +58,8 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
+    product : what the cell makes; cells of one product share labels and versions. None: as a known cell has it, or
+        nothing is shared.
     wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
     keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
         None: all keep them. A retrain itself stays listed for ever.
@@ -76,6 +78,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         cell_id: str = "cell",
         clock: Callable[[], float] = time.time,
         *,
+        product: str | None = None,
         wait: float = WAIT,
         keep_versions: int | None = KEEP,
     ) -> None:
@@ -87,16 +90,22 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
             raise StoreError(f"Expected a wait above 0 seconds, got {wait!r}; 0.4 is the default.")
         self.keep_versions = check_keep(keep_versions)
         self._clock, self.wait = clock, wait
-        self._database = SqlDatabase(str(url), cell_id, clock)
+        self._database = SqlDatabase(str(url), cell_id, clock, product)
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
-        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key != SCHEMA_KEY)
+        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key.not_in(RESERVED))
         return {row.key: row.value for row in self._read(query)}
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
         """Replace the settings by these."""
-        self._database.write(replacing(self.cell_id, settings))
+        replace = replacing(self.cell_id, settings)
+
+        def save(connection: sa.Connection) -> None:
+            self._refuse_disagreement(connection, settings)
+            replace(connection)
+
+        self._database.write(save)
 
     # Decisions
 
@@ -208,7 +217,11 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         return AddedPoints(seqs, stack([unpack(row.point) for row in rows], (0, 0)))
 
     def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
-        """Return what became of the decisions whose labels came after `seq`, without the quarantined and the forgotten."""
+        """Return what became of this cell's decisions whose labels came after `seq`, without the quarantined and forgotten.
+
+        A product's other cells are left out: a level that their streams certify says nothing certain of this one's, and
+        a watch that counts them would notice too late that this cell has changed.
+        """
         return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq), int(since_version))))
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
@@ -250,7 +263,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
             self.events(STATUS_EVENTS),
             self._database.failures,
             self._corrected(),
-        )
+        ) | ({} if self.product is None else {"product": self.product})
 
     def __enter__(self) -> Self:
         return self

@@ -14,6 +14,7 @@ import sqlalchemy as sa
 from ..errors import DengineError, StoreError
 from .sql_engine import WatchedFile, advice, make_engine
 from .sql_ledger import LedgerEntry, chain_writes
+from .sql_scope import Scope, join_product
 from .sql_tables import prepare_tables
 
 OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)  # the database itself is well
@@ -24,11 +25,12 @@ class SqlConnections:
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     clock : the time in seconds that entries of the ledger are stamped with.
+    scope : the cell and its product.
     name : the URL without its password, for errors.
     failures : how many writes failed so far.
     """
 
-    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
         self.cell_id = cell_id
         self.failures = 0
         self._clock = clock
@@ -41,7 +43,7 @@ class SqlConnections:
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._lease: Callable[[sa.Connection], None] | None = None  # taken again on each new connection that writes
         self._leased: sa.Connection | None = None
-        self._open()
+        self.scope = self._open(product)
         self._file = WatchedFile(self._engine.url)
 
     @property
@@ -49,12 +51,13 @@ class SqlConnections:
         """Of the database, its password included."""
         return self._engine.url
 
-    def _open(self) -> None:
+    def _open(self, product: str | None) -> Scope:
         try:
             with self._told("open"), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
                 with connection.begin():
                     prepare_tables(connection, self.cell_id, self.name)
+                    return Scope(self.cell_id, join_product(connection, self.cell_id, product))
         except StoreError:
             self._engine.dispose()
             raise

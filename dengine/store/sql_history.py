@@ -11,12 +11,13 @@ from ..errors import StoreError
 from . import sql_queries as ask
 from .checks import as_data, as_text, check_state, nothing_to_correct, unknown_decision
 from .records import Change, Correction, Event, as_label
+from .sql_fleet import ProductShare
 from .sql_rows import chunks, event_row, read_event, version_row
-from .sql_tables import CORRECTION, EVENT, LABEL, SCHEMA_KEY, SETTING
+from .sql_tables import CORRECTION, EVENT, LABEL, RESERVED, SETTING
 from .sql_versions import SqlVersions
 
 
-class SqlHistory(SqlVersions):
+class SqlHistory(SqlVersions, ProductShare):
     """The part of `SqlStore` that is about its history."""
 
     def _read(self, query: sa.Select[Any]) -> Sequence[Any]:
@@ -56,12 +57,21 @@ class SqlHistory(SqlVersions):
             if change.decisions:
                 self._correct(connection, change, author, number, now)
             if version is not None:
-                self._add_version(connection, version)
-            if replace is not None:
+                self._add_as_numbered(connection, version)
+            if change.settings is not None and replace is not None:
+                self._refuse_disagreement(connection, change.settings)
                 replace(connection)
             return number
 
         return self._database.write(add)
+
+    def _add_as_numbered(self, connection: sa.Connection, row: dict[str, Any]) -> None:
+        number = self._add_version(connection, row)
+        if number != row["version"]:
+            raise StoreError(
+                f"Expected version {row['version']} to be the next, a sister of the product stored {number - 1} meanwhile; "
+                "try it again."
+            )
 
     def _correct(self, connection: sa.Connection, change: Change, author: str, event: int, now: float) -> None:
         found = [row for part in chunks(change.decisions) for row in connection.execute(ask.held_query(self.cell_id, part))]
@@ -83,7 +93,7 @@ class SqlHistory(SqlVersions):
 
     def corrections(self, after: int = 0) -> list[Correction]:
         """Return the corrections after number `after`, oldest first."""
-        return [Correction(*row) for row in self._read(ask.correction_query(self.cell_id, int(after)))]
+        return [Correction(*row) for row in self._read(ask.correction_query(self._database.scope, int(after)))]
 
     def _corrected(self) -> dict[str, int]:
         """How many decisions count otherwise than they were reported, and how many are forgotten."""
@@ -94,10 +104,10 @@ class SqlHistory(SqlVersions):
 
 def replacing(cell_id: str, settings: Mapping[str, str]) -> Callable[[sa.Connection], None]:
     """What puts these settings in the place of a cell's present ones."""
-    if SCHEMA_KEY in settings:
-        raise StoreError(f"Expected settings of the engine, got {SCHEMA_KEY!r}, which is the store's; rename it.")
+    for key in sorted(settings.keys() & set(RESERVED)):
+        raise StoreError(f"Expected settings of the engine, got {key!r}, which is the store's; rename it.")
     rows = [{"cell_id": cell_id, "key": key, "value": value} for key, value in settings.items()]
-    mine = (SETTING.c.cell_id == cell_id) & (SETTING.c.key != SCHEMA_KEY)
+    mine = (SETTING.c.cell_id == cell_id) & SETTING.c.key.not_in(RESERVED)
 
     def replace(connection: sa.Connection) -> None:
         connection.execute(sa.delete(SETTING).where(mine))

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .chain import START, added_text, entry_digest, plain_row, row_sum, settings_text, state_sum
-from .sql_tables import CHAINED, LEDGER, SCHEMA_KEY, SETTING
+from .sql_tables import CHAINED, LEDGER, RESERVED, SCHEMA_KEY, SETTING
 
 DOUBLES = {
     name: tuple(column.name for column in table.c if isinstance(column.type, sa.Double)) for name, table in CHAINED.items()
@@ -90,7 +90,7 @@ def new_entry(
 
 def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     """Return a cell's settings, without the store's own."""
-    query = sa.select(SETTING.c.key, SETTING.c.value).where(SETTING.c.cell_id == cell_id, SETTING.c.key != SCHEMA_KEY)
+    query = sa.select(SETTING.c.key, SETTING.c.value).where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
     return {row.key: row.value for row in connection.execute(query)}
 
 

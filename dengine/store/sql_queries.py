@@ -9,6 +9,7 @@ import sqlalchemy as sa
 
 from ..records import Action
 from .records import FORGOTTEN
+from .sql_scope import Scope
 from .sql_tables import CORRECTION, DECISION, EVENT, LABEL, TRACE, VERSION
 
 Query = sa.Select[Any]
@@ -61,7 +62,7 @@ def held_query(cell_id: str, ids: Sequence[str]) -> Query:
 
 
 def newest_query(
-    cell_id: str, limit: int | None, first: int = 1, last: int | None = None, corrected_to: int | None = None
+    scope: Scope, limit: int | None, first: int = 1, last: int | None = None, corrected_to: int | None = None
 ) -> Query:
     """The newest labels that train, newest first, without their traces; along the index `label_training`.
 
@@ -69,18 +70,25 @@ def newest_query(
     """
     success = counted(corrected_to).label("success")
     query = sa.select(LABEL.c.seq, success, *LABEL.c["content_hash", "decision_id"])
-    query = query.where(LABEL.c.cell_id == cell_id, LABEL.c.quarantined == sa.false(), remembered(corrected_to))
+    query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), remembered(corrected_to))
     query = query if first <= 1 else query.where(LABEL.c.seq >= first)
     query = query if last is None else query.where(LABEL.c.seq <= last)
     return query.order_by(LABEL.c.seq.desc()).limit(limit)
 
 
-def trace_query(cell_id: str, first: int, last: int) -> Query:
+def trace_query(scope: Scope, first: int, last: int) -> Query:
     """The traces of the labels `first` to `last`, the forgotten too, oldest first."""
     same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
     query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same))
-    mine = (LABEL.c.cell_id == cell_id) & (LABEL.c.quarantined == sa.false())
+    mine = scope.shared(LABEL.c.cell_id) & (LABEL.c.quarantined == sa.false())
     return query.where(mine, LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
+
+
+def news_query(scope: Scope, seq: int, limit: int) -> Query:
+    """The first labels after `seq` that train, oldest first, without their traces."""
+    mine = scope.shared(LABEL.c.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > seq) & remembered()
+    query = sa.select(LABEL.c.seq, counted().label("success"), *LABEL.c["content_hash", "decision_id"])
+    return query.where(mine).order_by(LABEL.c.seq).limit(limit)
 
 
 def points_query(cell_id: str, seq: int, model_version: int) -> Query:
@@ -139,36 +147,36 @@ def source_query(cell_id: str) -> Query:
     return query.where(LABEL.c.cell_id == cell_id, remembered()).group_by(LABEL.c.source)
 
 
-def version_query(cell_id: str, retrain: int) -> Query:
+def version_query(scope: Scope, retrain: int) -> Query:
     """An accepted version with its state."""
-    query = sa.select(*VERSION.c["version", "last_seq", "state", "state_sum"])
-    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.retrain == retrain)
+    query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
+    return query.where(scope.shared(VERSION.c.cell_id), VERSION.c.retrain == retrain)
 
 
-def accepted_query(cell_id: str) -> Query:
+def accepted_query(scope: Scope) -> Query:
     """The accepted versions, newest first, and whether each has its state."""
     query = sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
-    query = query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true())
+    query = query.where(scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
     return query.order_by(VERSION.c.retrain.desc())
 
 
-def held_states_query(cell_id: str) -> Query:
+def held_states_query(scope: Scope) -> Query:
     """The accepted versions that have their states."""
     query = sa.select(*VERSION.c["retrain", "version"])
-    return query.where(VERSION.c.cell_id == cell_id, VERSION.c.accepted == sa.true(), VERSION.c.state.is_not(None))
+    return query.where(scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true(), VERSION.c.state.is_not(None))
 
 
-def versions_query(cell_id: str) -> Query:
+def versions_query(scope: Scope) -> Query:
     """Every retrain, oldest first, with the size of its state, NULL where it has none."""
     size = sa.func.length(VERSION.c.state).label("n_bytes")
     query = sa.select(*VERSION.c["version", "time", "accepted", "reason"], size)
-    return query.where(VERSION.c.cell_id == cell_id).order_by(VERSION.c.retrain)
+    return query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain)
 
 
-def retrain_query(cell_id: str) -> Query:
+def retrain_query(scope: Scope) -> Query:
     """Every retrain, oldest first, with the fields of `RetrainReport`."""
     query = sa.select(*VERSION.c["version", "seconds", "n_traces", "n_steps", "accepted", "reason"])
-    return query.where(VERSION.c.cell_id == cell_id).order_by(VERSION.c.retrain)
+    return query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain)
 
 
 def event_query(cell_id: str, limit: int | None) -> Query:
@@ -177,12 +185,12 @@ def event_query(cell_id: str, limit: int | None) -> Query:
     return sa.select(*columns).where(EVENT.c.cell_id == cell_id).order_by(EVENT.c.number.desc()).limit(limit)
 
 
-def correction_query(cell_id: str, after: int) -> Query:
+def correction_query(scope: Scope, after: int) -> Query:
     """The corrections after number `after`, oldest first, with the fields of `Correction`."""
     own = ("number", "time", "decision_id", "success", "was", "author", "event", "newest_seq")
     same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
     query = sa.select(*CORRECTION.c[own], LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
-    return query.where(CORRECTION.c.cell_id == cell_id, CORRECTION.c.number > after).order_by(CORRECTION.c.number)
+    return query.where(scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > after).order_by(CORRECTION.c.number)
 
 
 def corrected_query(cell_id: str) -> Query:

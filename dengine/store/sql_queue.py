@@ -17,7 +17,7 @@ from .checks import as_text, duplicate_id
 from .records import DecidedTrace
 from .sql_connections import OF_A_ROW, SqlConnections
 from .sql_rows import chunks, decision_row, event_row, trace_row
-from .sql_tables import DECISION, EVENT, SCHEMA_KEY, SETTING, TRACE
+from .sql_tables import DECISION, EVENT, TRACE
 
 log = logging.getLogger("dengine")
 LINGER = 0.05  # seconds that a decision waits for company before it is committed
@@ -30,10 +30,10 @@ T = TypeVar("T")
 class SqlDatabase(SqlConnections):
     """An open database, and the decisions on their way to it."""
 
-    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
         """Open or create the database, and start its writer thread."""
         self._queue: dict[str, DecidedTrace] = {}
-        super().__init__(url, cell_id, clock)
+        super().__init__(url, cell_id, clock, product)
         self._queue_bytes = 0
         self._clash: StoreError | None = None
         self._lock = threading.Condition()  # guards the queue
@@ -96,11 +96,8 @@ class SqlDatabase(SqlConnections):
         self._commit(record, [])
 
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
-        """Lock the cell (PostgreSQL; SQLite's BEGIN IMMEDIATE did it already), then number the next row of a table."""
-        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-        connection.execute(sa.select(SETTING).where(mine).with_for_update())
-        newest = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
-        return (connection.execute(newest).scalar() or 0) + 1
+        """Lock the cell, and its product, then number the next row of a table."""
+        return self.scope.next_number(connection, column)
 
     def _waiting(self) -> str:
         n = len(self._queue)

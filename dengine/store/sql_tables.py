@@ -8,6 +8,9 @@ from ..errors import StoreError
 
 SCHEMA = "3"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
+PRODUCT_KEY = "product"  # a row of `setting` for every cell that shares what it learns
+OWNER_KEY = "owner"  # a row of `setting` for every cell that an engine drives, where the store keeps one
+RESERVED = (SCHEMA_KEY, PRODUCT_KEY, OWNER_KEY)  # rows of `setting` that are the store's own
 
 METADATA = sa.MetaData()
 
@@ -81,7 +84,7 @@ VERSION = sa.Table(  # every retrain, dropped candidates included
     "model_version",
     METADATA,
     sa.Column("cell_id", sa.String, primary_key=True),
-    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
+    sa.Column("retrain", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell, or product
     sa.Column("version", sa.BigInteger, nullable=False),
     sa.Column("time", sa.Double, nullable=False),
     sa.Column("seconds", sa.Double, nullable=False),

@@ -7,16 +7,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from ..errors import StoreError
 from . import sql_queries as ask
 from .chain import row_sum
 from .checks import mixed_shapes
+from .fleet import News
 from .records import Labelled
 from .sql_queue import SqlDatabase
 from .sql_rows import CHUNK, unpack_trace
-from .sql_tables import TRACE
+from .sql_scope import Scope, newest_of
+from .sql_tables import CORRECTION, LABEL, TRACE, VERSION
 
 COLUMNS = tuple(TRACE.c.keys())
 NAMED = 20  # decisions that an event names
@@ -36,20 +39,60 @@ class SqlTraces:
 
         A trace that is not as it was stored is left out; an event names its decision.
         """
-        query = ask.newest_query(self.cell_id, limit, int(first), last, corrected_to)
+        scope = self._database.scope
+        query = ask.newest_query(scope, limit, int(first), last, corrected_to)
         with self._database.transaction(write=False) as connection:
-            newest = connection.execute(query).all()[::-1]
-            begin, end = (newest[0].seq, newest[-1].seq) if newest else (1, 0)
-            rows = connection.execute(ask.trace_query(self.cell_id, begin, end).execution_options(yield_per=CHUNK))
-            sound = sound_traces(rows, [row.seq for row in newest])  # the forgotten are not among them
+            rows = self._newest(connection, query, limit, last)[::-1]
+            sound = self._sound(connection, rows, scope)
+        return self._labelled(rows, sound)
+
+    def _newest(self, connection: sa.Connection, query: ask.Query, limit: int | None, last: int | None) -> Sequence[Any]:
+        """The newest labels, newest first. Of a product: by their numbers, or all would be read to be sorted."""
+        scope = self._database.scope
+        if scope.product is not None and limit is not None:
+            newest = connection.execute(newest_of(scope.product, LABEL.c.seq)).scalar() or 0
+            newest = newest if last is None else min(newest, last)
+            rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
+            if len(rows) == limit or newest <= 2 * limit:
+                return rows
+        return connection.execute(query).all()  # more than every second is quarantined or forgotten
+
+    def _sound(self, connection: sa.Connection, rows: Sequence[Any], scope: Scope) -> SoundTraces:
+        """The traces of labels, oldest first, read one after the other."""
+        first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
+        found = connection.execute(ask.trace_query(scope, first, last).execution_options(yield_per=CHUNK))
+        return sound_traces(found, [row.seq for row in rows])  # the forgotten are not among them
+
+    def _labelled(self, rows: Sequence[Any], sound: SoundTraces) -> Labelled:
+        """What was read, once its transaction is over: damage is an event."""
         if not sound.kept.all():
-            self._note("damaged", damage_text([newest[i].decision_id for i in np.flatnonzero(~sound.kept)]))
+            self._note("damaged", damage_text([rows[i].decision_id for i in np.flatnonzero(~sound.kept)]))
         return Labelled(
-            seq=np.array([row.seq for row in newest], dtype=np.int64)[sound.kept],
+            seq=np.array([row.seq for row in rows], dtype=np.int64)[sound.kept],
             traces=sound.traces,
-            labels=_labels(newest)[sound.kept],
-            hashes=np.array([row.content_hash for row in newest], dtype=np.int64)[sound.kept],
+            labels=_labels(rows)[sound.kept],
+            hashes=np.array([row.content_hash for row in rows], dtype=np.int64)[sound.kept],
         )
+
+    def news_since(self, seq: int, limit: int) -> News:
+        """Labels of the product after `seq`, at most `limit`, its newest version's number, and its newest correction's."""
+        scope = self._database.scope
+        with self._database.transaction(write=False) as connection:
+            rows = connection.execute(ask.news_query(scope, int(seq), limit)).all()
+            sound, version, correction = self._sound(connection, rows, scope), 0, 0
+            if scope.product is not None:
+                accepted = newest_of(scope.product, VERSION.c.version, VERSION.c.accepted == sa.true())
+                version = connection.execute(accepted).scalar() or 0
+                correction = connection.execute(newest_of(scope.product, CORRECTION.c.number)).scalar() or 0
+        return News(self._labelled(rows, sound), version, correction)
+
+    def own_labelled(self) -> Labelled:
+        """Return this cell's own labelled traces, all of them, oldest first."""
+        own = Scope(self.cell_id)
+        with self._database.transaction(write=False) as connection:
+            rows = connection.execute(ask.newest_query(own, None)).all()[::-1]
+            sound = self._sound(connection, rows, own)
+        return self._labelled(rows, sound)
 
     def labelled_upto(self, seq: int, limit: int) -> Labelled:
         """Return the newest `limit` labelled traces among the labels up to number `seq`."""

@@ -1,0 +1,102 @@
+"""Whose rows a query is about: a cell's own, or those of all cells of its product."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from .sql_tables import EVENT, LABEL, PRODUCT_KEY, RESERVED, SCHEMA_KEY, SETTING, VERSION
+
+PRODUCT_LOCKS = 7236482515  # seed of the locks' numbers, so that they are nobody else's
+
+
+@dataclass(frozen=True)
+class Scope:
+    """A cell, and its product, if it has one.
+
+    What is learned belongs to the product: labels as traces to train on, and versions. One sequence numbers each over all
+    of the product's cells. What was decided, and what became of it, belongs to the cell.
+    """
+
+    cell_id: str
+    product: str | None = None
+
+    def shared(self, column: sa.Column[Any]) -> sa.ColumnElement[bool]:
+        """Whether a row belongs to what this cell shares, by the row's cell_id; without a product its own rows."""
+        return column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
+
+    def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
+        """Lock the product or the cell, then number the next row of a table."""
+        self.lock_cell(connection)  # always before the product, as the ledger does: else two would wait for each other
+        if self.product is None or column.table is EVENT:
+            newest: Any = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
+        else:
+            lock_product(connection, self.product)
+            newest = newest_of(self.product, column)
+        return (connection.execute(newest).scalar() or 0) + 1
+
+    def next_version(self, connection: sa.Connection, version: int, accepted: bool) -> int:
+        """The number of a version that was trained, under the lock of `next_number`: a sister's may have come before."""
+        if self.product is None or not accepted:
+            return version
+        newest = newest_of(self.product, VERSION.c.version, VERSION.c.accepted == sa.true())
+        return max(version, (connection.execute(newest).scalar() or 0) + 1)
+
+    def lock_cell(self, connection: sa.Connection) -> None:
+        # PostgreSQL; SQLite's BEGIN IMMEDIATE did it already.
+        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
+        connection.execute(sa.select(SETTING).where(mine).with_for_update())
+
+
+def lock_product(connection: sa.Connection, product: str) -> None:
+    """Hold a product until the transaction ends, so that its numbers are committed in their order."""
+    if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
+        lock = sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:product, :seed))")
+        connection.execute(lock, {"product": product, "seed": PRODUCT_LOCKS})
+
+
+def cells_of(product: str) -> sa.Select[Any]:
+    """The cells of a product."""
+    return sa.select(SETTING.c.cell_id).where(SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product)
+
+
+@lru_cache(maxsize=100)  # of a few products and columns: to write the statement takes longer than to answer it
+def newest_of(product: str, column: sa.Column[Any], *more: sa.ColumnElement[bool]) -> sa.Select[Any]:
+    """The largest number in a column over a product's cells: a step down the index for each, of however many rows."""
+    table, sister = column.table, cells_of(product).subquery()
+    order = VERSION.c.retrain if table is VERSION else column  # the index's own order, in which versions increase too
+    query = sa.select(column).where(table.c.cell_id == sister.c.cell_id, *more)
+    each = query.order_by(order.desc()).limit(1).correlate(sister).scalar_subquery()
+    return sa.select(sa.func.max(each)).select_from(sister)
+
+
+def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
+    """The product of a cell; a new cell enters the one that is named.
+
+    Raises StoreError for a cell of another product, and for one that has worked without: its labels have other numbers.
+    """
+    mine = SETTING.c.cell_id == cell_id
+    query = sa.select(SETTING.c.value).where(mine, SETTING.c.key == PRODUCT_KEY)
+    held: str | None = connection.execute(query).scalar()
+    if product is None or held == product:
+        return held
+    if held is not None:
+        raise StoreError(
+            f"Expected product {held!r} of cell {cell_id!r}, got {product!r}; leave it out, or name another cell."
+        )
+    if not product.strip() or not product.isprintable():
+        raise StoreError(f"Expected a product's name of printable characters, got {product!r}.")
+    settings = connection.execute(sa.select(SETTING.c.key).where(mine, SETTING.c.key.not_in(RESERVED))).first()
+    label = connection.execute(sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)).first()
+    if settings is not None or label is not None:
+        raise StoreError(
+            f"Expected a new cell for product {product!r}, got {cell_id!r}, which has worked without a product; "
+            "name a new cell, and bring its labels over by an import."
+        )
+    lock_product(connection, product)
+    connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product})
+    return product
