@@ -43,6 +43,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1 --umap-most 1",
     "python training/check_noise.py": "--data screw_driving.npz --samples 100 --seeds 100:101",
+    "python training/benchmark_faults.py": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
     "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",
     "python training/show_scenarios.py": "--cycles 12 --n-jobs 1",

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dengine import DataEngine, Policy, Recipe, TraceSpec, load_dataset
+from dengine import DataEngine, Policy, Reason, Recipe, TraceSpec, load_dataset
 from dengine.archives import must_fit, read_archive
 from dengine.cli import main
-from dengine.errors import DataError, DengineError, SettingError, StoreError
+from dengine.errors import DataError, DengineError, SettingError
 from dengine.reducers import reducer_class
 from dengine.values import is_number, is_whole
 
@@ -220,7 +220,7 @@ def test_a_file_that_is_damaged_anywhere_is_read_rightly_or_a_data_error(tmp_pat
     assert refused > 300
 
 
-def test_a_damaged_version_is_a_store_error(tmp_path: Path, make_data) -> None:
+def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so(tmp_path: Path, make_data) -> None:
     data, path = make_data(70), tmp_path / "engine.db"
     with DataEngine("pca", retrain_every=60, store=path) as engine:
         for x, y in zip(data.X, data.y, strict=True):
@@ -235,8 +235,9 @@ def test_a_damaged_version_is_a_store_error(tmp_path: Path, make_data) -> None:
     ):
         with sqlite3.connect(path) as connection:
             connection.execute("UPDATE model_version SET state = ?", (state,))
-        with pytest.raises(StoreError, match="restore"):
-            DataEngine.open(path)
+        with DataEngine.open(path) as engine:
+            assert engine.decide(data.X[0]).reason is Reason.NO_MODEL
+            assert "damaged" in [event.kind for event in engine.store.events()]
 
 
 @pytest.mark.parametrize(

@@ -91,8 +91,9 @@ def test_what_must_not_be_used_is_refused(programs: Path, signed: tuple[Path, Pa
         file.write_bytes(content)
     elif kind == "foreign":
         from dengine.export.file import write_export
+        from dengine.outputs import ONNX
 
-        write_export(file, lambda partial: partial.write_bytes(b"garbage") and None, key)
+        write_export(file, b"garbage", ONNX, key=key)
     elif kind == "no sum":
         file.with_name("model.onnx.sha256").unlink()
     elif kind == "unsigned":

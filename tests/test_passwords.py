@@ -68,6 +68,13 @@ VERBS = {  # every verb that takes a store
     "run": ["run", "--cell", "replay", "--cycles", "1", "--store", NOBODY],
     "export": ["export", NOBODY, "--out", "{out}"],
     "import-labels": ["import-labels", "{journal}", "--store", NOBODY],
+    **{
+        words[0]: [words[0], NOBODY, *words[1:]]
+        for words in (
+            *(["cells"], ["history"], ["explain", "last"], ["verify"], ["dump", "--out", "{out}"], ["correct", "a", "bad"]),
+            *(["forget", "a"], ["rollback", "1"], ["set-policy", "--alpha", "0.1"], ["retrain"]),
+        )
+    },
     "an unknown verb": [NOBODY],
     "an unknown option": ["status", f"--store={NOBODY}"],
     "a journal that is none": ["import-labels", NOBODY, "--store", "a.db"],

@@ -14,6 +14,9 @@ from dengine.cli.export import make_key as make_key_verb
 from dengine.errors import ExportError
 from dengine.export import make_key, read_metadata
 from dengine.export.file import write_checked, write_export
+from dengine.outputs import Kind
+
+ANY = Kind("file of a test", lambda file: True)
 
 
 @pytest.fixture(scope="module")
@@ -81,16 +84,9 @@ def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(
 
 def test_a_file_that_is_replaced_has_a_signature_that_fits_at_every_moment(key: Path, tmp_path: Path) -> None:
     file, signatures = tmp_path / "model.ts", tmp_path / "model.ts.sig"
-    write_export(file, lambda partial: partial.write_bytes(b"one") and None, key)
+    write_export(file, b"one", ANY, key=key)
     one = signatures.read_text()
-    seen: list[str] = []
-
-    def two(partial: Path) -> None:
-        partial.write_bytes(b"two")
-        seen.append(signatures.read_text())
-
-    write_export(file, two, key)
-    assert seen == [one]
+    write_export(file, b"two", ANY, key=key)
     assert signatures.read_text() != one
 
     class KilledError(Exception):
@@ -103,13 +99,11 @@ def test_a_file_that_is_replaced_has_a_signature_that_fits_at_every_moment(key: 
 
     both = signatures.read_text()
     with pytest.raises(KilledError):
-        write_export(
-            file, lambda partial: partial.write_bytes(b"three") and None, key, Exportable(None, TraceSpec(40), note=killed)
-        )
+        write_export(file, b"three", ANY, key=key, source=Exportable(None, TraceSpec(40), note=killed))
     assert file.read_bytes() == b"two"
     assert both in signatures.read_text()
     assert signatures.read_text().count("\n") == 2
-    write_export(file, lambda partial: partial.write_bytes(b"four") and None, None)
+    write_export(file, b"four", ANY)
     assert not signatures.exists()  # it was of the file that was replaced
 
 
@@ -117,7 +111,7 @@ def test_a_signature_of_another_tool_is_not_replaced(key: Path, tmp_path: Path) 
     own = tmp_path / "model.ts.sig"
     own.write_text("-----BEGIN PGP SIGNATURE-----\n")
     with pytest.raises(ExportError, match="is no signature of dengine's"):
-        write_export(tmp_path / "model.ts", lambda partial: partial.write_bytes(b"one") and None, key)
+        write_export(tmp_path / "model.ts", b"one", ANY, key=key)
     assert own.read_text().startswith("-----BEGIN")
     assert not (tmp_path / "model.ts").exists()
 
@@ -126,7 +120,7 @@ def test_either_of_two_sums_is_accepted_while_a_file_is_replaced(model: ModelPre
     file = export_torchscript(model, tmp_path / "model.ts")
     total = tmp_path / "model.ts.sha256"
     line = total.read_text()
-    other = write_checked(tmp_path / "other", lambda partial: partial.write_bytes(b"other") and None)
+    other = write_checked(tmp_path / "other", b"other", ANY)
     wrong = f"{hashlib.sha256(other.read_bytes()).hexdigest()}  model.ts\n"
     for text in (line + wrong, wrong + line, line.split()[0], line.replace("  ", " *"), line.replace("model.ts", "old.ts")):
         total.write_text(text)

@@ -132,10 +132,10 @@ def write_export(
     target, secret = Path(path), None if key is None else read_key(key)
     check_target(target, kind, force)
     earlier = earlier_signatures(target)
-    if source is not None and source.note is not None:
-        source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
     if secret is not None:
         write_signatures(target, [*earlier[-1:], signature(content, secret)])
+    if source is not None and source.note is not None:
+        source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
     written = write_checked(target, content, kind, force)
     if secret is not None:
         write_signatures(target, [signature(content, secret)])
@@ -224,7 +224,7 @@ def _sums_of(path: Path) -> list[str]:
     """The sums that a sum file lists: one, or two where an export was killed between its two renames."""
     sums = listed(_read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace"), path.name)
     if not sums or any(not SHA256.fullmatch(each) for each in sums):
-        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum; copy it again together with {path.name}.")
+        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
     return sums
 
 
