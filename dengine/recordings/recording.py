@@ -97,7 +97,7 @@ def seconds_of(column: Any, name: str) -> NDArray[np.float64]:
     words = column.astype(str).str.strip()
     numbers = [is_number(word) for word in words]
     if 2 * sum(numbers) > len(numbers):
-        _refuse_time(words, numbers.index(False), name)
+        _refuse_time(words, numbers.index(False) if False in numbers else 0, name)
     stamps = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
     bad = np.flatnonzero(stamps.isna())
     if len(bad):

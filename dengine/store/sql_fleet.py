@@ -91,7 +91,7 @@ def must_have_cell(url: str, cell_id: str) -> None:
         names = cell_names(url)
     if names and cell_id not in names:
         raise StoreError(
-            f"Expected a cell of this store, got {cell_id!r}; it holds {', '.join(names)}. Name one of them: --cell NAME."
+            f"Expected a cell of this store, got {cell_id!r}; it holds {', '.join(map(str, names))}. Name one of them: --cell NAME."
         )
 
 
