@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
 from .store.base import Store
@@ -27,6 +28,9 @@ class OwnedStore(Store, Protocol):
     @property
     def remote(self) -> bool:
         """Whether it is on a server, which may be away while this machine's disk is well."""
+
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        """Within this, in this thread, a transaction that is not wanted any more when it would commit is rolled back."""
 
     def own(self) -> Journal:
         """Claim the cell; StoreError where another engine has it."""

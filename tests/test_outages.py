@@ -135,6 +135,35 @@ def test_a_fault_of_the_store_costs_no_label_and_raises_nothing_and_the_cell_ver
     assert not list(tmp_path.glob("*.journal"))
 
 
+def test_a_version_that_took_too_long_to_store_is_not_stored_later_and_a_reopened_engine_decides_as_the_one_that_went_on(
+    stream: Dataset, tmp_path: Path
+) -> None:
+    file = tmp_path / "engine.db"
+    engine = engine_on(file)
+    go_on(engine, stream, 0, 100)
+    before, put_version = engine.version, engine.store.put_version
+    asked = threading.Event()
+
+    def store_it(*row):
+        asked.set()
+        return put_version(*row)
+
+    engine.store.put_version = store_it
+    with locked(file):
+        report = engine.retrain()
+    assert asked.is_set()
+    assert not report.accepted
+    assert "not stored" in report.reason
+    until_back(engine)
+    engine.flush()
+    assert engine.version == before
+    assert max(kept.version for kept in engine.store.retrains()) == before
+    expected = bounds(engine, stream)
+    engine.close()
+    with DataEngine.open(str(file)) as again:
+        assert bounds(again, stream) == expected
+
+
 def test_labels_of_an_outage_survive_a_killed_process(stream: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "engine.db"
     child = """

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import urllib.parse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -64,6 +65,10 @@ class SqlOwning:
     def remote(self) -> bool:
         """Whether the database is on a server, which may be away while this machine's disk is well."""
         return self._database.url.get_backend_name() != "sqlite"
+
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        """Within this, in this thread, a transaction that is not wanted any more when it would commit is rolled back."""
+        return self._database.committing(wanted)
 
     def own(self) -> Journal:
         """Claim the cell for one engine; StoreError where another one has it, on this or another machine."""
