@@ -35,6 +35,9 @@ class OwnedStore(Store, Protocol):
     def own(self) -> Journal:
         """Claim the cell; StoreError where another engine has it."""
 
+    def let_go(self) -> None:
+        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
+
     def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
         """Write what a journal held; labels' numbers by decision, and what was refused."""
 

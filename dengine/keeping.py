@@ -192,6 +192,7 @@ class Keeper:
             self._thread.join()
         except StoreError as error:
             log.warning("the store was left, its journal %s holds what it lacks: %s", self._backlog.journal.path, error)
+            self._backlog.store.let_go()  # else its writer, and its lease on the cell, would outlive the engine
         self._backlog.journal.close()
 
     # Limits, and the journal

@@ -164,6 +164,25 @@ def test_a_version_that_took_too_long_to_store_is_not_stored_later_and_a_reopene
         assert bounds(again, stream) == expected
 
 
+def test_closing_while_the_store_is_away_leaves_neither_threads_nor_its_lease(stream: Dataset, tmp_path: Path) -> None:
+    file = tmp_path / "engine.db"
+    engine = engine_on(file)
+    go_on(engine, stream, 0, 60)
+    with moved_away(file):
+        decision = engine.decide(stream.X[60])
+        engine.report(decision.id, True)
+        engine.close()
+        engine.store._database._writer.join(15.0)
+        engine._keeper._thread.join(15.0)
+        assert not engine.store._database._writer.is_alive()
+        assert not engine._keeper._thread.is_alive()
+        assert engine.store._database._engine.pool.checkedout() == 0
+        with pytest.raises(StoreError, match="after close"):
+            engine.store.flush()
+    with DataEngine.open(str(file)) as again:
+        assert again.store.get_decision(decision.id).success is True
+
+
 def test_labels_of_an_outage_survive_a_killed_process(stream: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "engine.db"
     child = """

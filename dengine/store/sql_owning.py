@@ -88,6 +88,10 @@ class SqlOwning:
         if self._journal is not None:
             self._journal.close()
 
+    def let_go(self) -> None:
+        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
+        self._database.let_go()
+
     def play_back(self, records: Sequence[Record]) -> tuple[list[Arrived], list[str]]:
         """Write what a journal held, in one transaction; what is stored already counts as written, for its answer got lost.
 
