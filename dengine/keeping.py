@@ -61,11 +61,14 @@ class Keeper:
             self._begin(self._backlog)
 
     def _begin(self, backlog: Backlog) -> None:
+        damaged = len(backlog.journal.damaged)
         try:
             self._play_back(backlog)
             if backlog.journal.dropped:
                 text = f"{backlog.journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
                 self.store.put_event("journal", text)
+            if damaged:
+                self.store.put_event("journal", f"{damaged} records that are not as they were written were left out")
         except BaseException:
             backlog.journal.close()
             raise

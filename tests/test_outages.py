@@ -465,6 +465,25 @@ def label_of(name: str):
     return NewLabel(name, True, Source.CONFIRMED, 3, np.array([0.1, -7e-30], dtype=np.float32), 5)
 
 
+def test_a_changed_byte_in_a_journal_costs_its_record_and_none_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    journal = Journal(path)
+    offsets = journal.append([bytes([65 + i]) * 50 for i in range(5)])
+    journal.let_go()
+    content = bytearray(path.read_bytes())
+    content[offsets[1] + 20] ^= 1
+    path.write_bytes(content)
+    with contextlib.closing(Journal(path)) as again:
+        assert again.damaged == [offsets[1]]
+        assert again.dropped == 0
+        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E"]
+        again.append([b"F" * 50])
+        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E", b"F"]
+        again.clear()
+        assert again.empty
+        assert not again.damaged
+
+
 @pytest.mark.parametrize("cut", [1, 5, 9, 30])
 def test_an_unfinished_record_at_the_end_is_dropped_and_counted(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "a.journal"

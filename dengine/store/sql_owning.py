@@ -133,7 +133,7 @@ def _write_labels(
         label, row = late.label, held.get(late.label.decision_id)
         now = (label.success, label.source.value)
         if row is None:
-            refused.append(f"a label on {label.decision_id!r}, which the store does not hold")
+            refused.append(f"a label on {label.decision_id!r}, which the store does not hold: {_words(*now)}")
         elif said.setdefault(label.decision_id, now) != now:
             first = said[label.decision_id]
             refused.append(f"a second label on {label.decision_id!r}: {_words(*now)} after {_words(*first)}")
