@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
 from .store.base import Store
@@ -28,8 +29,14 @@ class OwnedStore(Store, Protocol):
     def remote(self) -> bool:
         """Whether it is on a server, which may be away while this machine's disk is well."""
 
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        """Within this, in this thread, a transaction that is not wanted any more when it would commit is rolled back."""
+
     def own(self) -> Journal:
         """Claim the cell; StoreError where another engine has it."""
+
+    def let_go(self) -> None:
+        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
 
     def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
         """Write what a journal held; labels' numbers by decision, and what was refused."""

@@ -13,13 +13,13 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .asking import Asked
 from .backlog import WAITING, Backlog, OwnedStore
 from .errors import StoreError
 from .records import RetrainReport
@@ -36,7 +36,6 @@ RECENT = 1_000  # decisions that a report finds without asking the store
 BACK = "it is there again, and is to take what its journal holds."
 
 T = TypeVar("T")
-Job = tuple[Future[Any], Callable[[], Any]]
 
 
 class Keeper:
@@ -55,18 +54,21 @@ class Keeper:
         self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
         self._pid = os.getpid()
         self._closed, self._reading, self._patient = False, not owning, patient
-        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._jobs: queue.SimpleQueue[Asked[Any] | None] = queue.SimpleQueue()
         self._backlog: Backlog | None = None
         if owning and isinstance(store, OwnedStore):
             self._backlog = Backlog(store, store.own())
             self._begin(self._backlog)
 
     def _begin(self, backlog: Backlog) -> None:
+        damaged = len(backlog.journal.damaged)
         try:
             self._play_back(backlog)
             if backlog.journal.dropped:
                 text = f"{backlog.journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
                 self.store.put_event("journal", text)
+            if damaged:
+                self.store.put_event("journal", f"{damaged} records that are not as they were written were left out")
         except BaseException:
             backlog.journal.close()
             raise
@@ -147,8 +149,8 @@ class Keeper:
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
     def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
-        """Commit a retrain; returns the version's number. StoreError where the store does not take it now."""
-        return self._commit(lambda: self.store.put_version(report, last_seq, state))
+        """Commit a retrain; returns the version's number. StoreError where the store does not take it now, nor later."""
+        return self._commit(lambda: self.store.put_version(report, last_seq, state), GRACE)
 
     def event(self, kind: str, text: str) -> None:
         """Record what happened, in the journal where the store is away."""
@@ -166,21 +168,15 @@ class Keeper:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
         self._recent.pop(decision_id, None)
 
-    def ask(self, work: Callable[[], T]) -> T:
-        """Call the store with the time limit; StoreError where it is away."""
+    def ask(self, work: Callable[[], T], more: float = 0.0) -> T:
+        """Call the store with the time limit; StoreError where it is away. more : seconds for a commit under way."""
         if self._backlog is None:
             return work()
         if self.fault:
             raise StoreError(f"The store is away: {self.fault} Labels wait in its journal; try this again when it is back.")
         wait = None if self._patient else self._backlog.store.wait
-        job: Future[T] = Future()
-        self._jobs.put((job, work))
-        try:
-            return job.result(wait)
-        except TimeoutError as error:
-            if job.done():
-                raise
-            raise StoreError(f"no answer from the store within {wait:g} s.") from error
+        self._jobs.put(asked := Asked(work))
+        return asked.result(wait, more)
 
     def close(self) -> None:
         """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
@@ -192,14 +188,14 @@ class Keeper:
             return
         self.flush()
         self._closed = True
-        closing: Future[None] = Future()
-        self._jobs.put((closing, self.store.close))
+        self._jobs.put(closing := Asked(self.store.close, lasting=True))
         self._jobs.put(None)
         try:
             closing.result(CLOSE)
             self._thread.join()
-        except (StoreError, TimeoutError) as error:
+        except StoreError as error:
             log.warning("the store was left, its journal %s holds what it lacks: %s", self._backlog.journal.path, error)
+            self._backlog.store.let_go()  # else its writer, and its lease on the cell, would outlive the engine
         self._backlog.journal.close()
 
     # Limits, and the journal
@@ -220,13 +216,13 @@ class Keeper:
                 self._note(str(error))
                 raise
             self._note(self.fault or BACK)
-        self._jobs.put((Future(), lambda: None))  # so that the store is tried now, not at the next beat
+        self._jobs.put(Asked(lambda: None))  # so that the store is tried now, not at the next beat
         return None
 
-    def _commit(self, work: Callable[[], T]) -> T:
+    def _commit(self, work: Callable[[], T], more: float = 0.0) -> T:
         """Call the store; where that succeeds, all decisions before it are committed as well."""
         before = [] if self._backlog is None else self._backlog.unsafe
-        result = self.ask(work)
+        result = self.ask(work, more)
         if self._backlog is not None:
             self._backlog.committed(before)
         return result
@@ -265,11 +261,7 @@ class Keeper:
                 continue
             if job is None:
                 return
-            result, work = job
-            try:
-                result.set_result(work())
-            except BaseException as error:  # it is raised where the result is asked for
-                result.set_exception(error)
+            job.run(backlog.store.committing)
             if self.fault:
                 self._beat(backlog)
 

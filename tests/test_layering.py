@@ -42,6 +42,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "fleet": 8,
     "deciding": 8,
     "interrupts": 1,
+    "asking": 8,
     "backlog": 8,
     "keeping": 8,
     "pending": 8,

@@ -135,6 +135,54 @@ def test_a_fault_of_the_store_costs_no_label_and_raises_nothing_and_the_cell_ver
     assert not list(tmp_path.glob("*.journal"))
 
 
+def test_a_version_that_took_too_long_to_store_is_not_stored_later_and_a_reopened_engine_decides_as_the_one_that_went_on(
+    stream: Dataset, tmp_path: Path
+) -> None:
+    file = tmp_path / "engine.db"
+    engine = engine_on(file)
+    go_on(engine, stream, 0, 100)
+    before, put_version = engine.version, engine.store.put_version
+    asked = threading.Event()
+
+    def store_it(*row):
+        asked.set()
+        return put_version(*row)
+
+    engine.store.put_version = store_it
+    with locked(file):
+        report = engine.retrain()
+    assert asked.is_set()
+    assert not report.accepted
+    assert "not stored" in report.reason
+    until_back(engine)
+    engine.flush()
+    assert engine.version == before
+    assert max(kept.version for kept in engine.store.retrains()) == before
+    expected = bounds(engine, stream)
+    engine.close()
+    with DataEngine.open(str(file)) as again:
+        assert bounds(again, stream) == expected
+
+
+def test_closing_while_the_store_is_away_leaves_neither_threads_nor_its_lease(stream: Dataset, tmp_path: Path) -> None:
+    file = tmp_path / "engine.db"
+    engine = engine_on(file)
+    go_on(engine, stream, 0, 60)
+    with moved_away(file):
+        decision = engine.decide(stream.X[60])
+        engine.report(decision.id, True)
+        engine.close()
+        engine.store._database._writer.join(15.0)
+        engine._keeper._thread.join(15.0)
+        assert not engine.store._database._writer.is_alive()
+        assert not engine._keeper._thread.is_alive()
+        assert engine.store._database._engine.pool.checkedout() == 0
+        with pytest.raises(StoreError, match="after close"):
+            engine.store.flush()
+    with DataEngine.open(str(file)) as again:
+        assert again.store.get_decision(decision.id).success is True
+
+
 def test_labels_of_an_outage_survive_a_killed_process(stream: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "engine.db"
     child = """
@@ -415,6 +463,25 @@ def test_what_a_journal_is_given_returns_bit_for_bit(stream: Dataset, tmp_path: 
 
 def label_of(name: str):
     return NewLabel(name, True, Source.CONFIRMED, 3, np.array([0.1, -7e-30], dtype=np.float32), 5)
+
+
+def test_a_changed_byte_in_a_journal_costs_its_record_and_none_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.journal"
+    journal = Journal(path)
+    offsets = journal.append([bytes([65 + i]) * 50 for i in range(5)])
+    journal.let_go()
+    content = bytearray(path.read_bytes())
+    content[offsets[1] + 20] ^= 1
+    path.write_bytes(content)
+    with contextlib.closing(Journal(path)) as again:
+        assert again.damaged == [offsets[1]]
+        assert again.dropped == 0
+        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E"]
+        again.append([b"F" * 50])
+        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E", b"F"]
+        again.clear()
+        assert again.empty
+        assert not again.damaged
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 30])

@@ -29,6 +29,7 @@ class Journal:
 
     path : of the file, which is made; a link is refused.
     dropped : bytes of an unfinished record at the end, which a killed process left; they were never acknowledged.
+    damaged : offsets of records before the end that are not as they were written; the others are read all the same.
 
     Raises StoreError where another process, or another engine of this one, owns it.
     """
@@ -36,6 +37,7 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._fd = _locked(path)
+        self.damaged: list[int] = []
         try:
             self._end, self.dropped = self._scan()
             os.ftruncate(self._fd, self._end)
@@ -92,6 +94,9 @@ class Journal:
     def records(self, begin: int = HEADER) -> Iterator[tuple[int, bytes]]:
         """Return the records from an offset on, each with the offset behind it."""
         while begin < self._end:
+            if begin in self.damaged:
+                begin = self._behind(begin)
+                continue
             record = self.read(begin)
             begin += FRAME.size + len(record)
             yield begin, record
@@ -99,7 +104,7 @@ class Journal:
     def clear(self) -> None:
         """Forget all records; the store holds them now."""
         os.ftruncate(self._fd, HEADER)
-        self._end = HEADER
+        self._end, self.damaged = HEADER, []
         self._reserve()
         os.fsync(self._fd)
 
@@ -127,14 +132,25 @@ class Journal:
         if os.pread(self._fd, len(MAGIC), 0) != MAGIC:
             raise StoreError(f"Expected a journal of dengine, found another file: {self.path}; move it away.")
         begin = HEADER
-        while begin + FRAME.size <= size:
-            length, crc = FRAME.unpack(os.pread(self._fd, FRAME.size, begin))
-            record = os.pread(self._fd, length, begin + FRAME.size) if length else b""
-            if not length or len(record) < length or zlib.crc32(record) != crc:
-                break
-            begin += FRAME.size + length
+        while (whole := self._is_whole(begin)) or self._is_whole(self._behind(begin)):  # no process leaves one behind it
+            self.damaged += [] if whole else [begin]
+            begin = self._behind(begin)
         left = os.pread(self._fd, size - begin, begin) if size > begin else b""
         return begin, len(left.rstrip(b"\0"))
+
+    def _behind(self, offset: int) -> int:
+        """Return the offset behind a record, by what it says of its length; the same where no record begins."""
+        frame = os.pread(self._fd, FRAME.size, offset)
+        length = FRAME.unpack(frame)[0] if len(frame) == FRAME.size else 0
+        return offset + FRAME.size + length if length else offset
+
+    def _is_whole(self, offset: int) -> bool:
+        """Whether a record at an offset is there as it was written."""
+        left = os.fstat(self._fd).st_size - offset - FRAME.size
+        if left <= 0:
+            return False
+        length, crc = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))
+        return bool(0 < length <= left and zlib.crc32(os.pread(self._fd, length, offset + FRAME.size)) == crc)
 
     def _reserve(self) -> None:
         try:

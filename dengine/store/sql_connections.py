@@ -41,6 +41,7 @@ class SqlConnections:
         self._closed = False
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
+        self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
         self._lease: Callable[[sa.Connection], None] | None = None  # taken again on each new connection that writes
         self._leased: sa.Connection | None = None
         self.scope = self._open(product)
@@ -93,8 +94,19 @@ class SqlConnections:
                 yield connection
                 if entry is not None:
                     entry.append(connection)  # chains what the transaction added
+                if write and not getattr(self._asked, "wanted", _always)():
+                    raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
             if write:
                 self._file.check()  # nobody is told that a file holds what went into another one
+
+    @contextmanager
+    def committing(self, wanted: Callable[[], bool]) -> Iterator[None]:
+        """Ask before each commit of this thread whether it is wanted still, for nobody may wait for it any more."""
+        self._asked.wanted = wanted
+        try:
+            yield
+        finally:
+            del self._asked.wanted
 
     def _entry(self) -> LedgerEntry:
         return LedgerEntry(self.cell_id, self._clock)
@@ -148,3 +160,7 @@ class SqlConnections:
                 f"Expected the process that opened {self.name}, {self._pid}, got its fork {os.getpid()}; "
                 "open the store after the fork, in the process that uses it."
             )
+
+
+def _always() -> bool:
+    return True

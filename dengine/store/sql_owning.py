@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import urllib.parse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import sqlalchemy as sa
@@ -65,6 +66,10 @@ class SqlOwning:
         """Whether the database is on a server, which may be away while this machine's disk is well."""
         return self._database.url.get_backend_name() != "sqlite"
 
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        """Within this, in this thread, a transaction that is not wanted any more when it would commit is rolled back."""
+        return self._database.committing(wanted)
+
     def own(self) -> Journal:
         """Claim the cell for one engine; StoreError where another one has it, on this or another machine."""
         journal = Journal(journal_path(self._database.url, self.cell_id))
@@ -82,6 +87,10 @@ class SqlOwning:
         self._database.close()
         if self._journal is not None:
             self._journal.close()
+
+    def let_go(self) -> None:
+        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
+        self._database.let_go()
 
     def play_back(self, records: Sequence[Record]) -> tuple[list[Arrived], list[str]]:
         """Write what a journal held, in one transaction; what is stored already counts as written, for its answer got lost.
@@ -124,7 +133,7 @@ def _write_labels(
         label, row = late.label, held.get(late.label.decision_id)
         now = (label.success, label.source.value)
         if row is None:
-            refused.append(f"a label on {label.decision_id!r}, which the store does not hold")
+            refused.append(f"a label on {label.decision_id!r}, which the store does not hold: {_words(*now)}")
         elif said.setdefault(label.decision_id, now) != now:
             first = said[label.decision_id]
             refused.append(f"a second label on {label.decision_id!r}: {_words(*now)} after {_words(*first)}")

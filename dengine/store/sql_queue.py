@@ -38,6 +38,7 @@ class SqlDatabase(SqlConnections):
         self._clash: StoreError | None = None
         self._lock = threading.Condition()  # guards the queue
         self._stop = threading.Event()
+        self._left = False  # let go without writing
         self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
         self._writer.start()
         atexit.register(self._close_at_exit)
@@ -171,6 +172,9 @@ class SqlDatabase(SqlConnections):
             self._stop.wait(RETRY if self._doubtful else LINGER)
             if not self._stop.is_set() and self._queue:
                 self._try_queue()
+        if self._left:
+            with self._writing:  # not under the hands of a write that still waits for the database
+                self.disconnect()
 
     def _try_queue(self) -> bool:
         """Write the queue; a failure is counted, keeps the queue, and is raised by the next flush or report."""
@@ -195,6 +199,16 @@ class SqlDatabase(SqlConnections):
             self.flush()  # of what other threads put meanwhile
             self._closed = True
         self.disconnect()
+        atexit.unregister(self._close_at_exit)
+
+    def let_go(self) -> None:
+        """Stop and disconnect without writing or waiting, lease and all; what is queued is kept elsewhere."""
+        if self._closed:
+            return
+        self._closed = self._left = True
+        self._stop.set()
+        with self._lock:
+            self._lock.notify_all()
         atexit.unregister(self._close_at_exit)
 
     def _close_at_exit(self) -> None:
