@@ -90,9 +90,8 @@ def must_have_cell(url: str, cell_id: str) -> None:
     with suppress(StoreError):
         names = cell_names(url)
     if names and cell_id not in names:
-        raise StoreError(
-            f"Expected a cell of this store, got {cell_id!r}; it holds {', '.join(map(str, names))}. Name one of them: --cell NAME."
-        )
+        held = ", ".join(map(str, names))
+        raise StoreError(f"Expected a cell of this store, got {cell_id!r}; it holds {held}. Name one of them: --cell NAME.")
 
 
 def list_cells(url: str) -> list[CellSummary]:
