@@ -160,3 +160,32 @@ def test_a_lost_connection_is_made_again_with_its_lease_and_loses_no_label(make_
         assert [again.decide(x).lower for x in data.X[-20:]] == expected
         said = {each.decision.id: each.success for each in cycles if each.success is not None}
         assert {name: again.store.get_decision(name).success for name in said} == said
+
+
+def test_an_engine_closed_while_its_server_was_frozen_leaves_the_cell_to_the_next_one(make_data, cell: str) -> None:
+    data = make_data(400, samples=60, seed=3)
+    engine = engine_of(cell)
+    cycles = list(engine.run(ReplayCell(data, np.arange(60)), 60))
+    pid = backend_of(engine)
+    try:
+        os.kill(pid, signal.SIGSTOP)
+    except PermissionError:
+        pytest.skip("the server's processes are somebody else's")
+    try:
+        cycles += engine.run(ReplayCell(data, np.arange(60, 90)), 30)
+        engine.close()
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    engine.store._database._writer.join(20.0)
+    assert not engine.store._database._writer.is_alive()
+    end = time.monotonic() + 10.0
+    while True:
+        try:
+            again = DataEngine.open(SqlStore(URL, cell))
+            break
+        except StoreError:  # the server has not noticed yet that the session is over
+            assert time.monotonic() < end
+            time.sleep(0.2)
+    with again:
+        said = {each.decision.id: each.success for each in cycles if each.success is not None}
+        assert {name: again.store.get_decision(name).success for name in said} == said
