@@ -6,8 +6,8 @@ found here, in every store alike: a replay in memory takes nothing that a cell's
 
 from __future__ import annotations
 
-import json
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -63,14 +63,12 @@ def _is_share(value: Any) -> bool:
 
 
 def _is_embedding(value: Any) -> bool:
-    if value is None:
-        return True
-    try:
-        spaces = json.loads(json.dumps(value, default=float))
-    except (TypeError, ValueError):
-        return False
-    return isinstance(spaces, list) and all(isinstance(point, list) and all(map(_is_number, point)) for point in spaces)
+    return value is None or _is_row(value, lambda point: _is_row(point, _is_number))
+
+
+def _is_row(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, tuple | list) and all(map(fits, value))
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
