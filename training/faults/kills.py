@@ -25,8 +25,13 @@ from dengine.importing import import_journal, import_labelled
 
 from .harness import PROBE, RECIPE, Outcome, Place, missing, stream
 
+# The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
+HERE = str(Path(__file__).resolve().parents[1])
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (HERE, os.environ.get("PYTHONPATH"))))
+LOADED = ("faults.kills", "dengine.store.sql", "dengine.importing", "dengine.export.torchscript", "dengine.reducers.pca")
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["faults.kills"])
+CONTEXT.set_forkserver_preload([*LOADED, "sklearn.decomposition", "pandas"])
+IN_ONE = 20  # kills of one store, so that opening it takes no longer than the kill
 OFTEN = replace(RECIPE, retrain_every=3)  # a version's commit is under way most of the time
 
 
@@ -132,22 +137,29 @@ check_cell.compared = 0
 
 
 def kill_cells(outcome: Outcome, place: Place, times: int, child: Callable[..., None] = cell) -> None:
-    """Kill so often, on one store that grows."""
-    check_cell.stored = 0
+    """Kill so often; a store is killed `IN_ONE` times in a row, then there is a new one."""
     for seed in range(times):
-        told = killed(child, place, seed)
+        if seed % IN_ONE == 0:
+            check_cell.stored = 0
+            own = next_place(place, seed)
+        told = killed(child, own, seed)
         outcome.injected += 1
         try:
-            check_cell(outcome, place, told)
+            check_cell(outcome, own, told)
         except DengineError as error:
             outcome.tell(error)
+
+
+def next_place(place: Place, seed: int) -> Place:
+    """Another file, or another cell of a server."""
+    return replace(place, cell=f"{place.cell}-{seed}") if "://" in place.url else replace(place, url=f"{place.url}.{seed}")
 
 
 def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
     """Kill imports, each of a new store; each is then repeated, and has every trace once."""
     n = len(stream())
     for seed in range(times):
-        own = replace(place, url=f"{place.url}.{seed}")
+        own = next_place(place, seed)
         told = killed(importing, own, seed, most=1.5)
         outcome.injected += 1
         done = max((int(words[1]) for words in told), default=0)
