@@ -12,7 +12,7 @@ import sqlite3
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,13 @@ IN_ONE = 20  # kills of one store, so that opening it takes no longer than the k
 OFTEN = replace(RECIPE, retrain_every=3)  # a version's commit is under way most of the time
 
 
+def _for_a_while(seconds: float = 60.0) -> Iterator[None]:
+    """Turns until somebody kills this process, but not for ever: its killer may be gone."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        yield
+
+
 def _acknowledge(path: str, *words: object) -> None:
     with Path(path).open("a") as file:
         file.write(" ".join(map(str, words)) + "\n")
@@ -45,9 +52,9 @@ def _open(place: Place, recipe: Any) -> DataEngine:
 
 
 def cell(place: Place, told: str, seed: int, recipe: Any = RECIPE) -> None:
-    """Decide and report for ever; after each report decide on a probe, and tell of all once it was acknowledged."""
+    """Decide and report on and on; after each report decide on a probe, and tell of all once it was acknowledged."""
     engine, data, rng = _open(place, recipe), stream(), np.random.default_rng(seed)
-    while True:
+    for _ in _for_a_while():
         i = int(rng.integers(len(data) - PROBE))
         decision = engine.decide(data.X[i])
         if decision.action is Action.VERIFY:
@@ -66,7 +73,7 @@ def in_outage(place: Place, told: str, seed: int) -> None:
     """A cell whose store is locked soon after it began."""
     engine, data, rng = _open(place, RECIPE), stream(), np.random.default_rng(seed)
     other = sqlite3.connect(place.url, isolation_level=None, timeout=30)
-    for n in range(10_000):
+    for n, _ in enumerate(_for_a_while()):
         if n == 20:
             other.execute("BEGIN IMMEDIATE")
         i = int(rng.integers(len(data) - PROBE))
@@ -94,7 +101,7 @@ def importing(place: Place, told: str, seed: int) -> None:
 def exporting(place: Place, told: str, seed: int) -> None:
     """An engine that is exported to one file again and again."""
     with DataEngine.open(place.store(), reading=True) as engine:
-        while True:
+        for _ in _for_a_while():
             export_torchscript(engine, Path(place.url).with_suffix(".ts"))
             _acknowledge(told, "exported")
 
