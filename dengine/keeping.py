@@ -148,8 +148,8 @@ class Keeper:
                 self._recent[label.decision_id] = replace(known, success=label.success, source=label.source)
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
-    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
-        """Commit a retrain; returns the version's number. StoreError where the store does not take it now, nor later."""
+    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int | None:
+        """Commit a retrain; returns the version's number, where the store says it. StoreError where it does not take it."""
         return self._commit(lambda: self.store.put_version(report, last_seq, state), GRACE)
 
     def event(self, kind: str, text: str) -> None:

@@ -198,7 +198,8 @@ class ModelVersions(CurrentVersion):
             state = self._state(model, references, origin)
         # Until the version could answer; storing it comes on top.
         report = replace(report, seconds=self.clock() - trained.begin)
-        report = replace(report, version=self.keeper.version(report, self.retrainer.window.newest_seq, state))
+        number = self.keeper.version(report, self.retrainer.window.newest_seq, state)
+        report = replace(report, version=report.version if number is None else number)  # one without products has no other
         if model is not None:
             self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
