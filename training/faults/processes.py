@@ -65,6 +65,7 @@ def interrupted(outcome: Outcome, place: Place) -> None:
             signal.raise_signal(signal.SIGINT)
 
     before = signal.signal(signal.SIGALRM, interrupt)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     for _ in range(300):
         try:
             armed = True
@@ -76,6 +77,8 @@ def interrupted(outcome: Outcome, place: Place) -> None:
             cell.next += 1
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     signal.signal(signal.SIGALRM, before)
+    signal.signal(signal.SIGINT, handler)
+    outcome.must(outcome.injected > 0, "nothing was interrupted")
     cell.finish()
 
 
