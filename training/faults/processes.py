@@ -69,7 +69,7 @@ def interrupted(outcome: Outcome, place: Place) -> None:
     for _ in range(300):
         try:
             armed = True
-            signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-4, 5e-3)))
+            signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-4, 0.02)))
             cell.play(1)
             armed = False
         except KeyboardInterrupt:
