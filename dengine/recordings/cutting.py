@@ -28,6 +28,14 @@ class Placed:
     gaps: Gaps
 
 
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where an insertion begins. time : seconds.  seen : its first sample came; False: at `time`, or later in a gap."""
+
+    time: float
+    seen: bool = True
+
+
 class StartFinder:
     """Finds where a trigger goes on, sample by sample. step : seconds from one to the next.  quiet_s : off before that."""
 
@@ -40,11 +48,11 @@ class StartFinder:
         self._off_since: float | None = None
         self._last_off = 0.0
 
-    def feed(self, time: float, active: bool) -> float | None:
-        """The time of the sample that an insertion begins with, if this one shows it.
+    def feed(self, time: float, active: bool) -> Start | None:
+        """Where an insertion begins, if this sample shows it.
 
-        Where samples are missing before this one, it may have begun in any of them: the earliest counts, so that the gap is
-        part of the trace, and known as one.
+        Where samples are missing just before this one, it may have begun in any of them: then no sample's place in its
+        trace is known.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
@@ -53,7 +61,8 @@ class StartFinder:
         began, self._off_since = self._off_since, None
         if began is None or time - began < self.quiet_s - self.step / 2:
             return None
-        return time if time - self._last_off < NEAR * self.step else self._last_off + self.step
+        seen = time - self._last_off < NEAR * self.step
+        return Start(time) if seen else Start(self._last_off + self.step, seen=False)
 
 
 def place(times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float) -> Placed:

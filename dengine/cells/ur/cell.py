@@ -115,6 +115,7 @@ class UrCell:
             n = self._record(rows) if verb is Verb.INSERT and self.last is None else len(rows)
             answer = answer or next((found for row in rows[:n] if (found := self._answered(row, verb))), None)
             self.recorder.seen(n)
+        self.recorder.stream.write(None)
         assert answer is not None  # `_rows` has raised
         return answer
 
@@ -135,7 +136,7 @@ class UrCell:
     def _why(self) -> str:
         if self.recorder.stream.trouble:
             return f"there is no connection: {self.recorder.stream.trouble}"
-        return "it did not; does its program do what training/ur_cell.script does, is it paused, or does it wait for something?"
+        return "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
 
     def _answered(self, row: Row, verb: Verb) -> Answer | None:
         """The answer to the order under way, if this package holds it; CellError for one that is no success."""

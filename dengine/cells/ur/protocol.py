@@ -175,6 +175,7 @@ FIELDS: Mapping[str, str] = {  # of the guide, those that a controller gives out
     **dict.fromkeys(
         (
             *("standard_digital_output_mask", "standard_digital_output", "configurable_digital_output_mask"),
+            *("tool_digital_output_mask", "tool_digital_output"),
             *("configurable_digital_output", "standard_analog_output_mask", "standard_analog_output_type"),
         ),
         "UINT8",

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import CellError, SettingError
-from ...recordings.cutting import Gaps, StartFinder, place
+from ...recordings.cutting import Gaps, Start, StartFinder, place
 from ...recordings.triggers import Trigger, as_trigger
 from ...records import TraceSpec
 from .channels import column_of, fields_of
@@ -31,8 +31,9 @@ class InsertionRecord:
     """One recorded insertion. trace : (T,), or (C, T) of several channels, float32; NaN where a sample never came.
 
     start_s : of its first sample, by the controller's clock; NaN where no start was seen.  samples : T.
-    missing : samples that never came.  gaps : (first, length) of each stretch of them.  late : samples that came late, and
-    are in their place.  repeated : samples that came twice; the first counts.  reconnects : connections made again.
+    missing : samples that never came; where the start itself fell into a gap all of them, for then no place is known.
+    gaps : (first, length) of each stretch of them.  late : samples that came late, and are in their place.
+    repeated : samples that came twice; the first counts.  reconnects : connections made again meanwhile.
     """
 
     trace: NDArray[np.float32]
@@ -66,7 +67,7 @@ class Cutter:
         """Forget all rows: look for a start from the next on."""
         self._finder.forget()
         self._rows: list[Row] = []
-        self._start: float | None = None
+        self._start: Start | None = None
 
     @property
     def begun(self) -> bool:
@@ -83,35 +84,35 @@ class Cutter:
                 self.arm()
             self._rows.append(row)
             if self._start is None:
-                began = self._finder.feed(row.timestamp, bool(active[i]))
-                self._start = None if began is None else began - self._before * self._step
+                self._start = self._finder.feed(row.timestamp, bool(active[i]))
                 del self._rows[: -self._before - 2]  # two more: the edge, and the connection that it came by
-            if self._start is not None and row.timestamp > self._start + (self._samples - 1.5) * self._step:
+            if self._start is not None and row.timestamp > self._first(self._start) + (self._samples - 1.5) * self._step:
                 return self.cut(), i + 1
         return None, len(rows)
 
     def cut(self) -> InsertionRecord:
-        """What there is of the insertion; all of it NaN where no start was seen."""
-        if self._start is None:
-            record = self.nothing()
-        else:
-            times = [row.timestamp for row in self._rows]
-            values = np.array([[row.values[c] for c in self._channels] for row in self._rows], dtype=np.float64)
-            placed = place(times, values, self._start, self._samples, self._step)
-            inside = [row for row in self._rows if row.timestamp > self._start - self._step / 2]
-            record = InsertionRecord(
-                self._shaped(placed.trace), self._start, self._samples, placed.missing, placed.gaps,
-                late=sum(row.late for row in inside),
-                repeated=placed.repeated,
-                reconnects=self._rows[-1].session - self._rows[0].session,
-            )  # fmt: skip
+        """What there is of the insertion; all of it NaN where its start was not seen."""
+        start, rows = self._start, self._rows
         self.arm()
-        return record
+        if start is None:
+            return self._nothing(float("nan"))
+        first = self._first(start)
+        inside = [row for row in rows if row.timestamp > first - self._step / 2]
+        late, reconnects = sum(row.late for row in inside), rows[-1].session - rows[0].session
+        if not start.seen:
+            return replace(self._nothing(first), late=late, reconnects=reconnects)
+        values = np.array([[row.values[c] for c in self._channels] for row in rows], dtype=np.float64)
+        placed = place([row.timestamp for row in rows], values, first, self._samples, self._step)
+        counts = {"late": late, "repeated": placed.repeated, "reconnects": reconnects}
+        return InsertionRecord(self._shaped(placed.trace), first, self._samples, placed.missing, placed.gaps, **counts)
 
-    def nothing(self) -> InsertionRecord:
-        """Of an insertion that no sample came of."""
+    def _first(self, start: Start) -> float:
+        """The time of the trace's first sample."""
+        return start.time - self._before * self._step
+
+    def _nothing(self, start_s: float) -> InsertionRecord:
         trace = np.full((len(self._channels), self._samples), np.nan, dtype=np.float32)
-        return InsertionRecord(self._shaped(trace), float("nan"), self._samples, self._samples, ((0, self._samples),))
+        return InsertionRecord(self._shaped(trace), start_s, self._samples, self._samples, ((0, self._samples),))
 
     def _active(self, rows: Sequence[Row]) -> NDArray[np.bool_]:
         named = {name: np.array([row.values[c] for row in rows], dtype=np.float64) for name, c in self._signals.items()}

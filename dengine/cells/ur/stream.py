@@ -72,7 +72,8 @@ class RtdeStream:
     """Reads in a thread of its own, so that no package waits for whoever uses them. Opened by `with`, or `open`.
 
     Connecting for the first time raises CellError; a connection lost later is made again, for as long as it takes, and what
-    was written last is written again. clock : seconds, for telling late packages.
+    was written last is written again, unless the controller itself began anew: it knows nothing of what it was told before.
+    clock : seconds, for telling late packages.
     """
 
     def __init__(
@@ -150,19 +151,22 @@ class RtdeStream:
                 )
             return self._rows[position - self._first :], self._first + len(self._rows)
 
-    def write(self, values: Sequence[float]) -> None:
-        """Set the inputs: now, or as soon as there is a connection again."""
+    def write(self, values: Sequence[float] | None) -> None:
+        """Set the inputs: now, or as soon as there is a connection again. None: what was written is not to be repeated."""
         with self._news:
-            self._written = tuple(values)
-            client = self._client
-        if client is not None:
+            self._written = None if values is None else tuple(values)
+            self._send()
+
+    def _send(self) -> None:
+        """What is to be written, with the lock held, so that nothing older comes after it."""
+        if self._client is not None and self._written is not None:
             try:
-                client.send(values)
+                self._client.send(self._written)
             except CellError as error:  # the reader finds the same, and connects again: then it is written
                 self.trouble = str(error)
 
     def _read(self) -> None:
-        late = Lateness()
+        late, again, newest = Lateness(), False, float("-inf")
         while not self._closing.is_set():
             client = self._client
             if client is None:
@@ -171,10 +175,18 @@ class RtdeStream:
                 rows = client.rows()
             except CellError as error:
                 self._again(str(error))
-                late = Lateness()
+                late, again = Lateness(), True
                 continue
             arrival = self._clock()
             self._keep([Row(values, late.is_late(values[0], arrival), self._session) for values in rows])
+            if again:
+                self._write_again(began_anew=rows[0][0] < newest)
+            again, newest = False, rows[-1][0]
+
+    def _write_again(self, began_anew: bool) -> None:
+        with self._news:
+            self._written = None if began_anew else self._written
+            self._send()
 
     def _keep(self, rows: list[Row]) -> None:
         with self._news:
@@ -196,7 +208,7 @@ class RtdeStream:
         self._counts["restarts"] += steps < 0
 
     def _again(self, why: str) -> None:
-        """Connect again, and write again what was written last."""
+        """Connect again."""
         wait, longest = RETRY_S
         with self._news:
             lost, self._client, self.trouble = self._client, None, why
@@ -205,10 +217,6 @@ class RtdeStream:
         while not self._closing.is_set():
             try:
                 client = self._connect()
-                with self._news:
-                    written = self._written
-                if written is not None:
-                    client.send(written)
             except CellError as error:
                 self.trouble = str(error)
                 self._closing.wait(wait)
@@ -218,8 +226,6 @@ class RtdeStream:
                 self._client, self.trouble = client, ""
                 self._session += 1
                 self._counts["reconnects"] += 1
-            if self._written != written:
-                self.write(self._written or ())
             if self._closing.is_set():
                 client.close()
             return
