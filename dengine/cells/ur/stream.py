@@ -166,7 +166,7 @@ class RtdeStream:
                 self.trouble = str(error)
 
     def _read(self) -> None:
-        late, again, newest = Lateness(), False, float("-inf")
+        late, again = Lateness(), False
         while not self._closing.is_set():
             client = self._client
             if client is None:
@@ -180,13 +180,9 @@ class RtdeStream:
             arrival = self._clock()
             self._keep([Row(values, late.is_late(values[0], arrival), self._session) for values in rows])
             if again:
-                self._write_again(began_anew=rows[0][0] < newest)
-            again, newest = False, rows[-1][0]
-
-    def _write_again(self, began_anew: bool) -> None:
-        with self._news:
-            self._written = None if began_anew else self._written
-            self._send()
+                with self._news:
+                    self._send()
+            again = False
 
     def _keep(self, rows: list[Row]) -> None:
         with self._news:
@@ -206,6 +202,7 @@ class RtdeStream:
         self._counts["missing"] += max(steps - 1, 0)
         self._counts["repeated"] += steps == 0
         self._counts["restarts"] += steps < 0
+        self._written = None if steps < 0 else self._written  # it began anew: that was meant for before
 
     def _again(self, why: str) -> None:
         """Connect again."""
