@@ -54,6 +54,11 @@ class EngineFacts:
         return self._settings.recipe.policy
 
     @property
+    def shadow(self) -> bool:
+        """Whether every part is verified, and the model only says what it would have done; `set_shadow` changes it."""
+        return self.policy.audit_rate == 1.0
+
+    @property
     def trace(self) -> TraceSpec | None:
         """The traces' contract; None before the first sound trace."""
         return self._settings.trace
