@@ -52,16 +52,17 @@ class DecisionMaker:
         part: str | None,
         model: EngineModel | None,
         version: int,
-        away: bool = False,
+        unasked: Reason | None = None,
         decision_id: str | None = None,
     ) -> DecidedTrace:
-        """(C, T) of a part with this number -> what goes into the store; away : the store cannot be written."""
+        """(C, T) of a part with this number -> what goes into the store.
+
+        unasked : why the part is verified whatever the model says; None: it is asked.
+        """
         fault, content = self._gate(torch.from_numpy(x))
         hash_ = own_hash(content, part)
-        if fault or away:
-            prediction = replace(NOTHING_KNOWN, reason=REASONS[fault] if fault else Reason.NO_STORE)
-        else:
-            prediction = _predict(x, hash_, model)
+        reason = REASONS[fault] if fault else unasked
+        prediction = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
         decision = self._record(prediction, part, content, version)
         named = decision if decision_id is None else replace(decision, id=decision_id)
         return DecidedTrace(named, x, hash_, bool(fault), 0.0, part)
@@ -113,7 +114,18 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
         raise TraceError(
             f"Expected the trace that decision {known.id!r} was made on, got another; give it an id of its own."
         )
+    return as_decision(known)
+
+
+def as_decision(known: StoredDecision) -> Decision:
+    """The decision as it was answered."""
     return Decision(**{field.name: getattr(known, field.name) for field in fields(Decision)})
+
+
+def late_decision(decision_id: str, part: str | int | None, version: int) -> Decision:
+    """What is answered to whoever waits no more, before the engine has recorded it."""
+    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, Reason.LATE, False, 1.0, as_part(part))
+    return Decision(decision_id, Action.VERIFY, Action.VERIFY, *said)
 
 
 def as_part(part: Any) -> str | None:

@@ -33,7 +33,7 @@ from .labels import as_id, as_success
 from .loop import drive
 from .model.base import EngineModel, Model
 from .recipe import Recipe
-from .records import Cycle, Decision, RetrainReport, TraceSpec
+from .records import Cycle, Decision, Reason, RetrainReport, TraceSpec
 from .resuming import Telling
 from .retraining import Clock, EncoderTime, Limits, Retrainer
 from .reviewing import EngineReview
@@ -185,7 +185,13 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
             return engine
 
     def decide(
-        self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False, decision_id: str | None = None
+        self,
+        trace: ArrayLike,
+        part: str | int | None = None,
+        *,
+        wait: bool = False,
+        decision_id: str | None = None,
+        late: bool = False,
     ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
@@ -196,23 +202,31 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
         decision_id : of the caller's, used once, so that whoever died before the answer asks again: the same id and trace
             have the same decision for ever, which is on the disk, in the store's journal at least, when this returns.
             TraceError for the id of another trace, ReportError for what is no id.
+        late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
         """
         self._keeper.check()
         with uninterrupted():
             id_ = None if decision_id is None else as_id(decision_id)
-            if id_ is not None and (known := self._keeper.find(id_)) is not None:
+            if id_ is not None and (known := self._known(id_)) is not None:
                 return decided_before(known, trace, self.trace)
             self._versions.collect()
             self.encoder_time.earn()
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
-            away = bool(self._keeper.away)
-            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, away, id_))
+            unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
+            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
             if wait:
                 self._keeper.flush()
             elif id_ is not None:
                 self._keeper.secure()
         return item.decision
+
+    def _known(self, decision_id: str) -> StoredDecision | None:
+        try:
+            return self._keeper.find(decision_id)
+        except StoreError as error:  # the store is away: what was decided lately is known all the same
+            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
+            return None
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:
         self._keeper.decided(item)
@@ -261,6 +275,7 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
     def settle(self) -> RetrainReport | None:
         """Do what need not wait for a report, a retrain or a slice of training; returns the newest retrain, once."""
         with uninterrupted():
+            self._versions.collect()
             self._versions.work(self.recipe.retrain_every)
             return self._versions.take_news()
 

@@ -69,6 +69,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "journals": 9,
     "export": 10,
     "experiments": 11,
+    "serve": 12,
     "cli": 13,
     "__main__": 13,
 }
