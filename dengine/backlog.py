@@ -117,6 +117,12 @@ class Backlog:
             self.committed([record.decision.id for record in batch if isinstance(record, DecidedTrace)])
         return refused
 
+    def stored_upto(self, end: int) -> None:
+        """The store holds what the journal held up to this offset; what is all stored is cleared."""
+        with self.lock:
+            self._played = max(self._played, end)
+            self.cleared()
+
     def cleared(self) -> bool:
         """Empty the journal once the store has all of it; whether nothing is left to be played back."""
         with self.lock:

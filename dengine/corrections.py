@@ -31,6 +31,7 @@ from .store.records import Change, StoredDecision
 from .versions import ModelVersions
 
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops")  # what a rule is made of, and its evidence measured by
+SHADOW = {True: "shadow mode: every part is verified from now on", False: "the shadow mode ended: the model decides again"}
 SAID = {True: "success", False: "failure", None: "forgotten"}
 
 
@@ -38,7 +39,7 @@ SAID = {True: "success", False: "failure", None: "forgotten"}
 class Changed:
     """What a verb that puts something right did.
 
-    kind : "correct", "forget", "rollback" or "policy".  text : in words.
+    kind : "correct", "forget", "rollback", "policy" or "shadow".  text : in words.
     event : number of the event that was recorded; None where everything was as asked already, and nothing changed.
     version : of the model that answers now.
     """
@@ -131,6 +132,23 @@ class Corrections:
         """
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
+        return self._go_on_under(policy, author)
+
+    def set_shadow(self, on: bool, author: str = "") -> Changed:
+        """Verify every part from the next decision on, or end that: the shadow mode, which lasts over restarts.
+
+        What the model is certain of is then an audit, each part's: `Decision.predicted` says what it would have done, and
+        its label, `Source.AUDIT`, whether that was right; all is learned from as ever. It is the policy with an audit rate
+        of 1, and its end brings back the rate from before; so the certificate begins anew with each.
+        """
+        if not isinstance(on, bool):
+            raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
+        policy, before = self._settings.recipe.policy, self._settings.shadowed_rate
+        if on == (policy.audit_rate == 1.0):
+            return self._unchanged("shadow", f"The shadow mode is {'on' if on else 'off'} already; nothing changed.")
+        return self._go_on_under(replace(policy, audit_rate=1.0 if on else before), author)
+
+    def _go_on_under(self, policy: Policy, author: str) -> Changed:
         old = self._settings.recipe.policy
         new = {name: value for name, value in asdict(policy).items() if value != getattr(old, name)}
         if not new:
@@ -147,8 +165,11 @@ class Corrections:
         settings = self._under(policy, anew)
         was = {name: getattr(old, name) for name in new}
         text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
+        kind = "policy"
+        if list(new) == ["audit_rate"] and 1.0 in (old.audit_rate, policy.audit_rate):
+            kind, text = "shadow", SHADOW[policy.audit_rate == 1.0]
         data = {"old": asdict(old), "new": asdict(policy)}
-        event = Change("policy", text, data, author, settings=settings.to_store())
+        event = Change(kind, text, data, author, settings=settings.to_store())
         telling = Telling(settings.told_since, settings.began_in)
         self._versions.set_policy(policy if anew else None, telling, event)
         self._settings, self._maker.audit_rate = settings, policy.audit_rate
@@ -159,7 +180,8 @@ class Corrections:
         """The settings under another policy; anew : whether its rule begins without evidence."""
         now = self._settings
         since = 0 if self._versions.answering is None else self._versions.next_number
-        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since)
+        shadowed = now.recipe.policy.audit_rate if policy.audit_rate == 1.0 else 0.0
+        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, shadowed_rate=shadowed)
         return replace(settings, told_since=since, began_in=SAFE_MODE.index(self._feedback.safe_mode)) if anew else settings
 
     def _make_ready(self) -> None:

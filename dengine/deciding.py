@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import logging
 import uuid
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .contracts import first_contract
+from .contracts import as_agreed, first_contract
 from .decision.rule import script
 from .errors import ReportError, TraceError
 from .folds import audited, own_hash
 from .labels import LONGEST, is_name
 from .model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
 from .records import REASONS, Action, Decision, Reason, Source, TraceSpec
-from .store.records import DecidedTrace
+from .store.records import DecidedTrace, StoredDecision
 from .traces import TraceGate
 from .wording import shortened
 
@@ -47,17 +47,25 @@ class DecisionMaker:
         return spec if fit else None
 
     def decide(
-        self, x: NDArray[np.float32], part: str | None, model: EngineModel | None, version: int, away: bool = False
+        self,
+        x: NDArray[np.float32],
+        part: str | None,
+        model: EngineModel | None,
+        version: int,
+        unasked: Reason | None = None,
+        decision_id: str | None = None,
     ) -> DecidedTrace:
-        """(C, T) of a part with this number -> what goes into the store; away : the store cannot be written."""
+        """(C, T) of a part with this number -> what goes into the store.
+
+        unasked : why the part is verified whatever the model says; None: it is asked.
+        """
         fault, content = self._gate(torch.from_numpy(x))
         hash_ = own_hash(content, part)
-        if fault or away:
-            prediction = replace(NOTHING_KNOWN, reason=REASONS[fault] if fault else Reason.NO_STORE)
-        else:
-            prediction = _predict(x, hash_, model)
+        reason = REASONS[fault] if fault else unasked
+        prediction = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
         decision = self._record(prediction, part, content, version)
-        return DecidedTrace(decision, x, hash_, bool(fault), 0.0, part)
+        named = decision if decision_id is None else replace(decision, id=decision_id)
+        return DecidedTrace(named, x, hash_, bool(fault), 0.0, part)
 
     def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> DecidedTrace:
         """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
@@ -97,6 +105,27 @@ def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> P
     except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
         log.exception("the model failed on a trace; the part is verified")
         return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
+
+
+def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
+    """The decision that this id has already; TraceError where it was made on another trace."""
+    x = as_agreed(trace, spec, False)
+    if not np.array_equal(x, known.trace, equal_nan=True):
+        raise TraceError(
+            f"Expected the trace that decision {known.id!r} was made on, got another; give it an id of its own."
+        )
+    return as_decision(known)
+
+
+def as_decision(known: StoredDecision) -> Decision:
+    """The decision as it was answered."""
+    return Decision(**{field.name: getattr(known, field.name) for field in fields(Decision)})
+
+
+def late_decision(decision_id: str, part: str | int | None, version: int) -> Decision:
+    """What is answered to whoever waits no more, before the engine has recorded it."""
+    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, Reason.LATE, False, 1.0, as_part(part))
+    return Decision(decision_id, Action.VERIFY, Action.VERIFY, *said)
 
 
 def as_part(part: Any) -> str | None:

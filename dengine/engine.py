@@ -14,29 +14,26 @@ import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, Self
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .agreeing import TraceAgreement
 from .cells.base import Cell
-from .contracts import as_agreed
 from .corrections import Corrections
-from .deciding import DecisionMaker, as_part
+from .deciding import DecisionMaker, as_part, decided_before
 from .decision.policy import Policy
 from .errors import StoreError
-from .facts import EngineFacts
 from .feedback import Feedback, unknown_stop
-from .fleet import agreed, as_sisters, trace_of_sisters
+from .fleet import agreed, as_sisters
 from .interrupts import uninterrupted
 from .keeping import CLOSE, Keeper
 from .labels import as_id, as_success
 from .loop import drive
 from .model.base import EngineModel, Model
 from .recipe import Recipe
-from .records import Cycle, Decision, RetrainReport, TraceSpec
+from .records import Cycle, Decision, Reason, RetrainReport, TraceSpec
 from .resuming import Telling
 from .retraining import Clock, EncoderTime, Limits, Retrainer
 from .reviewing import EngineReview
@@ -52,7 +49,7 @@ OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine(EngineFacts, EngineReview, Corrections):
+class DataEngine(TraceAgreement, EngineReview, Corrections):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -145,9 +142,12 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
         return cls(recipe=recipe, store=store, **options)
 
     @classmethod
-    def open(cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, **options: Any) -> Self:
+    def open(
+        cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, wait: float | None = None, **options: Any
+    ) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
+        wait : seconds for a file or URL, as `SqlStore` takes it.
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
         options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them; reading=True looks at a
             store that another engine may own, to export it for one, and neither decides nor learns.
@@ -155,7 +155,7 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
         is missing.
         """
         engine = cls.__new__(cls)
-        with opening(url, must_exist=True) as store:
+        with opening(url, must_exist=True, wait=wait) as store:
             name = "the store" if isinstance(url, Store) else str(url)
             settings = EngineSettings.from_store(store.settings(), name, reducer, model)
             engine._start(*settings.with_template(model), store, **options)
@@ -166,13 +166,16 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
         return engine
 
     @classmethod
-    def open_or_create(cls, store: StoreLike | None, seed: int | None = None, **settings: Any) -> Self:
+    def open_or_create(
+        cls, store: StoreLike | None, seed: int | None = None, *, wait: float | None = None, **settings: Any
+    ) -> Self:
         """Go on with a store that has been used, or start on a new one: the same line at every start of a program.
 
+        wait : as for `open`.
         settings : as `DataEngine` takes them. Those given must be what a used store was made with, or a SettingError
             says so: a running cell's settings do not change in silence.
         """
-        with opening(store) as opened:
+        with opening(store, wait=wait) as opened:
             if not opened.settings():
                 return cls(store=opened, **as_sisters(settings | {"seed": seed}, opened))
             options = {name: settings.pop(name) for name in OPTIONS if name in settings}
@@ -181,34 +184,49 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
                 engine._settings.must_agree_with(settings | {"seed": seed})
             return engine
 
-    def decide(self, trace: ArrayLike, part: str | int | None = None, *, wait: bool = False) -> Decision:
+    def decide(
+        self,
+        trace: ArrayLike,
+        part: str | int | None = None,
+        *,
+        wait: bool = False,
+        decision_id: str | None = None,
+        late: bool = False,
+    ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
         TraceError for a wrong shape, and for a first trace of less than 10 samples; whatever else fails becomes VERIFY, a
         store that is away too.
         part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
-        wait : return only when the decision is on the disk; by default it is there before any report on it returns.
+        wait : return only when the decision is in the store; by default it is there before any report on it returns.
+        decision_id : of the caller's, used once, so that whoever died before the answer asks again: the same id and trace
+            have the same decision for ever, which is on the disk, in the store's journal at least, when this returns.
+            TraceError for the id of another trace, ReportError for what is no id.
+        late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
         """
         self._keeper.check()
         with uninterrupted():
+            id_ = None if decision_id is None else as_id(decision_id)
+            if id_ is not None and (known := self._known(id_)) is not None:
+                return decided_before(known, trace, self.trace)
             self._versions.collect()
             self.encoder_time.earn()
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
-            away = bool(self._keeper.away)
-            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, away))
+            unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
+            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
             if wait:
                 self._keeper.flush()
+            elif id_ is not None:
+                self._keeper.secure()
         return item.decision
 
-    def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
-        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
-            if self.agree_on(spec, inferred=True) != spec:  # a sister's trace came first
-                return as_agreed(trace, self.trace, False)
-        elif self._settings_waiting:
-            self._save_settings()
-        return x
+    def _known(self, decision_id: str) -> StoredDecision | None:
+        try:
+            return self._keeper.find(decision_id)
+        except StoreError as error:  # the store is away: what was decided lately is known all the same
+            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
+            return None
 
     def _put(self, item: DecidedTrace) -> DecidedTrace:
         self._keeper.decided(item)
@@ -257,6 +275,7 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
     def settle(self) -> RetrainReport | None:
         """Do what need not wait for a report, a retrain or a slice of training; returns the newest retrain, once."""
         with uninterrupted():
+            self._versions.collect()
             self._versions.work(self.recipe.retrain_every)
             return self._versions.take_news()
 
@@ -276,21 +295,3 @@ class DataEngine(EngineFacts, EngineReview, Corrections):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
-        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
-        if self.trace is None:
-            trace = trace_of_sisters(self._keeper) or trace
-            self._settings = replace(self._settings, trace=trace, inferred=inferred)
-            self._maker.agree_on(trace)
-            self._save_settings()
-        return self._settings.trace or trace
-
-    def _save_settings(self) -> None:
-        """Store the settings, or do it before the next decision, if the store is away."""
-        try:
-            self._keeper.ask(lambda: self.store.save_settings(self._settings.to_store()))
-            self._settings_waiting = False
-        except StoreError:
-            self._settings_waiting = True
-            log.exception("the settings are stored later")

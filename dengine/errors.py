@@ -30,6 +30,10 @@ class StoreError(DengineError, RuntimeError):
     """A store that cannot be opened, belongs to something else, or lost its writer."""
 
 
+class BusyError(DengineError, RuntimeError):
+    """A server that has as much to do as it takes, or is closing: whoever asked goes on without it, and verifies."""
+
+
 class ExportError(DengineError, RuntimeError):
     """A model that cannot be exported, or an exported file that must not be used."""
 

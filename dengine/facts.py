@@ -9,12 +9,14 @@ from .decision.certificate import Certificate, certificate_of
 from .decision.policy import Policy
 from .feedback import Feedback
 from .keeping import Keeper
+from .labels import as_id
 from .model.base import Exportable
 from .recipe import Recipe
 from .records import TraceSpec
 from .retraining import EncoderTime
 from .settings import EngineSettings
 from .store.base import Store
+from .store.records import StoredDecision
 from .versions import ModelVersions
 
 
@@ -27,6 +29,10 @@ class EngineFacts:
     _keeper: Keeper
     _versions: ModelVersions
     _feedback: Feedback
+
+    def find(self, decision_id: str) -> StoredDecision | None:
+        """A decision with its trace, and with its label where it has one; None for an unknown id."""
+        return self._keeper.find(as_id(decision_id))
 
     def flush(self) -> None:
         """Return when all that is known so far is on the disk."""
@@ -52,6 +58,11 @@ class EngineFacts:
     def policy(self) -> Policy:
         """The user's numbers as they are in force; `set_policy` changes them."""
         return self._settings.recipe.policy
+
+    @property
+    def shadow(self) -> bool:
+        """Whether every part is verified, and the model only says what it would have done; `set_shadow` changes it."""
+        return self.policy.audit_rate == 1.0
 
     @property
     def trace(self) -> TraceSpec | None:

@@ -32,7 +32,7 @@ from .journals import Journal, JournalLine, read_journal
 from .recipe import Recipe
 from .records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
 from .settings import trace_in
-from .store.base import NewLabel, Store, opening
+from .store.base import UNHURRIED, NewLabel, Store, opening
 from .traces import TraceGate, as_traces
 
 EXPORTED = "export"  # the kind of the events that note a model's sum
@@ -71,7 +71,7 @@ def import_labelled(
     """
     data = load_dataset(dataset, **form_in(store, dataset))
     spec = data.spec
-    engine = DataEngine.open_or_create(store, seed, recipe=recipe)
+    engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe)
     try:
         agreed = engine.agree_on(spec)
         must_agree(data, agreed)

@@ -11,7 +11,6 @@ import os
 import queue
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -22,9 +21,9 @@ from numpy.typing import NDArray
 from .asking import Asked
 from .backlog import WAITING, Backlog, OwnedStore
 from .errors import StoreError
+from .recent import RecentDecisions
 from .records import RetrainReport
 from .store.base import Store
-from .store.checks import already_reported
 from .store.journal_records import LateEvent, LateLabel, Record
 from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
 
@@ -32,7 +31,6 @@ log = logging.getLogger("dengine")
 GRACE = 2.0  # seconds in which a store may be slow before its cell verifies everything
 BEAT = 1.0  # seconds between two tries, and between two looks at whether the store is there
 CLOSE = 5.0  # seconds that closing may take
-RECENT = 1_000  # decisions that a report finds without asking the store
 BACK = "it is there again, and is to take what its journal holds."
 
 T = TypeVar("T")
@@ -51,12 +49,14 @@ class Keeper:
         self.fault = ""
         self._fault_began = 0.0
         self._beat_began: float | None = None
-        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
+        self._recent = RecentDecisions()
         self._pid = os.getpid()
         self._closed, self._reading, self._patient = False, not owning, patient
         self._jobs: queue.SimpleQueue[Asked[Any] | None] = queue.SimpleQueue()
         self._backlog: Backlog | None = None
+        self._grace = GRACE
         if owning and isinstance(store, OwnedStore):
+            self._grace = max(GRACE, store.wait)
             self._backlog = Backlog(store, store.own())
             self._begin(self._backlog)
 
@@ -84,7 +84,7 @@ class Keeper:
         """
         if not self.fault or self._backlog is None or (self._backlog.store.remote and "journal" not in self.fault):
             return ""
-        slow = self.fault.startswith(("no answer", BACK)) and time.monotonic() - self._fault_began < GRACE
+        slow = self.fault.startswith(("no answer", BACK)) and time.monotonic() - self._fault_began < self._grace
         return "" if slow else self.fault
 
     @property
@@ -109,9 +109,7 @@ class Keeper:
     def decided(self, item: DecidedTrace) -> None:
         """Take a decision and its trace without waiting."""
         self.check()
-        self._recent[item.decision.id] = stored_decision(item)
-        if len(self._recent) > RECENT:
-            self._recent.popitem(last=False)
+        self._recent.add(stored_decision(item))
         backlog = self._backlog
         if backlog is None:
             self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
@@ -134,18 +132,16 @@ class Keeper:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
         if self._backlog is None:
             return self.store.get_decision(decision_id)
-        known = self._recent.get(decision_id) or self._backlog.find(decision_id)
+        known = self._recent.find(decision_id) or self._backlog.find(decision_id)
         return known or self.ask(lambda: self.store.get_decision(decision_id))
 
     def labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
         """Commit labels; returns their numbers, 0 for those that wait in the journal. ReportError as `Store.put_labels`."""
         now = time.time()
-        self._refuse_repeats(labels)
+        self._recent.refuse_repeats(labels)
         late = [LateLabel(label, now) for label in labels]
         numbers = self._store(lambda: self.store.put_labels(labels), late)
-        for label in labels:
-            if (known := self._recent.get(label.decision_id)) is not None:
-                self._recent[label.decision_id] = replace(known, success=label.success, source=label.source)
+        self._recent.label(labels)
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
     def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int | None:
@@ -160,13 +156,20 @@ class Keeper:
         """Return when all that is known so far is on the disk: in the store, or in its journal."""
         self._store(self.store.flush, [])
 
+    def secure(self) -> None:
+        """Return when all that was decided so far is on the disk: in the journal, which is quicker than the store."""
+        if self._backlog is None:
+            self.store.flush()
+        else:
+            self._spill(self._backlog, beyond=0)
+
     def arrived(self) -> list[tuple[str, int]]:
         """The numbers of labels, by their decisions, that waited in the journal until now; each once."""
         return [] if self._backlog is None else self._backlog.take_arrived()
 
     def forget(self, decision_id: str) -> None:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
-        self._recent.pop(decision_id, None)
+        self._recent.forget(decision_id)
 
     def ask(self, work: Callable[[], T], more: float = 0.0) -> T:
         """Call the store with the time limit; StoreError where it is away. more : seconds for a commit under way."""
@@ -182,21 +185,21 @@ class Keeper:
         """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
         if not self.usable:
             return
-        if self._backlog is None:
+        if (backlog := self._backlog) is None:
             self.store.close()
             self._closed = True
             return
         self.flush()
         self._closed = True
-        self._jobs.put(closing := Asked(self.store.close, lasting=True))
+        self._jobs.put(closing := Asked(lambda: self._let_store_go(backlog), lasting=True))
         self._jobs.put(None)
         try:
             closing.result(CLOSE)
             self._thread.join()
         except StoreError as error:
-            log.warning("the store was left, its journal %s holds what it lacks: %s", self._backlog.journal.path, error)
-            self._backlog.store.let_go()  # else its writer, and its lease on the cell, would outlive the engine
-        self._backlog.journal.close()
+            log.warning("the store was left, its journal %s holds what it lacks: %s", backlog.journal.path, error)
+            backlog.store.let_go()  # else its writer, and its lease on the cell, would outlive the engine
+        backlog.journal.close()
 
     # Limits, and the journal
 
@@ -235,20 +238,14 @@ class Keeper:
 
     def _look_at_the_beat(self) -> None:
         began = self._beat_began
-        if not self.fault and began is not None and time.monotonic() - began > GRACE and not self._patient:
-            self._note(f"no answer from the store for {GRACE:g} s.")
+        if not self.fault and began is not None and time.monotonic() - began > self._grace and not self._patient:
+            self._note(f"no answer from the store for {self._grace:g} s.")
 
-    def _spill(self, backlog: Backlog) -> None:
+    def _spill(self, backlog: Backlog, beyond: int = WAITING) -> None:
         try:
-            backlog.write_beyond(WAITING)
+            backlog.write_beyond(beyond)
         except StoreError as error:  # they wait in memory
             self._note(str(error))
-
-    def _refuse_repeats(self, labels: Sequence[NewLabel]) -> None:
-        for label in labels:
-            known = self._recent.get(label.decision_id)
-            if known is not None and known.success is not None and known.source is not None:
-                raise already_reported(known.id, (known.success, known.source), (label.success, label.source))
 
     # The keeper's thread
 
@@ -267,8 +264,9 @@ class Keeper:
 
     def _beat(self, backlog: Backlog) -> None:
         """Look whether the store is there; where it was not, and now is, play the journal back."""
-        before = backlog.unsafe
-        if not (before or self.fault):
+        with backlog.lock:
+            before, end, well = backlog.unsafe, backlog.journal.end, not self.fault
+        if well and not before and backlog.journal.empty:
             return
         self._beat_began = time.monotonic()
         try:
@@ -276,10 +274,16 @@ class Keeper:
             if self.fault:
                 self._play_back(backlog)
             backlog.committed(before)
+            if well:  # what the journal held then are decisions, which the store was given as well
+                backlog.stored_upto(end)
         except Exception as error:  # whatever it is, the cell goes on, and this thread too
             self._note(str(error))
         finally:
             self._beat_began = None
+
+    def _let_store_go(self, backlog: Backlog) -> None:
+        self._beat(backlog)
+        self.store.close()
 
     def _play_back(self, backlog: Backlog) -> None:
         while True:

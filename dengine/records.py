@@ -32,6 +32,7 @@ class Reason(StrEnum):
     NOVEL = "novel"  # unlike all that was learned from, whatever its neighbours say
     SAFE_MODE = "safe_mode"  # everything is verified: what was accepted failed too often, or too much is novel
     NO_STORE = "no_store"  # what is decided cannot be written where it belongs: the part is verified, its label waits
+    LATE = "late"  # the answer would have come too late: whoever asked verifies already
 
 
 ACTIONS, REASONS = tuple(Action), tuple(Reason)  # by position: the integers of exported files

@@ -44,6 +44,7 @@ class EngineSettings:
     policy_since : the first model version under the policy in force; 0: every one.
     told_since : the first version of whose decisions the rule in force is told.  began_in : the position in `SAFE_MODE`
         that it began in.
+    shadowed_rate : the audit rate that the shadow mode took the place of.
     """
 
     recipe: Recipe
@@ -55,6 +56,7 @@ class EngineSettings:
     policy_since: int = 0
     told_since: int = 0
     began_in: int = 0
+    shadowed_rate: float = 0.0
 
     def __post_init__(self) -> None:
         if not is_whole(self.seed, 0, SEEDS):
@@ -70,7 +72,7 @@ class EngineSettings:
             known["trace"] = json.dumps(asdict(self.trace))
         if self.inferred:
             known["inferred"] = "true"
-        return known | {name: str(value) for name in MARKS if (value := getattr(self, name))}
+        return known | {name: str(value) for name in (*MARKS, "shadowed_rate") if (value := getattr(self, name))}
 
     @classmethod
     def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
@@ -105,7 +107,8 @@ class EngineSettings:
                 )
         inferred = "inferred" in known
         marks = {name: int(known.get(name, "0")) for name in MARKS}
-        return cls(recipe, seed_in(known), known.get("model"), made_with, trace_in(known), inferred, **marks)
+        model_, trace, rate = known.get("model"), trace_in(known), shadowed_rate_in(known)
+        return cls(recipe, seed_in(known), model_, made_with, trace, inferred, **marks, shadowed_rate=rate)
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
@@ -122,6 +125,8 @@ class EngineSettings:
         given = {name: value for name, value in asked.items() if value is not None}
         reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
         have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
+        if self.recipe.policy.audit_rate == 1.0:  # a program's settings are the same in the shadow mode
+            have["audit_rate"] = self.shadowed_rate
         unknown = sorted(set(given) - set(have))
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
@@ -187,6 +192,17 @@ def seed_in(known: Mapping[str, str]) -> int:
     if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
         raise StoreError(f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy.")
     return int(seed)
+
+
+def shadowed_rate_in(known: Mapping[str, str]) -> float:
+    """The audit rate behind the shadow mode among a store's settings. StoreError for what is none."""
+    text = known.get("shadowed_rate", "0")
+    try:
+        return Policy(audit_rate=float(text)).audit_rate
+    except (ValueError, SettingError) as error:
+        raise StoreError(
+            f"Expected an audit rate in the store's settings, got {shortened(text)}; restore the store from a copy."
+        ) from error
 
 
 def flat(recipe: Recipe) -> dict[str, Any]:

@@ -214,6 +214,10 @@ def _no_store(past: PastDecision, trace: NDArray[np.float32], found: Circumstanc
     return ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
 
 
+def _late(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."
+
+
 WHY: dict[Reason, Why] = {
     Reason.CERTAIN: _certain,
     Reason.UNCERTAIN: _uncertain,
@@ -226,6 +230,7 @@ WHY: dict[Reason, Why] = {
     Reason.NOVEL: _novel,
     Reason.SAFE_MODE: _safe,
     Reason.NO_STORE: _no_store,
+    Reason.LATE: _late,
 }
 
 

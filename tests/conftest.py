@@ -3,6 +3,7 @@
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
+os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stalls for longer than a cell would wait
 
 import shutil
 import subprocess

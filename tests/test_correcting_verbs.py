@@ -155,7 +155,15 @@ def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path:
 
 
 @pytest.mark.parametrize(
-    "words", [("correct", "x", "good"), ("forget", "x"), ("rollback", 1), ("set-policy", "--alpha", 0.1), ("retrain",)]
+    "words",
+    [
+        ("correct", "x", "good"),
+        ("forget", "x"),
+        ("rollback", 1),
+        ("set-policy", "--alpha", 0.1),
+        ("shadow", "on"),
+        ("retrain",),
+    ],
 )
 def test_a_store_that_is_not_there_is_one_line_and_is_not_made(words: tuple, tmp_path: Path) -> None:
     verb, *rest = words

@@ -44,6 +44,8 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "interrupts": 1,
     "asking": 8,
     "backlog": 8,
+    "recent": 8,
+    "agreeing": 8,
     "keeping": 8,
     "pending": 8,
     "facts": 8,
@@ -67,8 +69,9 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "journals": 9,
     "export": 10,
     "experiments": 11,
-    "cli": 12,
-    "__main__": 12,
+    "serve": 12,
+    "cli": 13,
+    "__main__": 13,
 }
 HEAVY = {  # at the top of a module only in those dedicated to it, which are themselves imported where they are used
     "umap": (),

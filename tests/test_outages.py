@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -43,11 +43,15 @@ def go_on(engine: DataEngine, data: Dataset, first: int, last: int) -> list:
     return list(engine.run(ReplayCell(data, order), len(order)))
 
 
-def until_back(engine: DataEngine, seconds: float = 30.0) -> None:
+def wait_for(what: Callable[[], object], seconds: float = 30.0, late: Callable[[], str] = lambda: "it never came") -> None:
     end = time.monotonic() + seconds
-    while engine._keeper.fault:
-        assert time.monotonic() < end, f"the store is still away: {engine._keeper.fault}"
+    while not what():
+        assert time.monotonic() < end, late()
         time.sleep(0.05)
+
+
+def until_back(engine: DataEngine) -> None:
+    wait_for(lambda: not engine._keeper.fault, late=lambda: f"the store is still away: {engine._keeper.fault}")
 
 
 def labels_of(file: Path) -> dict[str, bool]:
@@ -399,7 +403,11 @@ def test_a_killed_executor_is_given_up_and_retrains_go_on_in_line(stream: Datase
         pool.submit(abs, 1).result()
         (worker,) = pool._processes
         os.kill(worker, signal.SIGKILL)
-        go_on(engine, stream, 0, 150)
+        for first in range(0, 450, 50):  # the pool is told of its worker's death by a thread of its own, some time later
+            go_on(engine, stream, first, first + 50)
+            if engine._versions.retrainer.executor is None:
+                break
+            wait_for(lambda: pool._broken)
         assert engine._versions.retrainer.executor is None  # given up, whether it was asked or answered for
         assert engine.version > 0
 

@@ -78,7 +78,7 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"lower_bound": 1.0}, r"0\.5 < lower_bound < 1"),
         ({"lower_bound": math.nan}, r"0\.5 < lower_bound < 1"),
         ({"interval": "wald"}, "wilson, binomial, clopper_pearson, jeffreys"),
-        ({"audit_rate": 1.0}, "audit_rate"),
+        ({"audit_rate": 1.1}, "audit_rate"),
         ({"audit_rate": -0.1}, "audit_rate"),
     ],
 )

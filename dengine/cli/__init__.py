@@ -17,7 +17,7 @@ from .. import __version__
 from ..errors import DengineError
 from ..wording import without_password
 from .cells import cells
-from .correcting import correct, forget, retrain, rollback, set_policy
+from .correcting import correct, forget, retrain, rollback, set_policy, shadow
 from .data import data
 from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
@@ -75,6 +75,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, train, run, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, retrain, export, export_cpp, make_key, import_labels),
+    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

@@ -36,9 +36,10 @@ def _changed(
 ) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine import DataEngine
+    from ..store.base import UNHURRIED
 
     who = _login() if author is None else author
-    with DataEngine.open(store) as engine:
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
         changed = change(engine, who)
         certificate, policy = engine.certificate(), engine.policy
     if as_json:
@@ -128,6 +129,20 @@ def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> N
     )
 
 
+@click.command(epilog=example("dengine shadow engine.db on"))
+@store_argument
+@click.argument("state", type=click.Choice(["on", "off"]))
+@author_option
+@json_option
+def shadow(store: str, state: str, author: str | None, as_json: bool) -> None:
+    """Verify every part, or let the model decide again.
+
+    In the shadow mode it only says what it would have done. The mode lasts over restarts. `dengine status` counts
+    what the model would have done, and how much of that was wrong.
+    """
+    _changed("shadow", store, author, lambda engine, who: engine.set_shadow(state == "on", who), as_json)
+
+
 @click.command(epilog=example("dengine retrain engine.db"))
 @store_argument
 @author_option
@@ -139,9 +154,10 @@ def retrain(store: str, author: str | None, as_json: bool) -> None:
     """
     from ..engine import DataEngine
     from ..experiments.tables import retrain_line
+    from ..store.base import UNHURRIED
 
     who = _login() if author is None else author
-    with DataEngine.open(store) as engine:
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
         report = engine.retrain()
         text = f"trained by hand on {report.n_traces} traces: {report.reason}"
         engine.store.put_event("retrain", text, asdict(report), who)

@@ -56,6 +56,7 @@ STRETCHES = 6
 @click.option(
     "--seed", type=click.IntRange(0), help="An integer, of a new store's engine and of the simulated cell.  [default: 0]"
 )
+@click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
 @out_option
 @json_option
 def run(
@@ -66,6 +67,7 @@ def run(
     cycles: int,
     store: str | None,
     seed: int | None,
+    shadow: bool,
     out: OutFolder | None,
     as_json: bool,
 ) -> None:
@@ -81,6 +83,8 @@ def run(
     from ..engine import DataEngine
 
     with DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None) as engine:
+        if shadow:
+            engine.set_shadow(True)
         cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles)
         log, changes = _drive(engine, cell, cycles, name, as_json)
         told = Told(changes, engine.safe_mode, engine.certificate())

@@ -101,6 +101,7 @@ def _import(
 def _train(store: str, retrains: int, quiet: bool, asked: Asked) -> Trained:
     from ..engine import DataEngine
     from ..importing import train_until_done
+    from ..store.base import UNHURRIED
 
     reports: list[RetrainReport] = []
 
@@ -111,7 +112,7 @@ def _train(store: str, retrains: int, quiet: bool, asked: Asked) -> Trained:
             raise EndAskedError
 
     interrupted = False
-    with DataEngine.open(store) as engine:
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
         try:
             with progress("training", retrains, quiet) as advance:
                 train_until_done(engine, retrains, count)

@@ -38,8 +38,8 @@ class Policy:
         together, however often one looks: see `guarantee`.
     stops : "all" where every accepted part that is bad stops the system and is reported before the next decision: then
         silence until that decision confirms the part. "some", the default, where silence says nothing.
-    audit_rate : share of certain decisions that are verified all the same, in [0, 1); needed for a guarantee on rejects,
-        since a rejected part gives no feedback of its own.
+    audit_rate : share of certain decisions that are verified all the same, in [0, 1]; needed for a guarantee on rejects,
+        since a rejected part gives no feedback of its own. 1 is the shadow mode: everything is verified.
     Raises SettingError for a value out of its range.
     """
 
@@ -61,8 +61,8 @@ class Policy:
             raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
         if not isinstance(self.interval, str) or self.interval not in INTERVALS:
             raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {shortened(self.interval)}.")
-        if not 0.0 <= self.audit_rate < 1.0:
-            raise SettingError(f"Expected 0 <= audit_rate < 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
+        if not 0.0 <= self.audit_rate <= 1.0:
+            raise SettingError(f"Expected 0 <= audit_rate <= 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
         if ":" not in self.guarantee and self.guarantee not in RULES:
             raise SettingError(
                 f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {shortened(self.guarantee)}."

@@ -35,7 +35,10 @@ from .records import (
 )
 from .views import StoreViews
 
+UNHURRIED = 10.0  # seconds to wait for a store where no cell waits, as its wait
+
 __all__ = [
+    "UNHURRIED",
     "AddedPoints",
     "Change",
     "Correction",
@@ -187,11 +190,14 @@ class Store(StoreViews, Protocol):
         """Flush and let go."""
 
 
-def open_store(store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False) -> Store:
+def open_store(
+    store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False, wait: float | None = None
+) -> Store:
     """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
 
     A file or URL may say whose rows it means, and what that cell makes: `fleet.address`.
     must_exist : a file or a cell that is not there is a StoreError; by default it is made.
+    wait : as `SqlStore` takes it; `UNHURRIED` where no cell waits.
     """
     if store is None:
         return MemoryStore()
@@ -204,7 +210,7 @@ def open_store(store: str | os.PathLike[str] | Store | None, *, must_exist: bool
         cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
         if must_exist:
             must_have_cell(os.fspath(store), cell_id)
-        return SqlStore(os.fspath(store), cell_id, product=product)
+        return SqlStore(os.fspath(store), cell_id, product=product, wait=wait)
     if not isinstance(store, Store):
         raise StoreError(f"Expected None, a file, a URL or a Store, got {type(store).__name__}; see `Store`.")
     return store
@@ -220,9 +226,11 @@ def must_be_there(store: str | os.PathLike[str]) -> None:
 
 
 @contextmanager
-def opening(store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False) -> Iterator[Store]:
+def opening(
+    store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False, wait: float | None = None
+) -> Iterator[Store]:
     """`open_store`; where what follows fails, a store that was opened here is closed again."""
-    opened = open_store(store, must_exist=must_exist)
+    opened = open_store(store, must_exist=must_exist, wait=wait)
     try:
         yield opened
     except BaseException:

@@ -77,6 +77,9 @@ class StoredDecision:
     quarantined: bool
     success: bool | None
     source: Source | None
+    n_success: int
+    n_failure: int
+    propensity: float
     part: str | None = None
 
 
@@ -236,6 +239,9 @@ def stored_decision(item: DecidedTrace, success: bool | None = None, source: Sou
         quarantined=item.quarantined,
         success=success,
         source=source,
+        n_success=decision.n_success,
+        n_failure=decision.n_failure,
+        propensity=decision.propensity,
         part=item.part,
     )
 

@@ -41,7 +41,7 @@ from .records import (
     stored_decision,
 )
 from .sql_history import SqlHistory, replacing
-from .sql_owning import WAIT, SqlOwning
+from .sql_owning import SqlOwning, checked_wait
 from .sql_queue import SqlDatabase
 from .sql_rows import chunks, label_row, read_decision, read_evidence, unpack
 from .sql_tables import LABEL, RESERVED, SETTING
@@ -61,6 +61,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
     product : what the cell makes; cells of one product share labels and versions. None: as a known cell has it, or
         nothing is shared.
     wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
+        None: as the environment's DENGINE_STORE_WAIT says, or 0.4.
     keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
         None: all keep them. A retrain itself stays listed for ever.
 
@@ -79,17 +80,15 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         clock: Callable[[], float] = time.time,
         *,
         product: str | None = None,
-        wait: float = WAIT,
+        wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
         """Open or create the store, and start its writer thread."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
-        if not wait > 0.0:
-            raise StoreError(f"Expected a wait above 0 seconds, got {wait!r}; 0.4 is the default.")
         self.keep_versions = check_keep(keep_versions)
-        self._clock, self.wait = clock, wait
+        self._clock, self.wait = clock, checked_wait(wait)
         self._database = SqlDatabase(str(url), cell_id, clock, product)
 
     def settings(self) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import urllib.parse
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..records import Source
+from ..wording import shortened
 from .journal import Journal, owned_by, owner
 from .journal_records import LateEvent, LateLabel, Record
 from .records import DecidedTrace
@@ -22,7 +24,21 @@ from .sql_rows import chunks, event_row, label_row
 from .sql_tables import EVENT, LABEL
 
 WAIT = 0.4  # seconds that an engine waits for the database
+WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 Arrived = tuple[str, int]  # a decision's id, the number of its label
+
+
+def checked_wait(wait: float | None) -> float:
+    """Return the seconds that an engine waits for its store; None: as the environment says, or 0.4. StoreError for less."""
+    said = os.environ.get(WAIT_VARIABLE) if wait is None else None
+    name = "a wait" if said is None else WAIT_VARIABLE
+    try:
+        seconds = float(said) if said else WAIT if wait is None else wait
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 < seconds < math.inf:
+        raise StoreError(f"Expected {name} above 0 seconds, got {shortened(said or wait)}; {WAIT} is the default.")
+    return seconds
 
 
 def journal_path(url: sa.URL, cell_id: str) -> Path:

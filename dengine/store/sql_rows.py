@@ -118,6 +118,9 @@ def read_decision(row: Any) -> StoredDecision:
         quarantined=row.quarantined,
         success=as_label(row.success),
         source=None if row.source is None else Source(row.source),
+        n_success=row.n_success,
+        n_failure=row.n_failure,
+        propensity=row.propensity,
         part=row.part,
     )
 

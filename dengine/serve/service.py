@@ -1,0 +1,247 @@
+"""One engine behind every interface: who asks waits in line for the one thread that owns it, and not for ever.
+
+    service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
+    answer = await service.decide(trace, "order-7")
+    told = await service.report(answer.decision.id, True)
+    service.close()
+
+Each interface (HTTP, XML-RPC, OPC UA, the page) turns its own words into these calls, and answers into its own words. What
+only reads asks `CellService.reading`, a second connection, so that no decision waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import queue
+import threading
+import time
+import uuid
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from numpy.typing import ArrayLike
+
+from ..deciding import as_decision, late_decision
+from ..engine import DataEngine
+from ..errors import BusyError
+from ..labels import as_success
+from ..records import Decision, Reason, RetrainReport
+from ..store.base import open_store
+from ..store.records import StoredDecision
+
+log = logging.getLogger("dengine")
+DEADLINE = 0.5  # seconds in line, after which who asked verifies
+MOST = 32  # requests in line
+IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What is answered to a trace.
+
+    decision : as it is recorded.  seconds : from the request to the answer.
+    """
+
+    decision: Decision
+    seconds: float
+
+    @property
+    def late(self) -> bool:
+        """Whether it is VERIFY since the line was too long for the deadline; the engine records it as such."""
+        return self.decision.reason is Reason.LATE
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What became of a report.
+
+    repeated : the same label was reported before, and nothing changed.  retrain : what it set off in line, if anything.
+    """
+
+    decision_id: str
+    success: bool
+    repeated: bool
+    retrain: RetrainReport | None = None
+
+
+class Job(Generic[T]):
+    """Work for the engine's thread. late : nobody waits for its answer any more, and it has not begun."""
+
+    def __init__(self, work: Callable[[DataEngine, bool], T]) -> None:
+        self.future: Future[T] = Future()
+        self._work = work
+        self._lock = threading.Lock()
+        self._begun = self._late = False
+
+    def give_up(self) -> bool:
+        """Wait no more; False where it has begun, and will be there at once."""
+        with self._lock:
+            self._late = self._late or not self._begun
+            return self._late
+
+    def run(self, engine: DataEngine) -> None:
+        """Do it, in the engine's thread."""
+        with self._lock:
+            self._begun = True
+        try:
+            self.future.set_result(self._work(engine, self._late))
+        except BaseException as error:  # whoever asked is told
+            self.future.set_exception(error)
+
+
+class CellService:
+    """The engine, its thread, and the line in front of it.
+
+    make : opens the engine, in the thread that will own it; what it raises is raised here.
+    store : the same store's name, for `reading`; None: the engine remembers in memory.
+    deadline : seconds that a decision may wait in line; then the answer is VERIFY, `Reason.LATE`, and recorded so.
+    most : requests in line; one more is a BusyError, and nothing of it is recorded.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], DataEngine],
+        store: str | os.PathLike[str] | None = None,
+        deadline: float = DEADLINE,
+        most: int = MOST,
+    ) -> None:
+        self.deadline = deadline
+        self.late = self.busy = 0  # answers since it began
+        self._jobs: queue.Queue[Job[Any] | None] = queue.Queue(most)
+        self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
+        self._closing = False
+        opened: Future[DataEngine] = Future()
+        self._thread = threading.Thread(target=self._serve, args=(make, opened), name="dengine-engine")
+        self._thread.start()
+        self.engine = opened.result()  # its facts may be read in any thread, its verbs only by `ask`
+        self.reading = self.engine.store if store is None else open_store(store)
+
+    # What interfaces ask
+
+    async def decide(self, trace: ArrayLike, request: str | None = None, part: str | int | None = None) -> Answer:
+        """Decide on a trace, (T,) or (channels, T).
+
+        request : the caller's id, once for every trace; asked again, the answer is the same, also after a restart.
+        TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
+        """
+        begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else request
+        job = self._put(lambda engine, late: engine.decide(trace, part, decision_id=id_, late=late))
+        answer = asyncio.wrap_future(job.future)
+        await asyncio.wait([answer], timeout=self.deadline)
+        if answer.done() or not job.give_up():
+            return Answer(await answer, time.monotonic() - begin)
+        self.late += 1
+        answer.add_done_callback(_note_failure)
+        known = await asyncio.to_thread(self.engine.find, id_)  # asked again, the answer is what it was
+        decision = late_decision(id_, part, self.engine.version) if known is None else as_decision(known)
+        return Answer(decision, time.monotonic() - begin)
+
+    async def report(self, decision_id: str, success: bool) -> Told:
+        """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
+
+        ReportError as `DataEngine.report`; BusyError where too many wait.
+        """
+        said = as_success(success)
+        return await self.ask(lambda engine: _report(engine, decision_id, said))
+
+    async def find(self, decision_id: str) -> StoredDecision | None:
+        """A decision with its trace and label; None for an unknown id."""
+        return await self.ask(lambda engine: engine.find(decision_id))
+
+    async def ask(self, work: Callable[[DataEngine], T]) -> T:
+        """Do something in the engine's thread, between two decisions; what it raises is raised here."""
+        return await asyncio.wrap_future(self._put(lambda engine, late: work(engine)).future)
+
+    @property
+    def waiting(self) -> int:
+        """Requests in line."""
+        return self._jobs.qsize()
+
+    async def changes(self) -> AsyncIterator[None]:
+        """Yield whenever something has changed since the last yield, at once for the first time."""
+        here = asyncio.get_running_loop(), asyncio.Event()
+        self._listeners.add(here)
+        try:
+            while not self._closing:
+                yield
+                await here[1].wait()
+                here[1].clear()
+        finally:
+            self._listeners.discard(here)
+
+    def close(self) -> None:
+        """Answer what is in line, close the engine, and end its thread; a second time does nothing."""
+        if self._closing:
+            return
+        self._closing = True
+        self._jobs.put(None)
+        self._thread.join()
+        self._tell()
+        if self.reading is not self.engine.store:
+            self.reading.close()
+
+    def _put(self, work: Callable[[DataEngine, bool], T]) -> Job[T]:
+        job = Job(work)
+        try:
+            if self._closing:
+                raise BusyError("The server is closing: verify the part, and ask again when it is back.")
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self.busy += 1
+            raise BusyError(
+                f"Expected at most {self._jobs.maxsize} requests in line: verify the part, nothing of it was recorded."
+            ) from None
+        return job
+
+    # In the engine's thread
+
+    def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
+        try:
+            engine = make()
+        except BaseException as error:  # raised where the service is made
+            opened.set_exception(error)
+            return
+        opened.set_result(engine)
+        with engine:
+            while (job := self._next(engine)) is not None:
+                job.run(engine)
+                self._tell()
+
+    def _next(self, engine: DataEngine) -> Job[Any] | None:
+        """The next one in line; while nobody asks, the engine does what it has to do."""
+        while True:
+            try:
+                return self._jobs.get(timeout=IDLE)
+            except queue.Empty:
+                self._settle(engine)
+
+    def _settle(self, engine: DataEngine) -> None:
+        try:
+            if engine.settle() is not None:
+                self._tell()
+        except Exception:  # whatever it is, the next request is answered
+            log.exception("what the engine does between requests failed")
+
+    def _tell(self) -> None:
+        for loop, changed in tuple(self._listeners):
+            with suppress(RuntimeError):  # its loop has ended
+                loop.call_soon_threadsafe(changed.set)
+
+
+def _report(engine: DataEngine, decision_id: str, success: bool) -> Told:
+    known = engine.find(decision_id)
+    if known is not None and known.success is success:
+        return Told(decision_id, success, repeated=True)
+    return Told(decision_id, success, False, engine.report(decision_id, success))
+
+
+def _note_failure(answer: asyncio.Future[Any]) -> None:
+    if not answer.cancelled() and (error := answer.exception()) is not None:
+        log.error("a decision that came too late failed: %s", error)
