@@ -1,6 +1,7 @@
 """A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of orders; over real TCP."""
 
 import csv
+import json
 import socket
 import struct
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner, Result
 
 from dengine import DataEngine, Dataset, Outcome, Policy, Reason, ReplayCell
 from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
@@ -22,6 +24,7 @@ from dengine.cells.ur.client import RtdeClient
 from dengine.cells.ur.orders import ANSWER, ORDER, PHASE, Answer, Verb, after, word
 from dengine.cells.ur.protocol import TYPES, Kind, Package, Packages, Recipe, type_of
 from dengine.cells.ur.stream import Lateness, RtdeStream
+from dengine.cli import main
 from dengine.errors import CellError, SettingError
 from dengine.recordings.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger
 
@@ -471,6 +474,59 @@ def test_a_controller_that_was_switched_off_is_not_told_an_old_order_again() -> 
         while stream.position < begun + 50:
             stream.after(stream.position, WAIT)
         assert fake._inputs.get(ORDER) is None
+
+
+# From the shell.
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(main, ["run", "--cell", "ur", *words])
+
+
+def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dataset, tmp_path: Path) -> None:
+    store = str(tmp_path / "cell.db")
+    with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "12", "--json")
+        assert done.exit_code == 0, done.output
+        told = json.loads(done.stdout)
+        done = run(*words[:-2], "--cycles", "3")
+    assert (told["total"]["verified"], told["recording"]["incomplete"]) == (12, 1)
+    assert told["recording"]["missing"] >= 2
+    assert "Traces with a gap, verified and never learned from: 0." in " ".join(done.output.split())
+    with DataEngine.open(store) as engine:
+        kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
+        assert engine.store.status()["decisions"] == 15
+    assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "Expected the robot's address for --cell ur"),
+        (("--host", "127.0.0.1:x"), "Expected a host, or host:port"),
+        (("--host", "127.0.0.1:1"), "it cannot be reached"),
+        (("--host", "127.0.0.1:1", "--trigger", "bits"), "Expected a trigger, as bit=0"),
+        (("--host", "127.0.0.1:1", "--channel", "FZ"), "Expected a channel among FX_Base"),
+    ],
+)
+def test_what_is_wrong_with_a_robot_is_one_line(words: tuple[str, ...], said: str) -> None:
+    done = run(*words)
+    assert done.exit_code == 1
+    assert said in " ".join(done.output.split())
+    assert "Traceback" not in done.output
+
+
+def test_a_controller_without_a_robot_is_started_from_the_shell() -> None:
+    words = [sys.executable, "-m", "dengine.cells.ur", "--port", "0", "--speed", "0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            said = process.stdout.readline()
+            host, port = said.split(" at ")[1].split(",")[0].split(":")
+            with UrCell(host, port=int(port), order_timeout=WAIT, start_timeout=WAIT) as cell:
+                assert cell.insert().shape == (1000,)
+        finally:
+            process.terminate()
 
 
 def test_orders_are_numbered_so_that_they_fit_a_register_for_ever() -> None:
