@@ -189,6 +189,10 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     lower, upper = wilson_interval(accept["n"] - bad, bad, POLICY.alpha)
     assert (accept["lower"], accept["upper"]) == pytest.approx((1 - upper, 1 - lower))
     assert accept["verdict"] == "kept"
+    certified = told["certificate"]
+    assert certified["accepted"]["shadowed"] is True
+    assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
+    assert f"Of {reject['n']} parts that the model would reject, each of which was" in certified["sentence_on_rejects"]
     shown = " ".join(CliRunner().invoke(main, ["status", store]).stdout.split())
     assert "would accept" in shown
     assert "the shadow mode, in which it only says what" in re.sub(r"[│┃] *", "", shown)

@@ -110,7 +110,7 @@ def curve_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command(
-    epilog=example("dengine costs --data insertion --reducer pca --cycles 300 --escape 600 --false-reject 30 --repeats 4")
+    epilog=example("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 )
 @data_options()
 @price_options
@@ -128,10 +128,10 @@ def costs(
     out: OutFolder | None,
     as_json: bool,
 ) -> None:
-    """Say which alpha and LB pay, from replays of your recordings.
+    """Say which alpha and LB pay.
 
-    What a part costs under each, verifying everything among them. All costs are in one unit, as seconds of production or
-    money. Ctrl-C shows the curve of the shuffles that every policy has finished.
+    What a part of your recordings costs under each, and where everything is verified. All costs are in one unit, as
+    seconds of production or money. Ctrl-C shows the curve of the shuffles that every policy has finished.
     """
     for name in ("alpha", "lower_bound"):
         if name in choice.settings:

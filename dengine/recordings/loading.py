@@ -87,8 +87,8 @@ def _read(path: Path, asked: Asked) -> Dataset:
         return read_folder(path, asked)
     if not path.is_file():
         raise DataError(
-            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5), a store, or a folder of CSV "
-            f"files; {path} is none of these."
+            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5), a store, or a folder of "
+            f"CSV files; {path} is none of these."
         )
     suffix = path.suffix.lower()
     if _is_database(path):
