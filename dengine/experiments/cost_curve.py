@@ -94,8 +94,11 @@ class CostCurve:
 
     @property
     def cheapest(self) -> PolicyCost:
-        """The policy that was cheapest in the shuffles that choose; of equal ones the strictest."""
-        return min(self.rows, key=lambda row: (row.chosen_by, -row.policy.lower_bound, row.policy.alpha))
+        """The policy that was cheapest in the shuffles that choose, of those that decided anything; of equal ones the
+        strictest.
+        """
+        decided = [row for row in self.rows if row.certain] or self.rows
+        return min(decided, key=lambda row: (row.chosen_by, -row.policy.lower_bound, row.policy.alpha))
 
     @property
     def verdict(self) -> str:
