@@ -33,6 +33,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine compare --reducers pca,my_reducers:PeakReducer": "--cycles 80",
     "dengine run --cell replay": "--cycles 80",
     "dengine run --cell simulated": "--cycles 15",
+    "dengine costs": "--repeats 2 --cycles 70 --alphas 0.5 --lower-bounds 0.8 --n-jobs 1",
     "dengine simulate": "--n 12 --n-jobs 1",
     "dengine replay --data recordings": "--repeats 1 --cycles 80",
     "dengine replay --data numbered.npz": "--cycles 80",

@@ -158,7 +158,7 @@ class UrCell:
         """The number of the last order there was, once it is answered and the program runs."""
         end = time.monotonic() + self.start_timeout
         while True:
-            rows = self._rows(end, "to send its state")
+            rows = self._rows(time.monotonic() + self.start_timeout, "to send its state")
             self.recorder.seen(len(rows))
             ordered, answered, state = (int(rows[-1].values[self._at[name]]) for name in (ORDER, ANSWER, RUNTIME))
             if state == Runtime.PLAYING and ordered // 10 == answered // 10:
