@@ -155,6 +155,21 @@ def test_the_controllers_own_words_are_in_the_error() -> None:
         client.close()
 
 
+def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() -> None:
+    with FakeController(speed=None, patience=0.2) as fake:
+        idle = RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force", "actual_q"))
+        with RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
+            while fake._connections[0].started:
+                stream.after(stream.position, WAIT)
+            begun = stream.position
+            assert stream.after(begun + 100, 0.0)[0] == []
+            while stream.position < begun + 100:
+                stream.after(stream.position, WAIT)
+        with pytest.raises(CellError, match="Expected packages"):
+            read_on(idle)
+        idle.close()
+
+
 def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:
     late = Lateness()
     drifting = [late.is_late(t, 1.0005 * t + 5.0) for t in np.arange(0.0, 60.0, 0.002)]
@@ -200,6 +215,27 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(pa
     assert cell.incomplete == len(hit)
     assert (report.reconnects, report.repeated, report.restarts) == (4, 1, 0)
     assert report.missing >= len(fake.lost)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_so_it_is_with_any_faults_at_any_samples(parts: Dataset, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = ("drop", "hold", "close", "half", "garbage", "repeat")
+    wrong = [
+        Trouble(
+            part, int(rng.integers(SAMPLES)) * int(rng.random() < 0.8), str(rng.choice(kinds)), int(rng.integers(1, 200))
+        )
+        for part in range(40)
+    ]
+    with FakeController(RobotProgram(parts), speed=None, troubles=wrong) as fake, cell_of(fake) as cell:
+        for part in range(40):
+            trace = cell.insert()
+            lost = {place for place in fake.lost if place[0] == part}
+            unseen = (part, 0) in lost
+            assert nan_places(part, trace) == ({(part, i) for i in range(SAMPLES)} if unseen else lost), wrong[part]
+            there = ~np.isnan(trace)
+            np.testing.assert_array_equal(trace[there], parts.X[part][there])
+            assert cell.verify() == bool(parts.y[part])
 
 
 def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
