@@ -221,12 +221,8 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(pa
 def test_so_it_is_with_any_faults_at_any_samples(parts: Dataset, seed: int) -> None:
     rng = np.random.default_rng(seed)
     kinds = ("drop", "hold", "close", "half", "garbage", "repeat")
-    wrong = [
-        Trouble(
-            part, int(rng.integers(SAMPLES)) * int(rng.random() < 0.8), str(rng.choice(kinds)), int(rng.integers(1, 200))
-        )
-        for part in range(40)
-    ]
+    samples = rng.integers(SAMPLES, size=40) * (rng.random(40) < 0.8)  # the first more often than by chance
+    wrong = [Trouble(i, int(samples[i]), str(rng.choice(kinds)), int(rng.integers(1, 200))) for i in range(40)]
     with FakeController(RobotProgram(parts), speed=None, troubles=wrong) as fake, cell_of(fake) as cell:
         for part in range(40):
             trace = cell.insert()
@@ -321,6 +317,16 @@ def test_a_recorder_cuts_by_any_trigger_with_samples_from_before_it(trigger, col
     with FakeController(program, speed=None) as fake, RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder:
         for _ in range(3):
             np.testing.assert_array_equal(recorder.record(WAIT).trace, contact()[180:240].astype(np.float32))
+
+
+def test_a_controller_is_asked_for_the_rate_that_a_trace_has() -> None:
+    with FakeController(Signals(FZ_Base=contact()), speed=None) as fake:  # 500 cycles a second: it sends every fourth
+        how = {"samples": 20, "rate_hz": 125.0, "port": fake.port}
+        with RtdeRecorder(fake.host, ContactTrigger(5.0, quiet_s=0.1), **how) as recorder:
+            insertion = recorder.record(WAIT)
+    assert insertion.complete
+    starts = [contact()[first : first + 80 : 4].astype(np.float32).tolist() for first in range(200, 204)]
+    assert insertion.trace.tolist() in starts
 
 
 def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts: Dataset) -> None:
