@@ -500,22 +500,40 @@ def test_an_order_given_while_there_is_no_connection_is_carried_out_once_there_i
     assert program.played == [0]
 
 
-def test_a_controller_that_was_switched_off_is_not_told_an_old_order_again() -> None:
-    with FakeController(speed=20.0) as fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+def reconnected(fake: FakeController, stream: RtdeStream) -> float | None:
+    """What the order's register holds once the connection was lost and made again."""
+    before = stream.report().reconnects
+    fake.hang_up()
+    while stream.report().reconnects == before:
+        stream.after(stream.position, 0.05)
+    begun = stream.position
+    while stream.position < begun + 50:
+        stream.after(stream.position, WAIT)
+    return fake._inputs.get(ORDER)
+
+
+def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
+    now, order = [0.0], word(7, Verb.INSERT)
+    fake = FakeController(speed=20.0)
+    fake._cycle = 10**6
+    how = {"port": fake.port, "clock": lambda: now[0]}
+    with fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), **how) as stream:
         stream.after(0, WAIT)
-        stream.write((word(7, Verb.INSERT),))
-        while fake._inputs.get(ORDER) != word(7, Verb.INSERT):
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
+            stream.after(stream.position, WAIT)
+        fake._inputs.clear()  # as if it had been lost on the way
+        assert reconnected(fake, stream) == order
+        fake._inputs.clear()
+        now[0] = 11.0
+        assert reconnected(fake, stream) is None
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
             stream.after(stream.position, WAIT)
         with fake._lock:  # off and on
             fake._inputs.clear()
             fake._begin = fake._cycle
-        fake.hang_up()
-        while stream.report().reconnects == 0:
-            stream.after(stream.position, 0.05)
-        begun = stream.position
-        while stream.position < begun + 50:
-            stream.after(stream.position, WAIT)
-        assert fake._inputs.get(ORDER) is None
+        assert reconnected(fake, stream) is None
 
 
 # From the shell.
