@@ -18,6 +18,7 @@ from ..errors import DengineError
 from ..wording import without_password
 from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy, shadow
+from .costing import costs
 from .data import data
 from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
@@ -75,7 +76,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, serve, simulate, status, cells, history, explain, verify, dump),
+    *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
     *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)
