@@ -120,8 +120,8 @@ class RobotCalls:
         return sum(map(len, pieces))
 
     async def decide(self, trace: Any, request: Any = "", part: Any = "") -> Answered:
-        """Decide on a whole trace, (T,) or (channels, T)."""
-        return await self._decide(as_samples(trace), request, part)
+        """Decide on a whole trace, (T,) or (channels, T), of lists."""
+        return await self.decide_on(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Answered:
         """Decide on the pieces that were added; asked again, the answer is the same."""
@@ -130,7 +130,7 @@ class RobotCalls:
         pieces = self._pieces.get(as_id(request))
         if not pieces:
             raise TraceError(f"Expected begin and add before decide_added, got no pieces of {shortened(request)}.")
-        answer = await self._decide(np.concatenate(pieces), request, part)
+        answer = await self.decide_on(np.concatenate(pieces), request, part)
         if answer["id"]:
             self._pieces.pop(request, None)
         return answer
@@ -157,7 +157,17 @@ class RobotCalls:
                 return _unknown(NOT_RECORDED)
             finally:
                 self._armed = None
-            return await self._decide(recording.trace, id_, part)
+            return await self.decide_on(recording.trace, id_, part)
+
+    async def decide_on(self, trace: ArrayLike, request: Any, part: Any) -> Answered:
+        """Decide on a trace as an array; an empty request or part is none."""
+        id_ = as_id(request) if request != "" else None
+        try:
+            answer = await self._service.decide(trace, id_, None if part == "" else part)
+        except (BusyError, StoreError) as error:
+            log.warning("verified without a record: %s", error)
+            return _unknown(BUSY)
+        return _answered(answer.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
         """What became of a part, True for good. Returns whether it is kept: it is not where nothing under this id was
@@ -184,15 +194,6 @@ class RobotCalls:
         except (BusyError, StoreError):
             return None
         return None if known is None else _answered(as_decision(known))
-
-    async def _decide(self, trace: ArrayLike, request: Any, part: Any) -> Answered:
-        id_ = as_id(request) if request != "" else None
-        try:
-            answer = await self._service.decide(trace, id_, None if part == "" else part)
-        except (BusyError, StoreError) as error:
-            log.warning("verified without a record: %s", error)
-            return _unknown(BUSY)
-        return _answered(answer.decision)
 
 
 def as_samples(value: Any) -> NDArray[np.float32]:
