@@ -22,6 +22,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "wording": 0,
     "values": 0,
     "labels": 1,
+    "documents": 1,
     "outputs": 1,
     "archives": 1,
     "folds": 1,

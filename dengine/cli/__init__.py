@@ -27,6 +27,7 @@ from .keeping import dump, verify
 from .options import example
 from .replaying import compare, replay
 from .running import run
+from .serving import serve
 from .simulating import simulate
 from .status import status
 from .training import train
@@ -74,7 +75,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, cells, history, explain, verify, dump),
+    *(data, replay, compare, train, run, serve, simulate, status, cells, history, explain, verify, dump),
     *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

@@ -16,7 +16,9 @@ from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.routing import BaseRoute
 
-from .access import Access, Guard
+from .access import Access
+from .guard import Guard
+from .problems import HANDLERS
 from .service import CellService
 
 INTERFACES = ("http", "xmlrpc", "page")  # modules here, in the order in which their routes are tried
@@ -40,11 +42,16 @@ def create_app(
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
-            for begin in beside:
-                await stack.enter_async_context(begin(service))
+            try:
+                for begin in beside:
+                    await stack.enter_async_context(begin(service))
+            except Exception as error:
+                app.state.failure = error  # uvicorn says only that it did not start
+                raise
             yield
 
-    return Starlette(routes=routes, middleware=[Middleware(Guard, access=access or Access())], lifespan=lifespan)
+    guard = Middleware(Guard, access=access or Access())
+    return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
 
 
 def routes_of(name: str, service: CellService) -> Sequence[BaseRoute]:
