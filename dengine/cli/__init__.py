@@ -19,6 +19,7 @@ from ..wording import without_password
 from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy, shadow
 from .data import data
+from .demo_cell import demo_cell
 from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
 from .history import history
@@ -75,6 +76,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, train, run, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
+    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels, demo_cell),
 ):
     main.add_command(verb)
