@@ -84,6 +84,11 @@ class EngineFacts:
         """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
         return self._feedback.safe_mode
 
+    @property
+    def store_fault(self) -> str:
+        """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
+        return self._keeper.fault
+
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()

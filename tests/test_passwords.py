@@ -14,7 +14,8 @@ from click.testing import CliRunner
 from dengine import DataEngine
 from dengine import errors as all_errors
 from dengine.cli import main
-from dengine.cli.output import plain, progress
+from dengine.cli.output import progress
+from dengine.documents import plain
 from dengine.errors import DengineError, StoreError
 from dengine.store import SqlStore
 from dengine.store.sql_engine import make_engine

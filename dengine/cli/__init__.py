@@ -18,6 +18,7 @@ from ..errors import DengineError
 from ..wording import without_password
 from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy, shadow
+from .costing import costs
 from .data import data
 from .demo_cell import demo_cell
 from .explaining import explain
@@ -28,6 +29,7 @@ from .keeping import dump, verify
 from .options import example
 from .replaying import compare, replay
 from .running import run
+from .serving import serve
 from .simulating import simulate
 from .status import status
 from .training import train
@@ -75,7 +77,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, simulate, status, cells, history, explain, verify, dump),
+    *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
     *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels, demo_cell),
 ):
     main.add_command(verb)

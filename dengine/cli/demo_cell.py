@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import socket
-from contextlib import ExitStack, suppress
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,15 +17,19 @@ import click
 from ..errors import OutputError, SettingError
 from .options import example, must_have_mujoco, seed_option
 from .output import show
+from .serving import must_have_serve
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from ..cells.base import Cell
     from ..serve.service import CellService
 
-NEEDED = ("starlette", "uvicorn", "jinja2", "sse_starlette")
+NEEDED = ("jinja2", "sse_starlette")
 BEFORE = 150  # parts that come at once, so that a model answers before one has read the page
 POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 ENDLESS = 10**9
+PATIENT = 5.0  # seconds that a decision may wait: nobody but who watches waits for it
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: st
     No robot is needed: recordings are played, or simulated. They go the way that a robot's traces go.
     Only this computer can see the page. Ctrl-C ends it.
     """
-    must_have_serve()
+    must_have_page()
     if kind == "simulated":
         must_have_mujoco()
     if keep is not None and Path(keep).exists():
@@ -80,30 +85,26 @@ def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: st
     show(f"Everything is in {keep}." if keep else "It ended, and nothing of it was kept.")
 
 
-def must_have_serve() -> None:
-    """SettingError where the server's packages are missing."""
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
+def must_have_page() -> None:
+    """SettingError where the server, or its page, cannot run."""
+    must_have_serve()
+    if missing := [name for name in NEEDED if find_spec(name) is None]:
         raise SettingError(f'Expected {", ".join(missing)} for the page, not installed: pip install "dengine[serve]".')
 
 
 def _run(demo: Demo) -> None:
     from ..engine import DataEngine
     from ..recipe import Recipe
-    from ..serve.service import CellService
+    from ..serve.server import Serving, serve
 
     recipe = Recipe.load("conv").with_policy(**POLICY)
     cell, cycles = _cell(demo)
-    with socket.create_server(("127.0.0.1", demo.port)) as listening:
-        # Nobody waits here but those who watch: a retrain is no reason for a late answer.
-        service = CellService(
-            lambda: DataEngine(recipe=recipe, store=demo.store, seed=demo.seed), demo.store, deadline=10.0
-        )
-        try:
-            with suppress(KeyboardInterrupt):
-                asyncio.run(_serve(service, cell, cycles, demo, listening))
-        finally:
-            service.close()
+
+    def make(executor: Executor) -> DataEngine:
+        return DataEngine(recipe=recipe, store=demo.store, seed=demo.seed, executor=executor)
+
+    serving = Serving(port=demo.port, deadline=PATIENT, beside=(partial(_driven, cell, cycles, demo),))
+    serve(make, demo.store, serving, lambda line: click.echo(f"{line} Look at it in a browser; Ctrl-C ends it."))
 
 
 def _cell(demo: Demo) -> tuple[Cell, int]:
@@ -122,27 +123,22 @@ def _cell(demo: Demo) -> tuple[Cell, int]:
     return ReplayCell(data, order), min(demo.cycles or len(data), len(data))
 
 
-async def _serve(service: CellService, cell: Cell, cycles: int, demo: Demo, listening: socket.socket) -> None:
-    """The page, until Ctrl-C; beside it the cell, until its parts are used up or it fails, which is raised."""
-    import uvicorn
-    from starlette.applications import Starlette
-
+@asynccontextmanager
+async def _driven(cell: Cell, cycles: int, demo: Demo, service: CellService) -> AsyncIterator[None]:
+    """The cell at work, as long as the server is there."""
     from ..serve.demo import Pace, drive
-    from ..serve.page import routes
 
-    config = uvicorn.Config(
-        Starlette(routes=routes(service)), log_level="warning", lifespan="off", ws="none", timeout_graceful_shutdown=1
-    )
-    server = uvicorn.Server(config)
-    serving = asyncio.ensure_future(server.serve(sockets=[listening]))
-    show(f"The page: http://127.0.0.1:{listening.getsockname()[1]}/  (Ctrl-C ends it)")
     driving = asyncio.ensure_future(drive(service, cell, Pace(demo.before, demo.speed), cycles))
-    done, _ = await asyncio.wait({serving, driving}, return_when=asyncio.FIRST_COMPLETED)
-    try:
-        if driving in done:
-            show(f"All parts are through: {driving.result()} were decided on. The page stays.")
-            await serving
-    finally:
-        server.should_exit = True
-        driving.cancel()
-        await asyncio.gather(serving, driving, return_exceptions=True)
+    driving.add_done_callback(_say_how_it_ended)
+    yield
+    driving.cancel()
+    await asyncio.wait([driving])
+
+
+def _say_how_it_ended(driving: asyncio.Future[int]) -> None:
+    if driving.cancelled():
+        return
+    if (error := driving.exception()) is not None:
+        click.echo(f"The cell stopped: {error}", err=True)
+        return
+    click.echo(f"All parts are through: {driving.result()} were decided on. The page stays until Ctrl-C.")

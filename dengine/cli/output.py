@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from textwrap import fill
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..documents import plain
 from ..errors import DengineError
 from ..wording import without_password
 
@@ -46,25 +46,6 @@ def console() -> Console:
 def write_json(result: Mapping[str, Any]) -> None:
     """Print one JSON document; NaN, which JSON has not, becomes null."""
     click.echo(json.dumps(plain(result), indent=2, allow_nan=False))
-
-
-def plain(value: Any) -> Any:
-    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None, no passwords."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
-    if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
-    if isinstance(value, str):
-        return without_password(value)
-    if isinstance(value, bool | int) or value is None:
-        return value
-    if hasattr(value, "item"):  # a NumPy scalar
-        return plain(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return without_password(str(value))
 
 
 def duration(seconds: float) -> str:

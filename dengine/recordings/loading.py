@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
 from ..errors import DataError
+from ..outputs import DATABASES
 from .arrays import from_pair, read_hdf5, read_npz
 from .asked import Asked, names_of
 from .dataset import Dataset
@@ -26,6 +28,7 @@ READERS: dict[str, Reader] = {  # by suffix; other zip files are read as .npz
     ".h5": read_hdf5,
     ".hdf5": read_hdf5,
 }
+STORED = "dengine.stored"  # from above: it opens a store
 TABLES = (".csv", ".parquet", ".pq")
 
 
@@ -44,7 +47,8 @@ def load_dataset(
 
     source : the name of a bundled set; a folder of CSV files, one an insertion; a wide table, a row an insertion, as .csv,
         .parquet or a DataFrame; an .npz or HDF5 file with X (n, T) or (n, C, T), times the number `scale` where one is
-        stored, and y (n,); a `Dataset`; a pair (X, y), where X may be a list of traces of any length.
+        stored, and y (n,); the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y), where X
+        may be a list of traces of any length.
     samples : of each trace, the first so many; with `fit="resample"` the points that the whole is put on.
     part : the name of the array, or column, of parts' numbers, texts or whole numbers; for a folder a column of `labels`.
         Where there is no `part`, every trace is a part of its own.
@@ -83,14 +87,23 @@ def _read(path: Path, asked: Asked) -> Dataset:
         return read_folder(path, asked)
     if not path.is_file():
         raise DataError(
-            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5) or a folder of CSV files; "
-            f"{path} is neither."
+            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5), a store, or a folder of "
+            f"CSV files; {path} is none of these."
         )
     suffix = path.suffix.lower()
+    if _is_database(path):
+        asked.refuse("a store", "label", "labels")
+        found: Dataset = import_module(STORED).read_store(path, path.stem, asked)
+        return found
     if suffix not in (".npz", *READERS) and not zipfile.is_zipfile(path):
         raise DataError(f"Expected a file .npz, .csv, .parquet or .h5, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
+
+
+def _is_database(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(16).startswith(DATABASES)
 
 
 def _refuse(source: Any) -> Dataset:

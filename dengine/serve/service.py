@@ -21,18 +21,19 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 from numpy.typing import ArrayLike
 
 from ..deciding import as_decision, late_decision
 from ..engine import DataEngine
 from ..errors import BusyError
-from ..labels import as_success
+from ..labels import as_id, as_success
 from ..records import Decision, Reason, RetrainReport
-from ..store.base import open_store
+from ..store.base import Store, open_store
 from ..store.records import StoredDecision
+from .jobs import CLOSING, Job
 
 log = logging.getLogger("dengine")
 DEADLINE = 0.5  # seconds in line, after which who asked verifies
@@ -63,37 +64,14 @@ class Told:
     """What became of a report.
 
     repeated : the same label was reported before, and nothing changed.  retrain : what it set off in line, if anything.
+    seconds : from the request to the answer.
     """
 
     decision_id: str
     success: bool
     repeated: bool
     retrain: RetrainReport | None = None
-
-
-class Job(Generic[T]):
-    """Work for the engine's thread. late : nobody waits for its answer any more, and it has not begun."""
-
-    def __init__(self, work: Callable[[DataEngine, bool], T]) -> None:
-        self.future: Future[T] = Future()
-        self._work = work
-        self._lock = threading.Lock()
-        self._begun = self._late = False
-
-    def give_up(self) -> bool:
-        """Wait no more; False where it has begun, and will be there at once."""
-        with self._lock:
-            self._late = self._late or not self._begun
-            return self._late
-
-    def run(self, engine: DataEngine) -> None:
-        """Do it, in the engine's thread."""
-        with self._lock:
-            self._begun = True
-        try:
-            self.future.set_result(self._work(engine, self._late))
-        except BaseException as error:  # whoever asked is told
-            self.future.set_exception(error)
+    seconds: float = 0.0
 
 
 class CellService:
@@ -114,9 +92,11 @@ class CellService:
     ) -> None:
         self.deadline = deadline
         self.late = self.busy = 0  # answers since it began
+        self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
         self._jobs: queue.Queue[Job[Any] | None] = queue.Queue(most)
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
-        self._closing = False
+        self._closing = self._listening_ended = False
+        self._beat = time.monotonic()
         opened: Future[DataEngine] = Future()
         self._thread = threading.Thread(target=self._serve, args=(make, opened), name="dengine-engine")
         self._thread.start()
@@ -131,25 +111,28 @@ class CellService:
         request : the caller's id, once for every trace; asked again, the answer is the same, also after a restart.
         TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
         """
-        begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else request
+        begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else as_id(request)
         job = self._put(lambda engine, late: engine.decide(trace, part, decision_id=id_, late=late))
         answer = asyncio.wrap_future(job.future)
         await asyncio.wait([answer], timeout=self.deadline)
         if answer.done() or not job.give_up():
-            return Answer(await answer, time.monotonic() - begin)
+            return self._heard(Answer(await answer, time.monotonic() - begin))
         self.late += 1
         answer.add_done_callback(_note_failure)
         known = await asyncio.to_thread(self.engine.find, id_)  # asked again, the answer is what it was
         decision = late_decision(id_, part, self.engine.version) if known is None else as_decision(known)
-        return Answer(decision, time.monotonic() - begin)
+        return self._heard(Answer(decision, time.monotonic() - begin))
 
     async def report(self, decision_id: str, success: bool) -> Told:
         """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
 
         ReportError as `DataEngine.report`; BusyError where too many wait.
         """
-        said = as_success(success)
-        return await self.ask(lambda engine: _report(engine, decision_id, said))
+        begin, said = time.monotonic(), as_success(success)
+        told = await self.ask(lambda engine: _report(engine, decision_id, said))
+        if told.retrain is not None:
+            self._heard(told.retrain)
+        return self._heard(replace(told, seconds=time.monotonic() - begin))
 
     async def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace and label; None for an unknown id."""
@@ -159,22 +142,39 @@ class CellService:
         """Do something in the engine's thread, between two decisions; what it raises is raised here."""
         return await asyncio.wrap_future(self._put(lambda engine, late: work(engine)).future)
 
+    async def look(self, work: Callable[[Store], T]) -> T:
+        """Read, in a thread of its own, a store that holds all that was decided so far."""
+        if self.reading is self.engine.store:
+            return await self.ask(lambda engine: work(engine.store))
+        await self.ask(lambda engine: engine.flush())
+        return await asyncio.to_thread(work, self.reading)
+
     @property
     def waiting(self) -> int:
         """Requests in line."""
         return self._jobs.qsize()
+
+    @property
+    def silent(self) -> float:
+        """Seconds since the engine's thread last took a job, or looked for one; infinite where it has ended."""
+        return time.monotonic() - self._beat if self._thread.is_alive() else float("inf")
 
     async def changes(self) -> AsyncIterator[None]:
         """Yield whenever something has changed since the last yield, at once for the first time."""
         here = asyncio.get_running_loop(), asyncio.Event()
         self._listeners.add(here)
         try:
-            while not self._closing:
+            while not self._listening_ended:
                 yield
                 await here[1].wait()
                 here[1].clear()
         finally:
             self._listeners.discard(here)
+
+    def end_listening(self) -> None:
+        """Let all that listen to `changes` go: the server is about to close."""
+        self._listening_ended = True
+        self._tell()
 
     def close(self) -> None:
         """Answer what is in line, close the engine, and end its thread; a second time does nothing."""
@@ -183,15 +183,19 @@ class CellService:
         self._closing = True
         self._jobs.put(None)
         self._thread.join()
-        self._tell()
+        with suppress(queue.Empty):
+            while True:
+                if (job := self._jobs.get_nowait()) is not None:  # it came while this began
+                    job.refuse()
+        self.end_listening()
         if self.reading is not self.engine.store:
             self.reading.close()
 
     def _put(self, work: Callable[[DataEngine, bool], T]) -> Job[T]:
         job = Job(work)
         try:
-            if self._closing:
-                raise BusyError("The server is closing: verify the part, and ask again when it is back.")
+            if self._closing or not self._thread.is_alive():
+                raise BusyError(CLOSING)
             self._jobs.put_nowait(job)
         except queue.Full:
             self.busy += 1
@@ -199,6 +203,11 @@ class CellService:
                 f"Expected at most {self._jobs.maxsize} requests in line: verify the part, nothing of it was recorded."
             ) from None
         return job
+
+    def _heard(self, news: T) -> T:
+        for observe in self.observers:
+            observe(news)  # type: ignore[arg-type]  # only what the list is of
+        return news
 
     # In the engine's thread
 
@@ -217,6 +226,7 @@ class CellService:
     def _next(self, engine: DataEngine) -> Job[Any] | None:
         """The next one in line; while nobody asks, the engine does what it has to do."""
         while True:
+            self._beat = time.monotonic()
             try:
                 return self._jobs.get(timeout=IDLE)
             except queue.Empty:
@@ -224,7 +234,8 @@ class CellService:
 
     def _settle(self, engine: DataEngine) -> None:
         try:
-            if engine.settle() is not None:
+            if (report := engine.settle()) is not None:
+                self._heard(report)
                 self._tell()
         except Exception:  # whatever it is, the next request is answered
             log.exception("what the engine does between requests failed")

@@ -39,7 +39,12 @@ class Looking:
         return self.service.engine.recipe
 
     async def look(self, view: Hashable, read: Callable[[Looking], T]) -> T:
-        """What `read` finds, in a worker thread; as it was found before where nothing has changed since."""
+        """What `read` finds, in a worker thread; as it was found before where nothing has changed since.
+
+        An engine that remembers in memory is read in its own thread: its store has one thread only.
+        """
+        if self.store is self.service.engine.store:
+            return await self.service.ask(lambda engine: self._look(view, read))
         return await asyncio.to_thread(self._look, view, read)
 
     def kept(self, what: Hashable, fits: Hashable, read: Callable[[], T]) -> T:

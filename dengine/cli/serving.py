@@ -1,0 +1,89 @@
+"""`dengine serve`: one engine behind HTTP, XML-RPC and a page."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import SettingError
+from .naming import cell_options
+from .options import RecipeChoice, example, recipe_options
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..engine import DataEngine
+
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack")
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.command(epilog=example("dengine serve --store cell.db --port 8000"))
+@click.option("--store", required=True, metavar="FILE|URL", help="Remembers everything; made where there is none.")
+@cell_options("--cell-id", product=True)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
+@click.option("--token-file", type=FILE, help="A file, its owner's alone, with the token that every request has to say.")
+@click.option("--cert", type=FILE, help="For TLS: the certificate, with its chain, in PEM.")
+@click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
+@click.option(
+    "--allow-host",
+    "allow_hosts",
+    multiple=True,
+    metavar="NAME",
+    help="A name by which the server is called, beside its own.",
+)
+@click.option(
+    "--deadline",
+    type=click.FloatRange(0.001, 60.0),
+    default=0.5,
+    show_default=True,
+    metavar="S",
+    help="Seconds that a decision may wait in line; then it is verify, and recorded so.",
+)
+@click.option(
+    "--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help="Requests a second of one client; 0: any."
+)
+@click.option("--largest", type=click.IntRange(1024), default=2**20, show_default=True, help="Bytes of a request's body.")
+@click.option("--connections", type=click.IntRange(1), default=100, show_default=True, help="Connections at once.")
+@click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
+@click.option(
+    "--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as a robot's program speaks it."
+)
+@click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
+@click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
+@recipe_options
+def serve(choice: RecipeChoice, store: str, shadow: bool, xmlrpc: bool, page: bool, seed: int | None, **how: Any) -> None:
+    """Let robots, controllers and people ask one engine over the network.
+
+    It goes on with its store, or starts a new one, and retrains in a process beside it. SIGTERM and Ctrl-C end it in order:
+    what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
+    machines reach it only with --host, which wants --token-file, and should have --cert and --key.
+    """
+    must_have_serve()
+    import sys
+
+    from ..engine import DataEngine
+    from ..serve.logs import log_lines_to
+    from ..serve.server import Serving, tell_safe_mode
+    from ..serve.server import serve as serve_cell
+
+    def make(executor: Executor) -> DataEngine:
+        options: dict[str, Any] = {"executor": executor, "on_safe_mode": tell_safe_mode}
+        engine = DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None, **options)
+        if shadow:
+            engine.set_shadow(True, "dengine serve --shadow")
+        return engine
+
+    log_lines_to(sys.stderr)
+    interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
+    serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
+
+
+def must_have_serve() -> None:
+    """SettingError where the server cannot run; asked before anything is made or begun."""
+    if missing := [name for name in NEEDED if find_spec(name) is None]:
+        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[serve]".')

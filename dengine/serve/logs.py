@@ -1,0 +1,45 @@
+"""Log lines that a machine reads as well: time, level, logger, and the message as JSON has a text.
+
+    2026-11-22T18:51:05.120Z level=warning logger=dengine message="labels wait in the journal beside the store: ..."
+
+Nothing in a message ends its line, and no password is in it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import UTC, datetime
+from typing import TextIO
+
+from ..wording import without_password
+
+
+class Lines(logging.Formatter):
+    """A record as one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Time, level, logger, message; and what was raised."""
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        line = f"{time} level={record.levelname.lower()} logger={record.name} message={_said(record.getMessage())}"
+        raised = f" raised={_said(self.formatException(record.exc_info))}" if record.exc_info else ""
+        return line + raised
+
+
+def _said(text: str) -> str:
+    return json.dumps(without_password(text))
+
+
+def log_lines_to(stream: TextIO) -> None:
+    """Have every logger write such lines; uvicorn only what it fails at, for what it refuses is answered and not told."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(Lines())
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(logging.WARNING)
+    logging.getLogger("dengine").setLevel(logging.INFO)
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "uvicorn.asgi"):
+        logger = logging.getLogger(name)
+        logger.handlers.clear()
+        logger.propagate = True
+        logger.setLevel(logging.CRITICAL)
