@@ -560,6 +560,27 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dat
     assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
 
 
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts: Dataset, tmp_path: Path
+) -> None:
+    program, store = RobotProgram((parts.X[:10], parts.y[:10])), str(tmp_path / "cell.db")  # then its bin is empty
+    with FakeController(program, speed=None) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "14")
+        said = " ".join(done.output.split())
+        assert done.exit_code == 1
+        assert "1 to 10 100 %" in said
+        assert (
+            "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14 cycles were done."
+            in said
+        )
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in said
+        program.played.clear()  # somebody has filled it
+        assert run(*words[:-2], "--cycles", "4").exit_code == 0
+    with DataEngine.open(store) as engine:
+        assert engine.store.status()["decisions"] == 14
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
