@@ -170,6 +170,26 @@ def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() 
         idle.close()
 
 
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        Package(Kind.OUTPUTS, b"short").bytes,
+        Package(Kind.OUTPUTS, bytes(8) + b"\xff\xfe").bytes,
+        Package(Kind.DATA, b"\x09").bytes,
+        Package(Kind.VERSION, b"").bytes,
+    ],
+    ids=["http", "half a set-up", "no text", "no recipe", "no version"],
+)
+def test_who_does_not_speak_rtde_is_hung_up_on_and_others_are_served(sent: bytes) -> None:
+    with FakeController(speed=None) as fake, socket.create_connection((fake.host, fake.port), WAIT) as stranger:
+        stranger.sendall(sent)
+        assert stranger.recv(100) == b""
+        client = RtdeClient(fake.host, fake.port)
+        assert client.rows()
+        client.close()
+
+
 def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:
     late = Lateness()
     drifting = [late.is_late(t, 1.0005 * t + 5.0) for t in np.arange(0.0, 60.0, 0.002)]
