@@ -20,6 +20,7 @@ from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy, shadow
 from .costing import costs
 from .data import data
+from .demo_cell import demo_cell
 from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
 from .history import history
@@ -77,6 +78,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
+    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels, demo_cell),
 ):
     main.add_command(verb)

@@ -26,7 +26,7 @@ from .options import (
     short_name,
 )
 from .output import certificate_record, progress, refusals_last, show, write_json
-from .robot import RobotChoice, recording_line, recording_record, robot_options
+from .robot import host_option, open_robot, recording_line, recording_record
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
@@ -48,7 +48,7 @@ STRETCHES = 6
     show_default=True,
     help="simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller.",
 )
-@robot_options
+@host_option
 @data_options()
 @scenario_option
 @click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
@@ -64,7 +64,7 @@ STRETCHES = 6
 def run(
     choice: RecipeChoice,
     kind: str,
-    robot: RobotChoice,
+    host: str | None,
     source: DataChoice,
     scenario: str,
     cycles: int,
@@ -78,7 +78,7 @@ def run(
 
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
     on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
-    training/ur_cell.script, or a program of the same handshake; --samples, --channel and --rate say what is recorded of it.
+    training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
     Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
     safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
     """
@@ -90,7 +90,7 @@ def run(
     with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=recipe) as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, robot)
+        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes = _drive(engine, cell, cycles, name, as_json)
         told = Told(changes, engine.safe_mode, engine.certificate())
@@ -158,7 +158,7 @@ def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
 
 
 def _simulated(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
 ) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
     from ..store.shared import is_shared
@@ -171,7 +171,7 @@ def _simulated(
 
 
 def _recorded(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
 ) -> tuple[Cell, str]:
     import numpy as np
 
@@ -197,8 +197,8 @@ def _recorded(
     return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
 
 
-def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice) -> tuple[Cell, str]:
-    return robot.open(source), f"robot at {robot.host}"
+def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None) -> tuple[Cell, str]:
+    return open_robot(host, source), f"robot at {host}"
 
 
 CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
