@@ -51,7 +51,9 @@ def create_app(
             yield
 
     guard = Middleware(Guard, access=access or Access())
-    return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app.router.redirect_slashes = False  # a robot does not follow; and where to, a request's Host would say
+    return app
 
 
 def routes_of(name: str, service: CellService) -> Sequence[BaseRoute]:
