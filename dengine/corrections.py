@@ -50,6 +50,14 @@ class Changed:
     version: int
 
 
+def _rate_behind(now: EngineSettings, policy: Policy) -> float:
+    """The audit rate that comes back when the shadow mode ends: of before it, whatever else is changed meanwhile."""
+    if policy.audit_rate < 1.0:
+        return 0.0
+    before = now.recipe.policy.audit_rate
+    return before if before < 1.0 else now.shadowed_rate
+
+
 class Corrections:
     """The part of `DataEngine` that puts things right."""
 
@@ -180,7 +188,7 @@ class Corrections:
         """The settings under another policy; anew : whether its rule begins without evidence."""
         now = self._settings
         since = 0 if self._versions.answering is None else self._versions.next_number
-        shadowed = now.recipe.policy.audit_rate if policy.audit_rate == 1.0 else 0.0
+        shadowed = _rate_behind(now, policy)
         settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, shadowed_rate=shadowed)
         return replace(settings, told_since=since, began_in=SAFE_MODE.index(self._feedback.safe_mode)) if anew else settings
 

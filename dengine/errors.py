@@ -40,3 +40,7 @@ class ExportError(DengineError, RuntimeError):
 
 class OutputError(DengineError, RuntimeError):
     """A file that cannot be written, or that holds something else than an earlier output of the same kind."""
+
+
+class CellError(DengineError, RuntimeError):
+    """A robot cell that cannot be reached, does not answer in time, or says that it could not do what it was told."""

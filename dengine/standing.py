@@ -46,9 +46,35 @@ class BadAccepts:
     @property
     def verdict(self) -> str:
         """kept, broken, or open, as far as the interval goes; it speaks of this one look."""
-        if self.upper <= self.tolerance:
-            return "kept"
-        return "broken" if self.lower > self.tolerance else "open"
+        return _verdict(self.lower, self.upper, self.tolerance)
+
+
+def _verdict(lower: float, upper: float, tolerance: float) -> str:
+    if upper <= tolerance:
+        return "kept"
+    return "broken" if lower > tolerance else "open"
+
+
+@dataclass(frozen=True, slots=True)
+class WouldHave:
+    """What the model would have done with parts that were checked all the same: audits, in the shadow mode every one.
+
+    n : checked parts that it would have accepted, or rejected.  wrong : of these, those that it was wrong about.
+    lower, upper : 95 % Wilson interval of the share of wrong ones, at one look; 0 and 1 where n is 0. Not at the policy's
+        alpha: at 0.5 that would be an even bet, and somebody decides by this whether the model may.
+    tolerance : 1 - LB.
+    """
+
+    n: int
+    wrong: int
+    lower: float
+    upper: float
+    tolerance: float
+
+    @property
+    def verdict(self) -> str:
+        """kept, broken, or open, as in `BadAccepts`."""
+        return _verdict(self.lower, self.upper, self.tolerance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +84,7 @@ class Span:
     first, last : times of the oldest and the newest; None where there is none.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : went on without a check.  rejected_good : audited parts that it would have rejected, and were good.
+    would_accept, would_reject : what audits say: those that were bad, or good, are the wrong ones.
     unlabelled : verified, of which no result was reported.
     retrains : all.  dropped : reasons of those that were dropped, with how often.
     """
@@ -75,6 +102,8 @@ class Span:
     rejected: int
     audited_rejects: int
     rejected_good: int
+    would_accept: WouldHave
+    would_reject: WouldHave
     bad_accepts: BadAccepts
     unlabelled: int
     retrains: int
@@ -137,11 +166,18 @@ def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
         rejected=outcomes.rejected,
         audited_rejects=outcomes.audited_rejects,
         rejected_good=outcomes.audited_rejects_good,
+        would_accept=_would_have(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
+        would_reject=_would_have(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
         bad_accepts=bad_accepts(outcomes, policy),
         unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
         retrains=len(here),
         dropped=dict(Counter(report.reason for report in here if not report.accepted)),
     )
+
+
+def _would_have(n: int, wrong: int, policy: Policy) -> WouldHave:
+    low, high = wilson_interval(n - wrong, wrong, 0.05)
+    return WouldHave(n, wrong, 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound)
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> BadAccepts:

@@ -99,6 +99,7 @@ def test_version_is_the_packages() -> None:
 VERBS = sorted(main.commands)
 LESS = {  # so that an example takes seconds; its own options are all read
     "compare": ["--repeats", 1, "--cycles", 150],
+    "costs": ["--alphas", 0.5, "--lower-bounds", 0.8, "--cycles", 100, "--n-jobs", 1],
     "replay": ["--repeats", 1, "--cycles", 150],
     "run": ["--cycles", 10],
     "simulate": ["--n", 4],

@@ -57,6 +57,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "envelope": 2,
     "history": 8,
     "standing": 8,
+    "stored": 8,
     "verdict": 8,
     "answering": 8,
     "explaining": 8,

@@ -34,11 +34,12 @@ def exact(notebook: Any) -> list[Any]:
     return [cell for cell in notebook.cells if "exact" in cell.metadata.get("tags", [])]
 
 
-def test_there_is_a_notebook_for_each_of_the_four_questions() -> None:
+def test_there_is_a_notebook_for_each_question() -> None:
     assert [path.stem for path in NOTEBOOKS] == [
         "comparing_reducers",
         "corrections",
         "recordings_to_deployment",
+        "shadow_and_costs",
         "the_guarantee_seen",
     ]
 

@@ -1,6 +1,7 @@
 """What decisions were worth: rates, errors with an interval, seconds."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from sklearn.metrics import accuracy_score, precision_score
 
 from dengine import Recipe, wilson_interval
 from dengine.errors import SettingError
-from dengine.experiments.rates import decided_rates, net_seconds, pooled_error, saved_seconds
+from dengine.experiments.rates import Costs, decided_rates, pooled_error
 from dengine.experiments.replay import Replay
 
 
@@ -93,7 +94,21 @@ def test_the_interval_covers_the_true_share_of_other_parts() -> None:
     assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 300) <= covered / 300
 
 
-def test_seconds_saved_are_checks_less_stops_and_good_parts_done_again() -> None:
-    assert saved_seconds(100) == 500
-    assert net_seconds(100, 2, 3) == 500 - 2 * 120 - 3 * 47.5
-    assert net_seconds(100, 2, 3, stop_s=0, again_s=0) == saved_seconds(100)
+def test_what_is_saved_are_checks_less_stops_and_good_parts_done_again() -> None:
+    assert Costs().saved(100) == 500
+    assert Costs().saved(100, 2, 3) == 500 - 2 * 120 - 3 * 47.5
+    assert Costs(escape=0, false_reject=0).saved(100, 2, 3) == 500
+
+
+def test_an_accept_is_worth_the_risk_up_to_check_by_escape() -> None:
+    costs = Costs(check=5, escape=600)
+    assert costs.saved(600, false_positive=600 * costs.worst_accept) == pytest.approx(0.0)
+    assert Costs(check=5, escape=2).worst_accept == Costs(check=5, escape=0).worst_accept == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("check", 0), ("escape", -1), ("false_reject", math.inf), ("escape", math.nan), ("check", "5")]
+)
+def test_a_cost_that_is_none_is_refused_by_its_name(name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=name):
+        Costs(**{name: value})

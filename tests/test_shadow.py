@@ -145,6 +145,23 @@ def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(
         assert not engine.shadow
 
 
+@pytest.mark.parametrize("rate", [0.0, 0.05])
+def test_a_policy_that_is_set_in_the_shadow_holds_when_it_ends_and_so_does_the_audit_rate_from_before(
+    stream: Dataset, rate: float, tmp_path: Path
+) -> None:
+    recipe = replace(RECIPE, policy=replace(POLICY, audit_rate=rate))
+    with DataEngine(recipe=recipe, store=tmp_path / "engine.db") as engine:
+        engine.set_shadow(True)
+        drive(engine, stream, 0, 200)
+        engine.set_policy(replace(engine.policy, lower_bound=0.8), "kim")
+        assert engine.shadow
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert engine.set_shadow(False, "kim").kind == "shadow"
+        assert not engine.shadow
+        assert engine.policy == replace(POLICY, lower_bound=0.8, audit_rate=rate)
+        assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 200, 300)}
+
+
 def test_the_certificate_begins_anew_with_the_shadow_and_counts_its_audits(stream: Dataset) -> None:
     with DataEngine(recipe=RECIPE) as engine:
         drive(engine, stream, 0, 200)

@@ -18,7 +18,9 @@ from ..errors import DengineError
 from ..wording import without_password
 from .cells import cells
 from .correcting import correct, forget, retrain, rollback, set_policy, shadow
+from .costing import costs
 from .data import data
+from .demo_cell import demo_cell
 from .explaining import explain
 from .export import export, export_cpp, import_labels, make_key
 from .history import history
@@ -75,7 +77,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, train, run, serve, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
+    *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
+    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels, demo_cell),
 ):
     main.add_command(verb)

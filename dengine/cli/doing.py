@@ -12,7 +12,7 @@ from .output import when
 
 if TYPE_CHECKING:
     from ..recipe import Recipe
-    from ..standing import BadAccepts, Span, Standing, Watch
+    from ..standing import BadAccepts, Span, Standing, Watch, WouldHave
     from ..store.base import Store
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
@@ -39,8 +39,9 @@ def doing_record(doing: Doing) -> dict[str, Any]:
 
 def _span_record(span: Span) -> dict[str, Any]:
     shares = {f"{name}_share": span.share(getattr(span, name)) for name in ("verified", "novel")}
-    bad = asdict(span.bad_accepts) | {"verdict": span.bad_accepts.verdict}
-    return asdict(span) | shares | {"bad_accepts": bad}
+    judged = ("bad_accepts", "would_accept", "would_reject")
+    verdicts = {name: asdict(said := getattr(span, name)) | {"verdict": said.verdict} for name in judged}
+    return asdict(span) | shares | verdicts
 
 
 def doing_table(doing: Doing, store: str) -> Any:
@@ -65,9 +66,11 @@ def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
     yield "from", when(span.first)
     yield "verified", _of(span.verified, span)
     yield "accepted", _of(span.accepted, span)
-    yield "of them bad", _bad(span.bad_accepts, alpha)
-    yield "rejected", f"{_of(span.rejected, span)}{_rejects(span)}"
-    yield "audits", f"{span.audits:,}"
+    yield "of them bad", _bad(span.bad_accepts, alpha) if span.accepted else "none was accepted"
+    yield "rejected", _of(span.rejected, span)
+    yield "audits", _of(span.audits, span)
+    yield "would accept", _would(span.would_accept, "bad")
+    yield "would reject", _would(span.would_reject, "good")
     yield "novel", _of(span.novel, span)
     yield "safe mode", _of(span.safe_mode, span)
     yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
@@ -84,15 +87,20 @@ def _of(some: int, span: Span) -> str:
 def _bad(bad: BadAccepts, alpha: float) -> str:
     """Known bad accepts, with what they say of all."""
     if not bad.by:
-        return f"{bad.stops:,} known; of the others nothing is" if bad.n else "none was accepted"
+        return f"{bad.stops:,} known; of the others nothing is"
     lead = f"{bad.bad:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
     stops = f", beside {bad.stops:,} stops" if bad.by == "audits" and bad.stops else ""
     between = f"{100 * bad.lower:.1f} to {100 * bad.upper:.1f} % at alpha {alpha:g}"
     return f"{lead}{stops}: {between}, {WORDS[bad.verdict]} {100 * bad.tolerance:g} %"
 
 
-def _rejects(span: Span) -> str:
-    return f"; {span.rejected_good:,} of {span.audited_rejects:,} audited were good" if span.audited_rejects else ""
+def _would(said: WouldHave, wrong: str) -> str:
+    """What checks said of parts that the model was certain of."""
+    if not said.n:
+        return "none was checked"
+    between = f"{100 * said.lower:.1f} to {100 * said.upper:.1f} % at 95 %"
+    held = f"{WORDS[said.verdict]} {100 * said.tolerance:g} %"
+    return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {between}, {held}"
 
 
 def _whole(doing: Doing) -> Iterator[tuple[str, str]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .interrupting import end_interrupted
+from .listing import Listed
 from .options import (
     ALPHA,
     GUARANTEE,
@@ -93,24 +94,6 @@ def replay(
 
     contender = Contender(choice.name, choice.load())
     _play("replay", [contender], {"confirms": [confirm]}, source, stream, out, as_json)
-
-
-class Listed(click.ParamType[Any]):
-    """Values with commas between, as a tuple; each is what another type says."""
-
-    name = "list"
-
-    def __init__(self, of: click.ParamType[Any]) -> None:
-        self.of = of
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
-        """'0.5,0.1' -> (0.5, 0.1); a wrong one among them is a usage error."""
-        if isinstance(value, tuple):
-            return value
-        parts = [part.strip() for part in str(value).split(",") if part.strip()]
-        if not parts:
-            self.fail("expected at least one value, with commas between.", param, ctx)
-        return tuple(self.of.convert(part, param, ctx) for part in parts)
 
 
 FEEDBACKS = {"stops": False, "confirmed": True}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,7 @@ from .options import (
     short_name,
 )
 from .output import certificate_record, progress, refusals_last, show, write_json
+from .robot import host_option, open_robot, recording_line, recording_record
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
@@ -42,11 +43,12 @@ STRETCHES = 6
 @click.option(
     "--cell",
     "kind",
-    type=click.Choice(["simulated", "replay"]),
+    type=click.Choice(["simulated", "replay", "ur"]),
     default="simulated",
     show_default=True,
-    help="simulated: physics in MuJoCo. replay: the parts of --data, in their order.",
+    help="simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller.",
 )
+@host_option
 @data_options()
 @scenario_option
 @click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
@@ -62,6 +64,7 @@ STRETCHES = 6
 def run(
     choice: RecipeChoice,
     kind: str,
+    host: str | None,
     source: DataChoice,
     scenario: str,
     cycles: int,
@@ -74,18 +77,21 @@ def run(
     """Drive a cell: verify, learn, and verify less.
 
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
-    on after its last part that was labelled or accepted: no part is learned from twice. Where too much goes wrong, or
-    looks like nothing known, everything is verified until fresh evidence says otherwise: the safe mode. Ctrl-C ends
-    the run after the cycle that is under way and shows what was done; pressed twice, it ends at once.
+    on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
+    training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
+    Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
+    safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
     """
     if kind == "simulated":
         must_have_mujoco()
     from ..engine import DataEngine
 
-    with DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None) as engine:
+    recipe = choice.load() if choice.asked else None
+    with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=recipe) as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles)
+        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
+        opened.callback(getattr(cell, "close", lambda: None))
         log, changes = _drive(engine, cell, cycles, name, as_json)
         told = Told(changes, engine.safe_mode, engine.certificate())
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
@@ -151,7 +157,9 @@ def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
     )
 
 
-def _simulated(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int) -> tuple[Cell, str]:
+def _simulated(
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
+) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
     from ..store.shared import is_shared
 
@@ -162,7 +170,9 @@ def _simulated(store: Store, seed: int, source: DataChoice, scenario: str, cycle
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
 
-def _recorded(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int) -> tuple[Cell, str]:
+def _recorded(
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
+) -> tuple[Cell, str]:
     import numpy as np
 
     from ..cells.replay import ReplayCell
@@ -187,7 +197,11 @@ def _recorded(store: Store, seed: int, source: DataChoice, scenario: str, cycles
     return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
 
 
-CELLS = {"simulated": _simulated, "replay": _recorded}
+def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None) -> tuple[Cell, str]:
+    return open_robot(host, source), f"robot at {host}"
+
+
+CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
 
 
 def _report(
@@ -197,12 +211,12 @@ def _report(
 
     total, stretches = log.summary(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
-    worst = max((r.seconds for r in log.retrains), default=None)
+    worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
     with refusals_last() as attempt:
         files = [] if out is None else attempt(lambda: _save(log, title, out))
         if as_json:
             about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
-            counts = {"total": total, "stretches": stretches, "cell": clock}
+            counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording}
             said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
             said |= {"certificate": certificate_record(told.certificate)}
             write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
@@ -210,6 +224,8 @@ def _report(
         show(_table([*stretches, total], title, clock is not None))
         if clock is not None:
             show(_clock_line(clock))
+        if recording is not None:
+            show(recording_line(recording))
         show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
         show(*(f"Wrote {path}" for path in files))
 

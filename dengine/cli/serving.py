@@ -64,10 +64,7 @@ def serve(choice: RecipeChoice, store: str, shadow: bool, xmlrpc: bool, page: bo
     machines reach it only with --host, which wants --token-file, and should have --cert and --key.
     """
     must_have_serve()
-    import sys
-
     from ..engine import DataEngine
-    from ..serve.logs import log_lines_to
     from ..serve.server import Serving, tell_safe_mode
     from ..serve.server import serve as serve_cell
 
@@ -78,7 +75,6 @@ def serve(choice: RecipeChoice, store: str, shadow: bool, xmlrpc: bool, page: bo
             engine.set_shadow(True, "dengine serve --shadow")
         return engine
 
-    log_lines_to(sys.stderr)
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
     serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
 

@@ -31,6 +31,7 @@ STOPS = {
     "some": "of some bad parts: silence after an accept says nothing",
     "all": "of all bad parts: an accepted part that no stop follows counts as good",
 }
+SHADOW = "all of what it is certain of: the shadow mode, in which it only says what it would have done"
 
 
 @click.command(epilog=example("dengine status engine.db --last 500"))
@@ -95,6 +96,11 @@ class Held:
     recent: int
     mode: Event | None
     doing: Doing
+
+    @property
+    def shadow(self) -> bool:
+        """Whether every part is verified, by the user's will."""
+        return self.recipe.policy.audit_rate == 1.0
 
     @property
     def safe_mode(self) -> str:
@@ -162,6 +168,7 @@ def _record(held: Held) -> dict[str, Any]:
         "certificate": certificate_record(held.certificate),
         "novel": novel,
         "safe_mode": mode,
+        "shadow": held.shadow,
         "settings": held.settings,
         "worst_retrain_s": worst,
         "all": [asdict(r) for r in held.retrains],
@@ -189,7 +196,7 @@ def _settings_rows(held: Held) -> Iterator[tuple[str, str]]:
     handed_in = settings.get("model")
     yield from _own_rows(recipe, seed) if handed_in is None else [("model", f"{handed_in}, decides by its own rule")]
     yield "stops known", STOPS[recipe.policy.stops]
-    yield "audits", f"{100 * recipe.policy.audit_rate:g} % of what it is certain of"
+    yield "audits", SHADOW if held.shadow else f"{100 * recipe.policy.audit_rate:g} % of what it is certain of"
     yield (
         "retrain",
         (f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}, on the newest {recipe.window:,}"),

@@ -63,6 +63,7 @@ class Bounded:
     n : parts the claim is about.  n_looked_at : those whose outcome is known.  n_bad : those known to be decided wrongly.
     propensity : probability with which each was looked at; 0 where nobody looked, so that nothing is known.
     alpha : what this bound may spend, the certificate's or a share of it.  upper : the bound, 1 where nothing is known.
+    shadowed : none of them was decided without a check, each was audited: the shadow mode.
     """
 
     n: int
@@ -71,6 +72,7 @@ class Bounded:
     propensity: float
     alpha: float
     upper: float
+    shadowed: bool = False
 
     @property
     def bad_rate(self) -> float:
@@ -162,6 +164,8 @@ class Certificate:
             return f"Of {parts} {which} nothing can be said, for {unknown}."
         if part.propensity < 1.0:
             which = f"that the model would {verb}, of which {part.n_looked_at:,} were audited"
+        if part.shadowed:
+            which = f"that the model would {verb}, each of which was checked"
         if part.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
         sure, tolerance = _percent(1.0 - self.alpha), _percent(self.tolerance)
@@ -214,12 +218,13 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: Stops, au
         raise SettingError(f"Expected stops among {', '.join(_ACCEPTED)}, got {stops!r}.")
     if not 0.0 < tolerance < 1.0:
         raise SettingError(f"Expected 0 < tolerance < 1, got {tolerance!r}; 0.05 tolerates 5 % of errors.")
-    rejected = outcomes.rejected + outcomes.audited_rejects
+    n = outcomes.rejected + outcomes.audited_rejects
+    rejected = _bounded(n, outcomes.audited_rejects, outcomes.audited_rejects_good, audit_rate, alpha)
     return Certificate(
         alpha=alpha,
         tolerance=tolerance,
         accepted=_ACCEPTED[stops](outcomes, alpha, audit_rate),
-        rejected=_bounded(rejected, outcomes.audited_rejects, outcomes.audited_rejects_good, audit_rate, alpha),
+        rejected=replace(rejected, shadowed=audit_rate == 1.0 and outcomes.rejected == 0),
     )
 
 
@@ -253,7 +258,8 @@ def _where_some_stop(outcomes: Outcomes, alpha: float, audit_rate: float) -> Bou
         return _bounded(outcomes.accepted, 0, 0, 0.0, alpha)
     n, n_bad = outcomes.accepted + outcomes.audited_accepts, outcomes.audited_accepts_bad
     bounded = _bounded(n, outcomes.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
-    return replace(bounded, upper=max(bounded.upper, (n_bad + outcomes.stops) / max(1, n)))
+    shadowed = audit_rate == 1.0 and outcomes.accepted == 0
+    return replace(bounded, upper=max(bounded.upper, (n_bad + outcomes.stops) / max(1, n)), shadowed=shadowed)
 
 
 _ACCEPTED: dict[str, Callable[[Outcomes, float, float], Bounded]] = {"all": _where_all_stop, "some": _where_some_stop}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -24,6 +25,7 @@ RULES = {  # by guarantee, and by what is known of stops
     "local": {"some": "dengine.decision.rule:DecisionRule", "all": "dengine.decision.guarantee:WatchedRule"},
     "pooled": dict.fromkeys(("some", "all"), "dengine.decision.guarantee:PooledRule"),
 }
+CURVE = "dengine.experiments.cost_curve"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +72,24 @@ class Policy:
 
         if self.stops not in get_args(Stops):
             raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
+
+    @classmethod
+    def from_costs(cls, dataset: Any, *, check: float, escape: float, false_reject: float, **how: Any) -> Policy:
+        """The policy that made a part cheapest in replays of the user's own recordings.
+
+        dataset : anything `load_dataset` takes.
+        check, escape, false_reject : what a verification, a bad part accepted and a good part rejected cost, in one unit.
+        how : `recipe`, `alphas`, `lower_bounds`, `repeats`, `n_jobs` and more, as `experiments.cost_curve.cost_curve` takes
+            them; its `CostCurve` says what each policy would have cost, and how sure that is.
+        Raises SettingError where nothing is cheaper than verifying everything, with what the cheapest policy costs.
+        """
+        curve = import_module(CURVE).cost_curve(  # from far above: it plays engines
+            dataset, check=check, escape=escape, false_reject=false_reject, **how
+        )
+        found: Policy | None = curve.policy
+        if found is None:
+            raise SettingError(f"Expected a policy that costs less than verifying everything. {curve.sentence}")
+        return found
 
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""

@@ -1,4 +1,4 @@
-"""What a replay's decisions were worth: rates of what was decided, errors of many replays with an interval, seconds.
+"""What a replay's decisions were worth: rates of what was decided, errors of many replays with an interval, costs.
 
 >>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, the share of bad ones
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from ..decision.bounds import wilson_interval
 from ..errors import SettingError
+from ..values import is_number
+from ..wording import shortened
 
 if TYPE_CHECKING:
     from .replay import Replay
@@ -95,17 +97,32 @@ def _independent(decided: Any, wrong: Any, rate: float, traces: int) -> tuple[fl
     return n * rate, n * (1.0 - rate)
 
 
-def saved_seconds(certain: float) -> float:
-    """Seconds of checks left out."""
-    return VERIFY_SECONDS * certain
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """What a part can cost beyond its cycle, in one unit of the user's: seconds of production, or money.
 
+    check : an expensive verification.  escape : a bad part that was accepted: a stop, or worse.  false_reject : a good part
+    that was sent back. By default the paper's check, the simulated cell's stop and the paper's cycle, in seconds.
+    SettingError for a check that costs nothing, which would never be worth leaving out, or a cost below 0.
+    """
 
-def net_seconds(
-    certain: float,
-    false_positive: float,
-    false_negative: float,
-    stop_s: float = STOP_SECONDS,
-    again_s: float = CYCLE_SECONDS,
-) -> float:
-    """Seconds of checks left out, less a stop for every bad part accepted and another cycle for every good one rejected."""
-    return saved_seconds(certain) - stop_s * false_positive - again_s * false_negative
+    check: float = VERIFY_SECONDS
+    escape: float = STOP_SECONDS
+    false_reject: float = CYCLE_SECONDS
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if not (is_number(value) and 0.0 <= value < math.inf):
+                raise SettingError(f"Expected a finite cost of 0 or more as {each.name}, got {shortened(value)}.")
+        if not self.check > 0.0:
+            raise SettingError("Expected a check that costs something, got 0: then verify everything.")
+
+    @property
+    def worst_accept(self) -> float:
+        """An accepted part is worth its risk where it is bad with at most this probability: check / escape, at most 1."""
+        return min(1.0, self.check / self.escape) if self.escape else 1.0
+
+    def saved(self, certain: float, false_positive: float = 0.0, false_negative: float = 0.0) -> float:
+        """What so many decisions without a check saved, less what the wrong ones among them cost."""
+        return self.check * certain - self.escape * false_positive - self.false_reject * false_negative

@@ -20,7 +20,7 @@ from ..errors import SettingError
 from ..recipe import Recipe
 from .contenders import Contender
 from .live import RunLog, watch
-from .rates import decided_rates, net_seconds, saved_seconds
+from .rates import Costs, decided_rates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +83,8 @@ class Replay(RunLog):
             "slice_max_s": self.slice_max_s,
             "decide_p50_us": 1e6 * _quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * _quantile(self.decide_seconds, 0.99),
-            "saved_s": saved_seconds(certain),
-            "net_s": net_seconds(certain, **wrong),
+            "saved_s": Costs().saved(certain),
+            "net_s": Costs().saved(certain, **wrong),
             "seconds": self.seconds,
         }
 

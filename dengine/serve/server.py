@@ -7,6 +7,7 @@ import signal
 import socket
 import ssl
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from ..records import RetrainReport
 from .access import Access, is_loopback, read_token
 from .app import INTERFACES, Beside, create_app
 from .connections import limited
+from .logs import log_lines_to
 from .retraining import retraining_process
 from .service import DEADLINE, Answer, CellService, Told
 
@@ -79,14 +81,18 @@ def serve(
     say : told where it listens, once it does.
     SettingError for a port that is in use, and for files that cannot be used; what `make` raises.
     """
-    access, tls = serving.access(), _tls(serving.cert, serving.key)
-    sys.setswitchinterval(SWITCH)
-    with bound(serving.host, serving.port) as listening, retraining_process() as executor:
+    tls, access = _tls(serving.cert, serving.key), serving.access()
+    with (
+        bound(serving.host, serving.port) as listening,
+        log_lines_to(sys.stderr),
+        quick_switches(),
+        retraining_process() as executor,
+    ):
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
             app = create_app(service, access, serving.interfaces, serving.beside)
-            config = uvicorn.Config(app, **_how(serving) | tls)
+            config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
             server = CellServer(config, service, lambda: say(f"{line}{'' if access.token else ', to this machine alone'}."))
@@ -95,7 +101,7 @@ def serve(
             service.close()
 
 
-def _how(serving: Serving) -> dict[str, Any]:
+def uvicorn_options(serving: Serving) -> dict[str, Any]:
     """What uvicorn is told; its own words in the log are ours to say."""
     limits = {"timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE, "ws": "none", "lifespan": "on"}
     silent = {"log_config": None, "access_log": False, "server_header": False, "proxy_headers": False}
@@ -125,6 +131,9 @@ class CellServer(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """SIGTERM and SIGINT ask for an end; uvicorn would raise them again once it has come."""
+        if threading.current_thread() is not threading.main_thread():  # Python delivers signals to that one alone
+            yield
+            return
 
         def end(number: int, frame: FrameType | None) -> None:
             log.info("%s: ending, what is in line is answered", signal.Signals(number).name)
@@ -137,6 +146,17 @@ class CellServer(uvicorn.Server):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+@contextmanager
+def quick_switches() -> Iterator[None]:
+    """Have the engine's thread and the one that answers give each other Python's lock without delay."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 @contextmanager

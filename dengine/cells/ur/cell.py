@@ -1,0 +1,172 @@
+"""A cell of a Universal Robots controller, driven by orders to the robot's program: the paper's loop on a real robot.
+
+with UrCell("192.168.1.10") as cell, DataEngine.open_or_create("cell.db") as engine:
+    for cycle in engine.run(cell, cycles=300): ...
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import CellError
+from ...recordings.triggers import Trigger
+from ...records import Outcome
+from .orders import ANSWER, ANSWERS, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, after, word
+from .protocol import PORT
+from .recorder import BAR_S, InsertionRecord, RtdeRecorder
+from .stream import Row
+
+OUTCOMES = {
+    Answer.UNKNOWN: Outcome.UNKNOWN,
+    Answer.CONFIRMED: Outcome.CONFIRMED,
+    Answer.STOPPED: Outcome.STOPPED,
+}
+REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED): "it says that it failed"}
+
+
+class UrCell:
+    """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot (`orders`).
+
+    host, trigger, samples, channels, rate_hz, before, port : as in `RtdeRecorder`; the trace is recorded while the robot
+    inserts.  order_timeout : seconds for each order to be answered.  start_timeout : seconds, at first, for the program to
+    run and to have finished what an earlier owner ordered.
+
+    A trace with a gap is handed on with NaN in it: the engine verifies that part and never learns from it; `last` says what
+    is missing, `incomplete` counts them. CellError where the robot does not answer, its program stops, or it says FAILED.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        trigger: Trigger | str = f"register@{PHASE}",
+        samples: int = 1000,
+        channels: Sequence[str] = ("FZ_Base",),
+        rate_hz: float = 500.0,
+        before: int = 0,
+        port: int = PORT,
+        order_timeout: float = 60.0,
+        start_timeout: float = 30.0,
+    ) -> None:
+        also = (ANSWER, ORDER, RUNTIME)
+        self.recorder = RtdeRecorder(host, trigger, samples, channels, rate_hz, before, port, also=also, inputs=(ORDER,))
+        self.order_timeout, self.start_timeout = order_timeout, start_timeout
+        self.last: InsertionRecord | None = None
+        self.incomplete = 0
+        self._number = 0
+
+    def open(self) -> UrCell:
+        """Connect, and wait until the robot's program runs and owes no answer."""
+        self.recorder.open()
+        try:
+            columns = self.recorder.stream.columns
+            self._at = {name: columns.index(name) for name in (ANSWER, ORDER, RUNTIME)}
+            self._number = self._take_over()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def close(self) -> None:
+        """Hang up; the robot waits for its next order."""
+        self.recorder.close()
+
+    def __enter__(self) -> UrCell:
+        return self.open()
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    def insert(self) -> NDArray[np.float32]:
+        """Pick a part, push it in, and give the force: (T,) or (C, T), NaN where a sample never came."""
+        self._ask(Verb.INSERT)
+        if self.last is None:  # answered, and no start was seen: the trigger fell into a gap, or is the wrong one
+            self.last = self.recorder.cutter.cut()
+        self.incomplete += not self.last.complete
+        return self.last.trace
+
+    def verify(self) -> bool:
+        """Have what was inserted measured: True for a success. A bad part goes back to the bin."""
+        return self._ask(Verb.VERIFY) is Answer.GOOD
+
+    def proceed(self) -> Outcome:
+        """Go on without measuring; what the line says of the part."""
+        return OUTCOMES[self._ask(Verb.PROCEED)]
+
+    def reject(self) -> None:
+        """Back to the bin, not measured."""
+        self._ask(Verb.REJECT)
+
+    def _ask(self, verb: Verb) -> Answer:
+        """Give one order, and read until it is answered; an insertion also until its trace is over."""
+        self.recorder.arm()  # what came while nothing was asked is nobody's
+        self._number = after(self._number)
+        self.last = None if verb is Verb.INSERT else self.last
+        self.recorder.stream.write((word(self._number, verb),))
+        answer: Answer | None = None
+        end = time.monotonic() + self.order_timeout
+        while answer is None or (verb is Verb.INSERT and self.last is None and self.recorder.cutter.begun):
+            rows = self._rows(end, f"to answer order {self._number} ({verb.name.lower()})", answer is not None)
+            if not rows:
+                break
+            n = self._record(rows) if verb is Verb.INSERT and self.last is None else len(rows)
+            answer = answer or next((found for row in rows[:n] if (found := self._answered(row, verb))), None)
+            self.recorder.seen(n)
+        self.recorder.stream.write(None)
+        assert answer is not None  # `_rows` has raised
+        return answer
+
+    def _record(self, rows: list[Row]) -> int:
+        self.last, n = self.recorder.cutter.feed(rows)
+        return n
+
+    def _rows(self, end: float, what: str, spare: bool = False) -> list[Row]:
+        """The next packages; none, where that is no fault, or else CellError once `end` is past."""
+        while (left := end - time.monotonic()) > 0:
+            rows = self.recorder.rows(min(left, BAR_S))
+            if rows:
+                return rows
+        if spare:
+            return []
+        raise CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {self._why()}.")
+
+    def _why(self) -> str:
+        if self.recorder.stream.trouble:
+            return f"there is no connection: {self.recorder.stream.trouble}"
+        return "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
+
+    def _answered(self, row: Row, verb: Verb) -> Answer | None:
+        """The answer to the order under way, if this package holds it; CellError for one that is no success."""
+        number, what = divmod(int(row.values[self._at[ANSWER]]), 10)
+        state = int(row.values[self._at[RUNTIME]])
+        about = f"order {self._number} ({verb.name.lower()})"
+        if number == self._number:
+            if what in ANSWERS[verb]:
+                return Answer(what)
+            said = REFUSALS.get(what, f"it answered {what}")
+            raise CellError(f"Expected the robot to carry out {about}, {said}; look at the part, then begin again.")
+        if state in (Runtime.STOPPING, Runtime.STOPPED):
+            raise CellError(
+                f"Expected the robot to carry out {about}, its program has stopped; start it, then begin again."
+            )
+        return None
+
+    def _take_over(self) -> int:
+        """The number of the last order there was, once it is answered and the program runs."""
+        end = time.monotonic() + self.start_timeout
+        while True:
+            rows = self._rows(time.monotonic() + self.start_timeout, "to send its state")
+            self.recorder.seen(len(rows))
+            ordered, answered, state = (int(rows[-1].values[self._at[name]]) for name in (ORDER, ANSWER, RUNTIME))
+            if state == Runtime.PLAYING and ordered // 10 == answered // 10:
+                return ordered // 10
+            if time.monotonic() > end:
+                owing = f"it owes an answer to order {ordered // 10}"
+                what = owing if state == Runtime.PLAYING else "its program does not run"
+                raise CellError(
+                    f"Expected the robot at {self.recorder.stream.where} to be ready within {self.start_timeout:g} s, "
+                    f"{what}; start training/ur_cell.script, or your own program of the same handshake, on it."
+                )

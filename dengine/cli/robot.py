@@ -1,0 +1,50 @@
+"""`dengine run --cell ur`: which robot, and what was recorded of it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import SettingError
+
+if TYPE_CHECKING:
+    from ..cells.ur.cell import UrCell
+    from .options import DataChoice
+
+SAMPLES, RATE_HZ = 1000, 500.0  # of a trace, where nothing else was asked for: two seconds
+
+
+host_option = click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
+
+
+def open_robot(address: str | None, source: DataChoice) -> UrCell:
+    """The cell, connected, its program running. SettingError where no host was named; CellError where none answers."""
+    from ..cells.ur.cell import UrCell
+    from ..cells.ur.protocol import PORT
+    from ..recordings.asked import names_of
+
+    if not address:
+        raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
+    host, _, port = address.partition(":")
+    if port and not port.isdecimal():
+        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    how: dict[str, Any] = {"samples": source.samples or SAMPLES, "rate_hz": source.rate_hz or RATE_HZ}
+    how |= {"trigger": source.trigger} if source.trigger else {}
+    how |= {"channels": names_of(source.channel)} if source.channel else {}
+    return UrCell(host, port=int(port) if port else PORT, **how).open()
+
+
+def recording_record(cell: Any) -> dict[str, Any] | None:
+    """What was missing of what a cell recorded; None for one that records nothing."""
+    recorder = getattr(cell, "recorder", None)
+    return None if recorder is None else {"incomplete": cell.incomplete, **asdict(recorder.report())}
+
+
+def recording_line(told: dict[str, Any]) -> str:
+    """The same for people."""
+    return (
+        f"Recorded: {told['packages']} packages, {told['missing']} missing, {told['late']} late, {told['reconnects']} "
+        f"reconnects. Traces with a gap, verified and never learned from: {told['incomplete']}."
+    )

@@ -1,0 +1,180 @@
+"""A robot's force over RTDE, sample for sample: what was sent, what was recorded, and what was said to be missing.
+
+    python training/benchmark_recording.py --insertions 300 --out out/
+    python training/benchmark_recording.py --insertions 20 --speed 20 --ur-rtde 10
+
+A controller without a robot (`FakeController`) plays bundled insertions at 500 Hz over TCP on this machine, in real time:
+300 of them take ten minutes and a half. Packages are dropped, held back and sent in one burst, sent twice; connections are
+closed, in the middle of a package too, or broken by what is no RTDE, each at a random sample. Then a `DataEngine` drives
+the same cell, undisturbed, and its decisions are compared with those of a replay. --ur-rtde measures ur_rtde's own recorder
+for so many seconds against the same controller.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from dengine import Cell, DataEngine, Dataset, Recipe, ReplayCell, load_dataset
+from dengine.cells import FakeController, UrCell
+from dengine.cells.ur import RobotProgram, Trouble
+from dengine.cli.output import duration
+
+SHARE = 0.5  # of the insertions that something goes wrong in
+LONGEST = {"drop": 60, "hold": 150}  # cycles
+KINDS = ("drop", "hold", "close", "half", "garbage", "repeat")
+POLICY = {"alpha": 0.1, "lower_bound": 0.9}
+MINE = "127.30.0.4"  # an address of the loopback: ur_rtde's port is fixed
+THEIRS = """
+import sys, time, rtde_receive
+receive = rtde_receive.RTDEReceiveInterface(sys.argv[1], 500.0)
+receive.startFileRecording(sys.argv[2], ["timestamp", "actual_TCP_force"])
+time.sleep(float(sys.argv[3]))
+receive.stopFileRecording()
+receive.disconnect()
+"""
+
+
+def troubles(insertions: int, samples: int, rng: np.random.Generator) -> list[Trouble]:
+    """One in about half of the insertions, at any sample."""
+    found = []
+    for part in np.flatnonzero(rng.random(insertions) < SHARE).tolist():
+        kind = str(rng.choice(KINDS))
+        cycles = int(rng.integers(1, LONGEST[kind] + 1)) if kind in LONGEST else 1
+        found.append(Trouble(part, int(rng.integers(samples)), kind, cycles))
+    return found
+
+
+def record(data: Dataset, insertions: int, speed: float | None, wrong: Sequence[Trouble]) -> pd.DataFrame:
+    """A row an insertion: samples sent and not sent, recorded and said to be missing."""
+    samples, kinds, rows = data.X.shape[-1], {each.part: each.kind for each in wrong}, []
+    with (
+        FakeController(RobotProgram(data), speed=speed, troubles=wrong) as fake,
+        UrCell(fake.host, port=fake.port, samples=samples) as cell,
+    ):
+        for part in range(insertions):
+            trace, said = cell.insert(), cell.last
+            lost = np.zeros(samples, dtype=bool)
+            lost[[sample for lost_part, sample in fake.lost if lost_part == part]] = True
+            unseen = bool(lost[0])  # the first sample: then no place is known
+            known, expected = ~np.isnan(trace), ~lost & (not unseen)
+            rows.append(
+                {
+                    "part": part,
+                    "trouble": kinds.get(part, ""),
+                    "not_sent": int(lost.sum()),
+                    "start_unseen": unseen,
+                    "recorded": int(known.sum()),
+                    "differing": int((trace[known] != data.X[part][known]).sum()),
+                    "unreported": int((known & ~expected).sum()),
+                    "invented": int((~known & expected).sum()),
+                    **{name: getattr(said, name) for name in ("missing", "late", "repeated", "reconnects")},
+                }
+            )
+            cell.reject()
+        print(f"Packages: {cell.recorder.report()}")
+    return pd.DataFrame(rows)
+
+
+def decisions(cell: Cell, recipe: Recipe, cycles: int) -> list[dict]:
+    """What an engine decides and is told, cycle by cycle."""
+    with DataEngine.from_recipe(recipe) as engine:
+        return [
+            {**asdict(c.decision), "id": 0, "outcome": c.outcome, "success": c.success} for c in engine.run(cell, cycles)
+        ]
+
+
+def compare(data: Dataset, recipe: Recipe, cycles: int) -> str:
+    """A run by orders to a robot's program beside a replay of the same traces."""
+    with (
+        FakeController(RobotProgram(data), speed=None) as fake,
+        UrCell(fake.host, port=fake.port, samples=data.X.shape[-1]) as cell,
+    ):
+        live = decisions(cell, recipe, cycles)
+    replayed = decisions(ReplayCell(data), recipe, cycles)
+    differing = sum(a != b for a, b in zip(live, replayed, strict=True))
+    actions = Counter(str(each["action"]) for each in live)
+    told = ", ".join(f"{n} {action}" for action, n in sorted(actions.items()))
+    return f"{recipe.name}: {differing} of {cycles} decisions differ from the replay's ({told})."
+
+
+class Count:
+    """Shows a number that grows by one each control cycle."""
+
+    place = None
+
+    def __init__(self) -> None:
+        self.cycle = 0
+
+    def step(self, inputs: dict[str, float]) -> dict[str, float]:
+        """The next number, as the force along z."""
+        self.cycle += 1
+        return {"actual_TCP_force[2]": float(self.cycle)}
+
+
+def theirs(seconds: float) -> str:
+    """ur_rtde's recorder on the same controller, undisturbed: what its file holds."""
+    with tempfile.TemporaryDirectory() as folder, FakeController(Count(), host=MINE, port=30004):
+        path = Path(folder) / "theirs.csv"
+        subprocess.run([sys.executable, "-c", THEIRS, MINE, str(path), str(seconds)], check=True)
+        with path.open(encoding="utf-8") as file:
+            steps = np.diff([float(row["actual_TCP_force_2"]) for row in csv.DictReader(file)])
+    again, skipped = int((steps == 0).sum()), int((steps[steps > 1] - 1).sum())
+    return f"ur_rtde's file of {len(steps) + 1} rows: {skipped} packages are not in it, {again} rows repeat the one before."
+
+
+def table(found: pd.DataFrame) -> Table:
+    """A row a kind of trouble."""
+    shown = Table(title=f"{len(found)} insertions", title_justify="left")
+    columns = ["not_sent", "recorded", "differing", "unreported", "invented", "late", "repeated", "reconnects"]
+    for name in ("trouble", "insertions", *columns):
+        shown.add_column(name.replace("_", " "), justify="left" if name == "trouble" else "right")
+    groups = [(kind or "none", group) for kind, group in found.groupby("trouble")]
+    for kind, group in [*groups, ("all", found)]:
+        shown.add_row(kind, str(len(group)), *(str(int(group[name].sum())) for name in columns))
+    return shown
+
+
+def main() -> None:
+    """Parse, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--insertions", type=int, default=300)
+    parser.add_argument("--speed", type=float, default=1.0, help="against real time; 0: as fast as it is read")
+    parser.add_argument("--samples", type=int, default=None, help="of each trace; default: all 1000")
+    parser.add_argument("--recipes", default="pca", help="with commas between; each is compared with a replay")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ur-rtde", type=float, default=0.0, metavar="SECONDS", help="measure ur_rtde's recorder too")
+    parser.add_argument("--out", type=Path, default=None, help="folder for recording.csv")
+    asked = parser.parse_args()
+    data = load_dataset("insertion", asked.samples)
+    wrong = troubles(asked.insertions, data.X.shape[-1], np.random.default_rng(asked.seed))
+    begin = time.perf_counter()
+    found = record(data, asked.insertions, asked.speed or None, wrong)
+    console = Console()
+    console.print(f"Recorded in {duration(time.perf_counter() - begin)}.", table(found))
+    console.print(f"{int(found.start_unseen.sum())} starts fell into a gap: no sample's place in those traces is known.")
+    for name in asked.recipes.split(","):
+        console.print(compare(data, Recipe.load(name).with_policy(**POLICY), asked.insertions))
+    if asked.ur_rtde > 0:
+        console.print(theirs(asked.ur_rtde))
+    if asked.out is not None:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        found.to_csv(asked.out / "recording.csv", index=False)
+        console.print(f"Wrote {asked.out / 'recording.csv'}")
+
+
+if __name__ == "__main__":
+    main()
