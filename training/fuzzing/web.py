@@ -199,7 +199,7 @@ def as_bytes(rng: random.Random) -> bytes:
             return b"GET /status HTTP/1.1\r\n" + b"X: " + b"y" * 100_000 + b"\r\n\r\n"
         case 3:
             return (
-                b"GET /status HTTP/9.9\r\nHost: localhost\r\n\r\n"
+                b"GET /status HTTX/1.1\r\nHost: localhost\r\n\r\n"
                 if rng.random() < 0.5
                 else b"\x16\x03\x01\x02\x00\x01\x00"
             )
