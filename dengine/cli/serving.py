@@ -58,6 +58,8 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "--opcua", type=click.IntRange(1, 65535), metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840."
 )
+@click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
+@click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
 @click.option("--robot", metavar="HOST", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
 @click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")

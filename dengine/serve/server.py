@@ -43,7 +43,8 @@ class Serving:
     token_file : of the token; None only where no other machine reaches the server.
     cert, key : PEM files; None: no TLS.
     allow_hosts : names by which the server is called, beside localhost.
-    opcua : the port of OPC UA, at the same host, with the same token, cert and key; None: it is not spoken.
+    opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
+    opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
     recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
     """
 
@@ -60,6 +61,8 @@ class Serving:
     interfaces: Sequence[str] = INTERFACES
     beside: Sequence[Beside] = field(default=())
     opcua: int | None = None
+    opcua_cert: Path | None = None
+    opcua_key: Path | None = None
     recorder: Callable[[], AbstractContextManager[Recorder]] | None = None
 
     def access(self) -> Access:
@@ -115,7 +118,7 @@ def _opcua(serving: Serving, access: Access) -> list[Beside]:
         return []
     from .opcua import opcua_server
 
-    token, cert, key = access.token or None, serving.cert, serving.key
+    token, cert, key = access.token or None, serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
     return [partial(opcua_server, port=serving.opcua, host=serving.host, token=token, cert=cert, key=key)]
 
 
