@@ -145,8 +145,8 @@ class EndOfShiftError(Exception):
 class Robot:
     """A robot of paper: its bin is a data set, its height check knows the labels; what it did with each part is noted."""
 
-    def __init__(self, data: Dataset, parts: int, port: int, recorder: Recorder) -> None:
-        self.data, self.parts, self.port, self.recorder = data, parts, port, recorder
+    def __init__(self, data: Dataset, parts: int, cell: Cell, patience: float = 600.0) -> None:
+        self.data, self.parts, self.port, self.recorder, self.patience = data, parts, cell.port, cell.recorder, patience
         self.taken, self.outputs, self.flags = -1, dict[int, bool](), dict[int, bool]()
         self.checked: list[int] = []
         self.said: list[str] = []
@@ -157,7 +157,7 @@ class Robot:
         names |= {"run": self.run, "kill": lambda thread: None, "textmsg": lambda *text: self.said.append("".join(text))}
         source = as_python(CODE).replace("192.168.1.20:8000/RPC2/TOKEN", f"127.0.0.1:{self.port}/RPC2")
         source = source.replace('HOST = "192.168.1.20"', 'HOST = "127.0.0.1"').replace("PORT = 8000", f"PORT = {self.port}")
-        source = source.replace("MOST_S = 3.0", "MOST_S = 0.3").replace("while True:", "while next_part():")
+        source = source.replace("MOST_S = 3.0", f"MOST_S = {self.patience}").replace("while True:", "while next_part():")
         with pytest.raises(EndOfShiftError):
             exec(compile(source, str(SCRIPT), "exec"), names | {"next_part": self.next_part})
 
@@ -173,7 +173,7 @@ class Robot:
         return thread
 
     def sleep(self, seconds: float) -> None:
-        time.sleep(min(seconds, 0.01))
+        time.sleep(min(seconds, 0.002))
 
     def write_output_integer_register(self, number: int, value: int) -> None:
         if value:
@@ -203,7 +203,7 @@ class Robot:
 
 def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data) -> None:
     data = make_data(90, samples=SAMPLES, seed=3)
-    robot = Robot(data, len(data), cell.port, cell.recorder)
+    robot = Robot(data, len(data), cell)
     robot.play()
     asked = cell.service._put(lambda engine, late: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
     found = asked.future.result(60)
@@ -222,7 +222,7 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data
 def test_what_is_not_answered_in_time_is_checked(cell: Cell, make_data) -> None:
     data, free = make_data(2, samples=SAMPLES, seed=3), threading.Event()
     held = cell.service._put(lambda engine, late: free.wait(60))
-    robot = Robot(data, 2, cell.port, cell.recorder)
+    robot = Robot(data, 2, cell, patience=0.3)
     robot.play()
     free.set()
     held.future.result(60)
@@ -233,7 +233,7 @@ def test_what_is_not_answered_in_time_is_checked(cell: Cell, make_data) -> None:
 
 def test_without_a_server_everything_is_checked_and_the_program_goes_on(cell: Cell, make_data) -> None:
     data = make_data(8, samples=SAMPLES, seed=3)
-    robot = Robot(data, 8, cell.port, cell.recorder)
+    robot = Robot(data, 8, cell)
     first_look = robot.socket_open
     robot.socket_open = lambda *where: first_look(*where) if robot.taken < 4 else False
     robot.play()
@@ -242,7 +242,7 @@ def test_without_a_server_everything_is_checked_and_the_program_goes_on(cell: Ce
 
 
 def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: Cell, make_data) -> None:
-    robot = Robot(make_data(2, samples=SAMPLES, seed=3), 1, cell.port, cell.recorder)
+    robot = Robot(make_data(2, samples=SAMPLES, seed=3), 1, cell)
     robot.flags[7] = True
     robot.play()
     assert robot.checked == [-1, 0]
