@@ -249,9 +249,8 @@ GERMAN = {
     "act.rollback.none": "Es gibt keine frühere Version.",
     "act.rollback.option": "{version}: {time}",
     "act.retrain": "Jetzt trainieren",
-    "act.retrain.what": "Das Modell wird mit allen jetzt bekannten Ergebnissen trainiert. Entscheidungen warten, höchstens "
-    "eine halbe Sekunde.",
-    "act.retrain.done": "Das Training ist beendet.",
+    "act.retrain.what": "Das Modell wird mit allen jetzt bekannten Ergebnissen trainiert.",
+    "act.retrain.done": "Das Training hat begonnen; sein Modell antwortet, sobald es fertig ist.",
     "act.export": "Exportieren",
     "act.export.what": "Das Modell, das jetzt antwortet, als TorchScript-Datei für eine Steuerung, mit Prüfsumme.",
     "act.export.done": "Die Datei wurde geladen.",
