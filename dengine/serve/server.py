@@ -10,8 +10,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,6 +24,7 @@ from ..errors import SettingError
 from ..records import RetrainReport
 from .access import Access, is_loopback, read_token
 from .app import INTERFACES, Beside, create_app
+from .calls import Recorder
 from .connections import limited
 from .logs import log_lines_to
 from .retraining import retraining_process
@@ -41,6 +43,9 @@ class Serving:
     token_file : of the token; None only where no other machine reaches the server.
     cert, key : PEM files; None: no TLS.
     allow_hosts : names by which the server is called, beside localhost.
+    opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
+    opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
+    recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
     """
 
     host: str = "127.0.0.1"
@@ -55,6 +60,10 @@ class Serving:
     connections: int = 100
     interfaces: Sequence[str] = INTERFACES
     beside: Sequence[Beside] = field(default=())
+    opcua: int | None = None
+    opcua_cert: Path | None = None
+    opcua_key: Path | None = None
+    recorder: Callable[[], AbstractContextManager[Recorder]] | None = None
 
     def access(self) -> Access:
         """Who may ask; SettingError where other machines reach the server and it has no token."""
@@ -87,11 +96,13 @@ def serve(
         log_lines_to(sys.stderr),
         quick_switches(),
         retraining_process() as executor,
+        serving.recorder() if serving.recorder else nullcontext() as recorder,
     ):
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
-            app = create_app(service, access, serving.interfaces, serving.beside)
+            beside = (*serving.beside, *_opcua(serving, access))
+            app = create_app(service, access, serving.interfaces, beside, recorder)
             config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
@@ -99,6 +110,16 @@ def serve(
             _run(server, listening, app.state)
         finally:
             service.close()
+
+
+def _opcua(serving: Serving, access: Access) -> list[Beside]:
+    """What speaks OPC UA, where it is asked for."""
+    if serving.opcua is None:
+        return []
+    from .opcua import opcua_server
+
+    token, cert, key = access.token or None, serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
+    return [partial(opcua_server, port=serving.opcua, host=serving.host, token=token, cert=cert, key=key)]
 
 
 def uvicorn_options(serving: Serving) -> dict[str, Any]:

@@ -219,7 +219,7 @@ class CellService:
 
     def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
         try:
-            engine = make()
+            engine = _opened(make)
         except BaseException as error:  # raised where the service is made
             opened.set_exception(error)
             return
@@ -250,6 +250,16 @@ class CellService:
         for loop, changed in tuple(self._listeners):
             with suppress(RuntimeError):  # its loop has ended
                 loop.call_soon_threadsafe(changed.set)
+
+
+def _opened(make: Callable[[], DataEngine]) -> DataEngine:
+    engine = make()
+    try:
+        engine.know_ids()
+    except BaseException:
+        engine.close()
+        raise
+    return engine
 
 
 def _report(engine: DataEngine, decision_id: str, success: bool) -> Told:
