@@ -145,6 +145,19 @@ def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
         RtdeClient("127.0.0.1", port, timeout=0.1)
 
 
+def test_a_register_that_its_owner_gives_up_is_taken_over_soon_after_and_one_that_is_held_is_said() -> None:
+    with FakeController(speed=20.0) as fake:
+        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        timer = threading.Timer(0.2, first.close)
+        timer.start()
+        with RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+            assert stream.after(0, WAIT)[0]
+        timer.join()
+    held = pytest.raises(CellError, match="another client")
+    with FakeController(speed=20.0, held=[ORDER]) as fake, held:
+        RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port).open()
+
+
 def test_the_controllers_own_words_are_in_the_error() -> None:
     with FakeController(speed=1.0) as fake:
         client = RtdeClient(fake.host, fake.port)
