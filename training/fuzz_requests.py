@@ -5,9 +5,9 @@
 Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC, OPC UA and bare TCP. Prints a table by kind: tried;
 refused (a 4xx, a fault, a Bad status); closed (the connection ended, for what is no request at all); waiting (half a
 message: the server waits for the rest); taken (what was only spoilt can still be good, and a view of the page takes any
-query). Failed is a 5xx, a redirect or a traceback. Afterwards the decisions from before must be what they were, the same traces must be decided on as before, the
-memory must be as it was after the first fifth, and connections that send nothing must have been ended. Exit code 1 if
-anything is not so.
+query). Failed is a 5xx, a redirect or a traceback. Afterwards the decisions from before must be what they were, the same
+traces must be decided on as before, the memory must be as it was after the first fifth, and connections that send nothing
+must have been ended. Exit code 1 if anything is not so.
 """
 
 from __future__ import annotations
