@@ -41,7 +41,6 @@ FIELDS = [  # of a form: none of them is whole
         "",
         "author=",
         "author=%00",
-        "author=%0aroot",
         "author=" + "x" * 300,
         "a=b&" * 50,
         "author=%E2%80%AE",
