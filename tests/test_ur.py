@@ -145,6 +145,19 @@ def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
         RtdeClient("127.0.0.1", port, timeout=0.1)
 
 
+def test_a_register_that_its_owner_gives_up_is_taken_over_soon_after_and_one_that_is_held_is_said() -> None:
+    with FakeController(speed=20.0) as fake:
+        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        timer = threading.Timer(0.2, first.close)
+        timer.start()
+        with RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+            assert stream.after(0, WAIT)[0]
+        timer.join()
+    held = pytest.raises(CellError, match="another client")
+    with FakeController(speed=20.0, held=[ORDER]) as fake, held:
+        RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port).open()
+
+
 def test_the_controllers_own_words_are_in_the_error() -> None:
     with FakeController(speed=1.0) as fake:
         client = RtdeClient(fake.host, fake.port)
@@ -168,6 +181,26 @@ def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() 
         with pytest.raises(CellError, match="Expected packages"):
             read_on(idle)
         idle.close()
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        Package(Kind.OUTPUTS, b"short").bytes,
+        Package(Kind.OUTPUTS, bytes(8) + b"\xff\xfe").bytes,
+        Package(Kind.DATA, b"\x09").bytes,
+        Package(Kind.VERSION, b"").bytes,
+    ],
+    ids=["http", "half a set-up", "no text", "no recipe", "no version"],
+)
+def test_who_does_not_speak_rtde_is_hung_up_on_and_others_are_served(sent: bytes) -> None:
+    with FakeController(speed=None) as fake, socket.create_connection((fake.host, fake.port), WAIT) as stranger:
+        stranger.sendall(sent)
+        assert stranger.recv(100) == b""
+        client = RtdeClient(fake.host, fake.port)
+        assert client.rows()
+        client.close()
 
 
 def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:

@@ -26,6 +26,7 @@ from .server import Connection, named, packed
 CYCLE_S = 0.002
 IDLE_S = 0.0002  # of a cycle at no set speed, while nobody listens
 STATE = {"robot_mode": 7.0, "safety_mode": 1.0, "speed_scaling": 1.0, RUNTIME: float(Runtime.PLAYING)}
+FOREIGN = (OSError, CellError, struct.error, ValueError, KeyError)  # of a client that is gone, or speaks otherwise
 GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
 TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
 
@@ -158,7 +159,7 @@ class FakeController:
             self._connections.append(connection)
             self.connections_made += 1
         packages = Packages()
-        with connection.socket, suppress(OSError, CellError):
+        with connection.socket, suppress(*FOREIGN):
             while piece := connection.socket.recv(65536):
                 for package in packages.feed(piece):
                     self._answer(connection, package)

@@ -34,6 +34,10 @@ TYPES = {  # struct's letter, and how many of it
 }
 
 
+class HeldError(CellError):
+    """An input that another client writes; it may be one that has just gone, which the controller has not noticed yet."""
+
+
 class Kind(IntEnum):
     """Of a package: the letter that its header names it by."""
 
@@ -128,7 +132,7 @@ def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
         )
     held = [name for name, kind in zip(names, types, strict=True) if kind == IN_USE]
     if held:
-        raise CellError(
+        raise HeldError(
             f"Expected to write {', '.join(held)}, another client of this controller does; close it, or its fieldbus "
             "unit (EtherNet/IP, PROFINET), or choose other registers."
         )

@@ -11,12 +11,13 @@ from itertools import pairwise
 
 from ...errors import CellError
 from .client import RtdeClient
-from .protocol import PORT
+from .protocol import PORT, HeldError
 
 LATE_S = 0.02  # beyond the quickest package's way: ten packages
 CREEP = 0.01  # two clocks drift apart; a controller's is not off by a hundredth
 KEPT_S = 60.0  # of packages, for whoever reads them late
 FRESH_S = 10.0  # an input that is older is not repeated: no controller is off and on again sooner
+RELEASE_S = 2.0  # in which a controller notices that an earlier owner has gone
 RETRY_S = (0.05, 1.0)  # between attempts to connect: the first, and the longest
 
 
@@ -106,10 +107,19 @@ class RtdeStream:
 
     def open(self) -> RtdeStream:
         """Connect and begin to read."""
-        self._client = self._connect()
+        self._client = self._connect_first()
         self.columns = self._client.outputs.columns
         self._thread.start()
         return self
+
+    def _connect_first(self) -> RtdeClient:
+        """The first connection; an owner that has just gone is given time to be noticed as gone."""
+        for _ in range(int(RELEASE_S / RETRY_S[0])):
+            try:
+                return self._connect()
+            except HeldError:
+                self._closing.wait(RETRY_S[0])
+        return self._connect()
 
     def close(self) -> None:
         """Hang up, and end the thread."""
