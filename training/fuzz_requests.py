@@ -4,10 +4,10 @@
 
 Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC, OPC UA and bare TCP. Prints a table by kind: tried;
 refused (a 4xx, a fault, a Bad status); closed (the connection ended, for what is no request at all); waiting (half a
-message: the server waits for the rest); taken (what was only spoilt can still be good). Failed is a 5xx, a redirect or a
-traceback. Afterwards the decisions from before must be what they were, the same traces must be decided on as before, the
-memory must be as it was after the first fifth, and connections that send nothing must have been ended. Exit code 1 if
-anything is not so.
+message: the server waits for the rest); taken (what was only spoilt can still be good, and a view of the page takes any
+query). Failed is a 5xx, a redirect or a traceback. Afterwards the decisions from before must be what they were, the same
+traces must be decided on as before, the memory must be as it was after the first fifth, and connections that send nothing
+must have been ended. Exit code 1 if anything is not so.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 from fuzzing.opc import Conversation
-from fuzzing.web import MAKERS, SAMPLES
+from fuzzing.web import MAKERS, SAMPLES, TOKEN
 
 from dengine import DataEngine, TraceSpec, open_store
 from dengine.checks import toy_traces
@@ -57,6 +57,9 @@ GROWTH = 24.0  # MB that the server may have grown by, over the last four fifths
 SHOWN = 5  # failures of a kind that are printed
 
 
+os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stalls for longer than a cell would wait
+
+
 def serve(store: str) -> None:
     """The server's process: HTTP, XML-RPC, OPC UA and the page, at ports of its own."""
     from dengine.serve.opcua import opcua_server
@@ -78,12 +81,13 @@ def serve(store: str) -> None:
 
 @dataclass
 class Server:
-    """A server's process. web, opc : its ports."""
+    """A server's process. web, opc : its ports.  token : what the page's own forms carry."""
 
     process: subprocess.Popen[str]
     web: int
     opc: int
     log: Path
+    token: bytes = b""
 
     def memory(self) -> float:
         """Its resident memory, in MB."""
@@ -101,7 +105,7 @@ def server(store: Path) -> Iterator[Server]:
         assert process.stdout is not None
         try:
             ports = dict(_port(process.stdout.readline()) for _ in range(2))
-            yield Server(process, ports["web"], ports["opcua"], log)
+            yield Server(process, ports["web"], ports["opcua"], log, _page_token(ports["web"]))
             process.send_signal(signal.SIGTERM)
             assert process.wait(60) == 0, f"it ended with exit code {process.returncode}"
         finally:
@@ -114,6 +118,13 @@ def _port(line: str) -> tuple[str, int]:
     found = re.search(r"^opcua (\d+)|http://[^ ]*:(\d+)", line)
     assert found is not None, f"the server did not say where it listens, but {line!r}"
     return ("opcua", int(found[1])) if found[1] else ("web", int(found[2]))
+
+
+def _page_token(web: int) -> bytes:
+    _, page = exchange(web, b"GET /acts HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    found = re.search(rb'data-token="([\w-]{43})"', page)
+    assert found is not None, "the page's forms carry no token"
+    return found[1]
 
 
 def trained(file: Path) -> None:
@@ -190,9 +201,11 @@ def _complete(said: bytes) -> bool:
     return len(body) >= int(head.lower().partition(b"content-length: ")[2].partition(b"\r\n")[0])
 
 
-def over_web(kind: str, port: int, rng: random.Random) -> tuple[str, bytes]:
+def over_web(kind: str, at: Server, rng: random.Random) -> tuple[str, bytes]:
     """An attempt over HTTP, XML-RPC or TCP."""
-    status, said = exchange(port, MAKERS[kind](rng), whole=kind != "bytes" and kind != "head")
+    status, said = exchange(
+        at.web, MAKERS[kind](rng).replace(TOKEN.encode(), at.token), whole=kind != "bytes" and kind != "head"
+    )
     if 300 <= status < 400 or status >= 500 or b"Traceback" in said:
         return "failed", said
     if status in (0, -1):
@@ -210,13 +223,13 @@ def over_opcua(conversation: Conversation, rng: random.Random) -> tuple[str, byt
 
 def attempt(kind: str, at: Server, conversation: Conversation, rng: random.Random) -> tuple[str, bytes]:
     """One malformed request; its outcome, and what was answered."""
-    return over_opcua(conversation, rng) if kind == "opcua" else over_web(kind, at.web, rng)
+    return over_opcua(conversation, rng) if kind == "opcua" else over_web(kind, at, rng)
 
 
-def slow_ones(port: int) -> list[socket.socket]:
+def slow_ones(port: int, n: int) -> list[socket.socket]:
     """Connections that send half a head, and nothing more."""
     begun = []
-    for _ in range(SLOW):
+    for _ in range(n):
         connection = socket.create_connection(("127.0.0.1", port), timeout=WAIT)
         connection.sendall(b"POST /decide HTTP/1.1\r\nHost: localhost\r\n")
         begun.append(connection)
@@ -247,14 +260,14 @@ def _more(connection: socket.socket) -> bool:
         return False
 
 
-def fuzz(n: int, seed: int, folder: Path) -> tuple[dict[str, Counter[str]], list[str]]:
-    """Try n requests; outcomes by kind, and what is not as it must be."""
+def fuzz(n: int, seed: int, folder: Path, slow: int = SLOW) -> tuple[dict[str, Counter[str]], list[str]]:
+    """Try n requests; outcomes by kind, and what is not as it must be. slow : connections that send half a head."""
     file, wrong = folder / "cell.db", list[str]()
     trained(file)
     before, order = decisions(file), _order(n, seed)
     found = {kind: Counter[str]() for kind in SHARES}
     with server(file) as at:
-        conversation, probes, slow = Conversation(at.opc), probed(at.web, "before"), slow_ones(at.web)
+        conversation, probes, begun = Conversation(at.opc), probed(at.web, "before"), slow_ones(at.web, slow)
         memory = 0.0
         for i, kind in enumerate(order):
             if i == n // 5:
@@ -269,7 +282,7 @@ def fuzz(n: int, seed: int, folder: Path) -> tuple[dict[str, Counter[str]], list
         wrong += [f"the server is not well: {said!r}"] if status != 200 or b'"ok"' not in said else []
         wrong += ["the same traces are decided on differently"] if probed(at.web, "after") != probes else []
         wrong += [f"the server has grown by {grown:.1f} MB"] if grown > GROWTH else []
-        wrong += [f"{left} slow connections were not ended"] if (left := still_open(slow)) else []
+        wrong += [f"{left} slow connections were not ended"] if (left := still_open(begun)) else []
     return found, wrong + _changed(before, decisions(file), found, at.log)
 
 

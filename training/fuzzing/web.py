@@ -24,10 +24,41 @@ IDS: list[Any] = ["", "a\nb", "\0", "x" * 500, "\x1b[31m", "é" * 201, 5, 1.5, T
 PATHS = [
     *("/", "//", "/../../etc/passwd", "/decisions/..%2f..%2fetc%2fpasswd", "/decisions/%00", "/decisions/" + "x" * 3000),
     *("/decisions/';DROP TABLE decision;--", "/decide/", "/DECIDE", "/report?x=" + "y" * 5000, "/%ff%fe", "/api/none"),
-    *("/static/../../secret", "/static/%2e%2e/%2e%2e/x", "/RPC2/wrong", "/RPC2?token=wrong", "/.env", "/api/label"),
+    *(
+        "/page/static/../../acts.py",
+        "/page/static/%2e%2e/%2e%2e/x",
+        "/RPC2/wrong",
+        "/RPC2?token=wrong",
+        "/.env",
+        "/page/static/..%2fx",
+    ),
     *("/decisions?limit=-1", "/decisions?limit=1e9", "/decisions?open=maybe", "/decisions?limit=%00"),
 ]
-API = ["/api/state", "/api/map", "/api/history", "/api/part", "/api/correct", "/api/rollback", "/api/shadow", "/events"]
+TOKEN = "@" * 43  # in the place of the token that the page's own forms carry
+ACTS = ["correct", "rollback", "shadow-on", "shadow-off", "retrain", "export", "none", "..%2f", "%00"]
+FIELDS = [  # of a form: none of them is whole
+    *(
+        "",
+        "author=",
+        "author=%00",
+        "author=" + "x" * 300,
+        "a=b&" * 50,
+        "author=%E2%80%AE",
+    ),
+    *("author=kim&id=unknown&label=good", "author=kim&id=&label=good", "author=kim&version=-1", "author=kim&version=x"),
+    *("author=kim&version=" + "9" * 6000, "author=kim&version=%D9%A1", "author=kim&id=known-0&label=maybe"),
+]
+VIEWS = [
+    "/part?id=",
+    "/map?id=",
+    "/history?id=",
+    "/history?from=",
+    "/history?page=",
+    "/history?action=",
+    "/how?last=",
+    "/?x=",
+]
+ODD = ["", "%00", "x" * 900, "%ff", "';--", "<script>", "-1", "1e999", "9" * 5000, "%0d%0aSet-Cookie:a=b", "../../x"]
 METHODS = ["PUT", "DELETE", "PATCH", "TRACE", "CONNECT", "BREW", "get", "PROPFIND"]
 
 
@@ -180,11 +211,21 @@ def as_xml(rng: random.Random) -> bytes:
 
 
 def as_page(rng: random.Random) -> bytes:
-    """What the page's own requests are not."""
-    path = rng.choice(API) + rng.choice(("", "/x", "/..%2f", "?id=%00", "?id=" + "x" * 900))
-    body = rng.choice((b"", b"{}", b"[]", b"{", b"id=1&success=maybe", rng.randbytes(50)))
-    heads = (rng.choice(("Origin: http://evil.example", "Sec-Fetch-Site: cross-site", "Cookie: " + "a=b;" * 200)),)
-    return request(body, path, rng.choice((JSON, "application/x-www-form-urlencoded", "a/b")), "POST", heads)
+    """What the page's own requests are not: acts with wrong forms, of others, without the token; views of nothing."""
+    form, act = rng.choice(FIELDS), rng.choice(ACTS)
+    kind, own = "application/x-www-form-urlencoded", "Origin: http://localhost"
+    match rng.randrange(5):
+        case 0 | 1:
+            wrong = act if "author=kim" not in form or act in ("correct", "rollback") else "none"
+            return request(f"token={TOKEN}&{form}".encode(), f"/acts/{wrong}", kind, heads=(own,))
+        case 2:
+            heads = ("Origin: http://evil.example", "Sec-Fetch-Site: cross-site", "Cookie: " + "a=b;" * 200)
+            return request(b"author=kim", f"/acts/{act}", kind, heads=(rng.choice(heads),))
+        case 3:
+            body = rng.choice((b"token=x&author=kim", b"{}", rng.randbytes(60), b"&" * 5000, b"author=kim&" * 40))
+            return request(body, f"/acts/{act}", kind, heads=(own,))
+        case _:
+            return request(b"", rng.choice(VIEWS) + rng.choice(ODD), kind, "GET")
 
 
 def as_bytes(rng: random.Random) -> bytes:

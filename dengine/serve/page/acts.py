@@ -117,7 +117,11 @@ class Acts:
             body += chunk
             if len(body) > LARGEST:
                 raise RefusedError(413, w("act.refused"))
-        form = {key: values[-1] for key, values in parse_qs(body.decode("utf-8", "replace"), max_num_fields=20).items()}
+        try:
+            fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=20)
+        except ValueError as error:  # more fields than that
+            raise RefusedError(413, w("act.refused")) from error
+        form = {key: values[-1] for key, values in fields.items()}
         if not secrets.compare_digest(form.get("token", "").encode(), self.token.encode()):
             raise RefusedError(403, w("act.refused"))
         return form
