@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from importlib import import_module
-from importlib.util import find_spec
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.routing import BaseRoute
 
 from .access import Access
+from .calls import Recorder
 from .guard import Guard
 from .problems import HANDLERS
 from .service import CellService
@@ -30,14 +30,16 @@ def create_app(
     access: Access | None = None,
     interfaces: Sequence[str] = INTERFACES,
     beside: Sequence[Beside] = (),
+    recorder: Recorder | None = None,
 ) -> Starlette:
     """The application; whoever made the service closes it, once the application has ended.
 
     access : who may ask, and how much; None: whoever is on this machine.
     interfaces : modules of this package that answer.
     beside : what runs in the same loop as long as the application does, an OPC UA server for one.
+    recorder : of what a robot's program does not send itself, for XML-RPC; whoever opened it closes it.
     """
-    routes: list[BaseRoute] = [route for name in interfaces for route in routes_of(name, service)]
+    routes: list[BaseRoute] = [route for name in interfaces for route in routes_of(name, service, recorder)]
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -54,8 +56,8 @@ def create_app(
     return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
 
 
-def routes_of(name: str, service: CellService) -> Sequence[BaseRoute]:
+def routes_of(name: str, service: CellService, recorder: Recorder | None = None) -> Sequence[BaseRoute]:
     """The routes of one interface."""
-    module = f"{__package__}.{name}"
-    found: Sequence[BaseRoute] = import_module(module).routes(service) if find_spec(module) else ()
+    options = {"recorder": recorder} if name == "xmlrpc" else {}
+    found: Sequence[BaseRoute] = import_module(f"{__package__}.{name}").routes(service, **options)
     return found

@@ -10,8 +10,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,6 +23,7 @@ from ..errors import SettingError
 from ..records import RetrainReport
 from .access import Access, is_loopback, read_token
 from .app import INTERFACES, Beside, create_app
+from .calls import Recorder
 from .connections import limited
 from .logs import log_lines_to
 from .retraining import retraining_process
@@ -41,6 +42,8 @@ class Serving:
     token_file : of the token; None only where no other machine reaches the server.
     cert, key : PEM files; None: no TLS.
     allow_hosts : names by which the server is called, beside localhost.
+    opcua : the port of OPC UA, with the same token and TLS; None: none.  beside : as `create_app` takes it.
+    recorder : of the insertions of a robot that does not send its force itself; opened before the engine.
     """
 
     host: str = "127.0.0.1"
@@ -54,7 +57,9 @@ class Serving:
     rate: float = Access().rate
     connections: int = 100
     interfaces: Sequence[str] = INTERFACES
-    beside: Sequence[Beside] = field(default=())
+    opcua: int | None = None
+    beside: Sequence[Beside] = ()
+    recorder: AbstractContextManager[Recorder] | None = None
 
     def access(self) -> Access:
         """Who may ask; SettingError where other machines reach the server and it has no token."""
@@ -65,6 +70,15 @@ class Serving:
         token = "" if self.token_file is None else read_token(self.token_file)
         names = () if is_loopback(self.host) else (self.host, socket.gethostname())
         return Access(token, (*names, *self.allow_hosts), self.largest, rate=self.rate, burst=max(1, int(2 * self.rate)))
+
+    def all_beside(self, access: Access) -> list[Beside]:
+        """What runs in the same loop: OPC UA, where it is asked for."""
+        if (port := self.opcua) is None:
+            return [*self.beside]
+        from .opcua import opcua_server
+
+        who = (self.host, access.token or None, self.cert, self.key)
+        return [*self.beside, lambda service: opcua_server(service, port, *who)]
 
     def address(self, port: int) -> str:
         """Where it is reached."""
@@ -87,11 +101,12 @@ def serve(
         log_lines_to(sys.stderr),
         quick_switches(),
         retraining_process() as executor,
+        serving.recorder or nullcontext() as recorder,
     ):
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
-            app = create_app(service, access, serving.interfaces, serving.beside)
+            app = create_app(service, access, serving.interfaces, serving.all_beside(access), recorder)
             config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
