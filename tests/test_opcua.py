@@ -342,6 +342,12 @@ def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService, run)
             run(serve(host="0.0.0.0", **options))
 
 
+def test_the_page_lists_every_variable_as_it_is() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    for name, (type_, _, text) in opcua.VARIABLES.items():
+        assert f"| `Cell.{name}` | {type_.name} | {text} |" in page
+
+
 def test_a_port_in_use_is_an_error(service: CellService, run) -> None:
     async def serve(port: int) -> None:
         async with opcua.opcua_server(service, port=port):

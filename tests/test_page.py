@@ -5,15 +5,17 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 
-from dengine import Action, load_exported
+from dengine import Action, DataEngine, load_exported
 from dengine.recipe import Recipe
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
@@ -31,9 +33,14 @@ def missing(what: str) -> None:
 if CHROMIUM is None:
     missing("Debian's chromium")
 try:
-    import sse_starlette  # noqa: F401  # of the extra `serve`
+    import uvicorn
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+    from dengine.serve.app import create_app
+    from dengine.serve.page import routes  # noqa: F401  # it needs all of the extra `serve`
+    from dengine.serve.server import bound
+    from dengine.serve.service import CellService
 except ImportError as error:
     missing(str(error))
 
@@ -83,7 +90,7 @@ def ended(process: subprocess.Popen) -> None:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DemoCell]:
     folder = tmp_path_factory.mktemp("demo")
-    options = ["--port", "0", "--speed", "2", "--before", "120", "--keep", str(folder / "cell.db")]
+    options = ["--port", "0", "--speed", "1", "--before", "120", "--keep", str(folder / "cell.db")]
     process, url = started([sys.executable, "-m", "dengine", "demo-cell", *options], folder)
     yield DemoCell(url, folder / "cell.db")
     ended(process)
@@ -292,18 +299,32 @@ def test_language_and_appearance_are_chosen_and_remembered(watched: Watched, dem
     expect(page.get_by_role("link", name="Jetzt")).to_have_attribute("aria-current", "page")
 
 
-def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser, tmp_path: Path) -> None:
-    options = ["--port", "0", "--before", "3", "--cycles", "3"]
-    process, url = started([sys.executable, "-m", "dengine", "demo-cell", *options], tmp_path)
+@contextmanager
+def served(service: CellService, port: int = 0) -> Iterator[int]:
+    """A server in a thread of this process; gives its port."""
+    with bound("127.0.0.1", port) as listening:
+        app = create_app(service, interfaces=("page",))
+        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        yield listening.getsockname()[1]
+        server.should_exit = True
+        thread.join()
+
+
+def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser) -> None:
+    service = CellService(lambda: DataEngine("pca"))
     context = browser.new_context(locale="en")
     context.set_default_timeout(PATIENT)
     page = context.new_page()
-    page.goto(url)
-    expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
-    ended(process)
+    with served(service) as port:
+        page.goto(f"http://127.0.0.1:{port}/")
+        expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
+        boot = page.evaluate("document.body.dataset.boot")
     expect(page.locator("#cut")).to_contain_text("What you see is old", timeout=PATIENT)
-    again, _ = started([sys.executable, "-m", "dengine", "demo-cell", *options, "--port", url.rpartition(":")[2]], tmp_path)
-    expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
-    expect(page.locator("#cut")).to_be_hidden()
-    context.close()
-    ended(again)
+    with served(service, port):
+        expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
+        expect(page.locator("#cut")).to_be_hidden()
+        page.wait_for_function("was => document.body.dataset.boot !== was", arg=boot)  # it took the new server's token
+        context.close()
+    service.close()

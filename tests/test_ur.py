@@ -500,22 +500,40 @@ def test_an_order_given_while_there_is_no_connection_is_carried_out_once_there_i
     assert program.played == [0]
 
 
-def test_a_controller_that_was_switched_off_is_not_told_an_old_order_again() -> None:
-    with FakeController(speed=20.0) as fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+def reconnected(fake: FakeController, stream: RtdeStream) -> float | None:
+    """What the order's register holds once the connection was lost and made again."""
+    before = stream.report().reconnects
+    fake.hang_up()
+    while stream.report().reconnects == before:
+        stream.after(stream.position, 0.05)
+    begun = stream.position
+    while stream.position < begun + 50:
+        stream.after(stream.position, WAIT)
+    return fake._inputs.get(ORDER)
+
+
+def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
+    now, order = [0.0], word(7, Verb.INSERT)
+    fake = FakeController(speed=20.0)
+    fake._cycle = 10**6
+    how = {"port": fake.port, "clock": lambda: now[0]}
+    with fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), **how) as stream:
         stream.after(0, WAIT)
-        stream.write((word(7, Verb.INSERT),))
-        while fake._inputs.get(ORDER) != word(7, Verb.INSERT):
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
+            stream.after(stream.position, WAIT)
+        fake._inputs.clear()  # as if it had been lost on the way
+        assert reconnected(fake, stream) == order
+        fake._inputs.clear()
+        now[0] = 11.0
+        assert reconnected(fake, stream) is None
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
             stream.after(stream.position, WAIT)
         with fake._lock:  # off and on
             fake._inputs.clear()
             fake._begin = fake._cycle
-        fake.hang_up()
-        while stream.report().reconnects == 0:
-            stream.after(stream.position, 0.05)
-        begun = stream.position
-        while stream.position < begun + 50:
-            stream.after(stream.position, WAIT)
-        assert fake._inputs.get(ORDER) is None
+        assert reconnected(fake, stream) is None
 
 
 # From the shell.
@@ -540,6 +558,27 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dat
         kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
         assert engine.store.status()["decisions"] == 15
     assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
+
+
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts: Dataset, tmp_path: Path
+) -> None:
+    program, store = RobotProgram((parts.X[:10], parts.y[:10])), str(tmp_path / "cell.db")  # then its bin is empty
+    with FakeController(program, speed=None) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "14")
+        said = " ".join(done.output.split())
+        assert done.exit_code == 1
+        assert "1 to 10 100 %" in said
+        assert (
+            "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14 cycles were done."
+            in said
+        )
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in said
+        program.played.clear()  # somebody has filled it
+        assert run(*words[:-2], "--cycles", "4").exit_code == 0
+    with DataEngine.open(store) as engine:
+        assert engine.store.status()["decisions"] == 14
 
 
 @pytest.mark.parametrize(

@@ -312,3 +312,9 @@ def test_every_call_takes_as_many_arguments_as_it_says(cell: Cell) -> None:
         least = sum(p.default is p.empty for p in taken)
         assert most == len(taken), name
         assert fewest == least or (name.startswith("action") and fewest == least + 1), name
+
+
+def test_the_page_names_every_call(cell: Cell) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    for name in RobotCalls(cell.service).table():
+        assert f"`{name}" in page

@@ -6,9 +6,9 @@ The data are cut, shuffled, into disjoint sets of so many parts. On each a curve
 `dengine costs` does, with either half of the shuffles choosing; what that policy costs elsewhere is its mean over the
 replays of all other sets, which played no role in the choice. Writes cost_choice.csv to --out.
 
-expected, reported, elsewhere : cost a part of the cheapest policy.  within : choices whose interval holds `elsewhere`.
-taken : elsewhere, by the policy that was chosen, or by verifying everything where none was.  best : by the policy that is
-best elsewhere.  decides : choices that name a policy.
+expected, reported, elsewhere : cost a part of the cheapest policy.  taken : elsewhere, by the policy that was chosen, or by
+verifying everything where none was.  best : by the policy that is best elsewhere.  pays, may pay : choices that say so.
+above, below : of these, how often `elsewhere` was above or below the interval.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ def choices(sets: Sequence[Sequence[Replay]], costs: Costs) -> Iterator[dict[str
             told = {"check": costs.check, "escape": costs.escape, "false_reject": costs.false_reject, "set": i}
             said = {"verdict": curve.verdict, "alpha": row.policy.alpha, "lower_bound": row.policy.lower_bound}
             cost = {"expected": row.chosen_by, "reported": row.cost, "elsewhere": elsewhere[row.policy]}
-            within = row.lower <= elsewhere[row.policy] <= row.upper
+            missed = {"above": elsewhere[row.policy] > row.upper, "below": elsewhere[row.policy] < row.lower}
+            missed = {name: policy is not None and miss for name, miss in missed.items()}
             taken = costs.check if policy is None else elsewhere[policy]
-            yield told | said | cost | {"within": within, "taken": taken, "best": min(costs.check, *elsewhere.values())}
+            yield told | said | cost | missed | {"taken": taken, "best": min(costs.check, *elsewhere.values())}
 
 
 def mean_cost(replays: Sequence[Replay], policy: Policy, costs: Costs) -> float:
@@ -79,10 +80,10 @@ def main() -> None:
     table = pd.DataFrame([row for costs in prices for row in choices(sets, costs)])
     args.out.mkdir(parents=True, exist_ok=True)
     table.to_csv(args.out / "cost_choice.csv", index=False)
-    shown = table.groupby("escape")[["expected", "reported", "elsewhere", "within", "taken", "best"]].mean().round(2)
-    shown["decides"] = (
-        table.assign(no=table.verdict == "does not pay").groupby("escape")["no"].agg(lambda no: int((~no).sum()))
-    )
+    shown = table.groupby("escape")[["expected", "reported", "elsewhere", "taken", "best"]].mean().round(2)
+    for verdict in ("pays", "may pay"):
+        shown[verdict] = (table.verdict == verdict).groupby(table.escape).sum()
+    shown = shown.join(table.groupby("escape")[["above", "below"]].sum())
     of = f"{len(sets)} sets of {args.parts} parts, {args.repeats} shuffles, {2 * len(sets)} choices"
     print(f"{args.data}, {args.recipe}: {of}")
     print(shown.to_string())

@@ -229,7 +229,7 @@ def data_options(default: str | None = "insertion") -> Callable[[Command], Comma
         "--data",
         metavar="NAME|FILE|FOLDER",
         help="The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv "
-        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); or a store's file, .db.",
+        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db.",
         **shown,
     )
     return lambda command: option(reading_options(command))

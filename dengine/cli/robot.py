@@ -11,33 +11,12 @@ from ..errors import SettingError
 
 if TYPE_CHECKING:
     from ..cells.ur.cell import UrCell
-    from ..cells.ur.recorder import RtdeRecorder
     from .options import DataChoice
 
 SAMPLES, RATE_HZ = 1000, 500.0  # of a trace, where nothing else was asked for: two seconds
 
 
 host_option = click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
-
-
-def recorder_of(address: str | None, trigger: str | None, samples: int) -> RtdeRecorder | None:
-    """What records a robot's insertions for `dengine serve`; None where no robot was named. It is not open yet."""
-    if address is None:
-        return None
-    from ..cells.ur.protocol import PORT
-    from ..cells.ur.recorder import RtdeRecorder
-
-    host, port = host_and_port(address)
-    how: dict[str, Any] = {"trigger": trigger} if trigger else {}
-    return RtdeRecorder(host, samples=samples, port=port or PORT, **how)
-
-
-def host_and_port(address: str) -> tuple[str, int | None]:
-    """The two of host:port; None where there is no port. SettingError for what is neither."""
-    host, _, port = address.partition(":")
-    if port and not (port.isascii() and port.isdecimal()):
-        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
-    return host, int(port) if port else None
 
 
 def open_robot(address: str | None, source: DataChoice) -> UrCell:
@@ -48,11 +27,13 @@ def open_robot(address: str | None, source: DataChoice) -> UrCell:
 
     if not address:
         raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
-    host, port = host_and_port(address)
+    host, _, port = address.partition(":")
+    if port and not port.isdecimal():
+        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
     how: dict[str, Any] = {"samples": source.samples or SAMPLES, "rate_hz": source.rate_hz or RATE_HZ}
     how |= {"trigger": source.trigger} if source.trigger else {}
     how |= {"channels": names_of(source.channel)} if source.channel else {}
-    return UrCell(host, port=port or PORT, **how).open()
+    return UrCell(host, port=int(port) if port else PORT, **how).open()
 
 
 def recording_record(cell: Any) -> dict[str, Any] | None:

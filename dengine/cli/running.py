@@ -10,6 +10,7 @@ from zlib import crc32
 
 import click
 
+from ..errors import CellError
 from .interrupting import EndAskedError, end_interrupted, interruptible
 from .naming import cell_options
 from .options import (
@@ -92,11 +93,13 @@ def run(
             engine.set_shadow(True)
         cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
         opened.callback(getattr(cell, "close", lambda: None))
-        log, changes = _drive(engine, cell, cycles, name, as_json)
+        log, changes, failure = _drive(engine, cell, cycles, name, as_json)
         told = Told(changes, engine.safe_mode, engine.certificate())
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
         _report(log, told, cell, kind, title, cycles, out, as_json)
+    if failure is not None:
+        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {_kept(len(log), cycles, store)}") from failure
     if len(log) < cycles:
         _say_interrupted(len(log), cycles, store)
 
@@ -124,7 +127,10 @@ class Told:
     certificate: Certificate
 
 
-def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) -> tuple[RunLog, list[ModeChange]]:
+def _drive(
+    engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
+) -> tuple[RunLog, list[ModeChange], CellError | None]:
+    """What was done, and what ended it, where the cell failed: what was done before that is shown first."""
     from ..experiments.live import RunRecorder
 
     recorder, changes, mode = RunRecorder(cell), list[ModeChange](), engine.safe_mode
@@ -142,19 +148,23 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) 
                 raise EndAskedError
 
         # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
-        with suppress(EndAskedError, KeyboardInterrupt):
-            recorder.follow(engine, cycles, count)
-    return recorder.log(), changes
+        try:
+            with suppress(EndAskedError, KeyboardInterrupt):
+                recorder.follow(engine, cycles, count)
+        except CellError as error:
+            return recorder.log(), changes, error
+    return recorder.log(), changes, None
 
 
 def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
     shown = "the table shows those" if done else "there is nothing to show"
-    kept = f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
-    forgotten = "Nothing was stored: --store FILE keeps a run, and goes on with it."
-    end_interrupted(
-        f"Interrupted: {done} of {cycles} cycles were done; {shown}.",
-        forgotten if store is None else kept,
-    )
+    end_interrupted(f"Interrupted: {done} of {cycles} cycles were done; {shown}.", _kept(done, cycles, store))
+
+
+def _kept(done: int, cycles: int, store: str | None) -> str:
+    if store is None:
+        return "Nothing was stored: --store FILE keeps a run, and goes on with it."
+    return f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
 
 
 def _simulated(

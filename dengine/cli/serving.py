@@ -1,8 +1,8 @@
-"""`dengine serve`: one engine behind HTTP, XML-RPC, OPC UA and a page."""
+"""`dengine serve`: one engine behind HTTP, XML-RPC and a page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,6 @@ import click
 from ..errors import SettingError
 from .naming import cell_options
 from .options import RecipeChoice, example, recipe_options
-from .robot import recorder_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -56,11 +55,15 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as a robot's program speaks it."
 )
-@click.option("--opcua", type=click.IntRange(0, 65535), metavar="PORT", help="OPC UA at this port too; 4840 is usual.")
-@click.option("--robot", metavar="HOST[:PORT]", help="Records insertions of this Universal Robots controller, for XML-RPC.")
-@click.option("--trigger", metavar="TEXT", help="When an insertion begins, for --robot.  [default: an output register]")
-@click.option("--samples", type=click.IntRange(2), default=1000, show_default=True, help="Of a recording, for --robot.")
 @click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
+@click.option(
+    "--opcua", type=click.IntRange(1, 65535), metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840."
+)
+@click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
+@click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
+@click.option("--robot", metavar="HOST", help="Record the force of this Universal Robots controller, for XML-RPC.")
+@click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
+@click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
 @recipe_options
 def serve(
@@ -70,7 +73,7 @@ def serve(
     xmlrpc: bool,
     page: bool,
     robot: str | None,
-    trigger: str | None,
+    trigger: str,
     samples: int,
     seed: int | None,
     **how: Any,
@@ -81,11 +84,8 @@ def serve(
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
     machines reach it only with --host, which wants --token-file, and should have --cert and --key.
     """
-    must_have_serve((*NEEDED, *(PAGE if page else ())))
-    if how["opcua"] is not None:
-        must_have_serve(("asyncua",), "opcua")
-    if (trigger is not None) and robot is None:
-        raise click.UsageError("--trigger says when a recording begins: name the robot, --robot HOST.")
+    must_have_serve(*(["asyncua"] if how["opcua"] else []), *(PAGE if page else []))
+    from ..cells import RtdeRecorder
     from ..engine import DataEngine
     from ..serve.server import Serving, tell_safe_mode
     from ..serve.server import serve as serve_cell
@@ -98,12 +98,12 @@ def serve(
         return engine
 
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
-    serve_cell(
-        make, store, Serving(interfaces=interfaces, recorder=recorder_of(robot, trigger, samples), **how), click.echo
-    )
+    recorder = partial(RtdeRecorder, robot, trigger, samples) if robot else None
+    serve_cell(make, store, Serving(interfaces=interfaces, recorder=recorder, **how), click.echo)
 
 
-def must_have_serve(needed: Sequence[str] = NEEDED, extra: str = "serve") -> None:
+def must_have_serve(*beside: str) -> None:
     """SettingError where the server cannot run; asked before anything is made or begun."""
-    if missing := [name for name in needed if find_spec(name) is None]:
-        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[{extra}]".')
+    if missing := [name for name in (*NEEDED, *beside) if find_spec(name) is None]:
+        extras = "serve,opcua" if "asyncua" in missing else "serve"
+        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[{extras}]".')

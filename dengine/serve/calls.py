@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..deciding import as_decision
-from ..errors import BusyError, DengineError, ReportError, SettingError, StoreError, TraceError
+from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError
 from ..labels import as_id
 from ..records import ACTIONS, Action, Decision
 from ..wording import shortened
@@ -174,14 +174,12 @@ class RobotCalls:
         recorded, where the server is busy, or where its store is away.
         """
         try:
+            if await self._service.find(decision_id) is None:
+                return False
             await self._service.report(decision_id, success)
         except (BusyError, StoreError) as error:
             log.warning("a report on %s was not kept: %s", shortened(decision_id), error)
             return False
-        except ReportError:
-            if await self._known(decision_id) is None:
-                return False
-            raise
         return True
 
     async def status(self) -> Answered:

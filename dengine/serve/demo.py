@@ -15,11 +15,16 @@ from ..records import Action, Outcome
 from .service import CellService
 
 CHECK = 0.4  # of a cycle, after which a verified part's result is there
+READY = 0.05  # seconds between two looks at whether a retrain is done
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """How fast parts come.  before : parts that come as fast as they can.  a_second : parts a second, after these."""
+    """How fast parts come.
+
+    before : parts that come as fast as they can, but for retrains: no model would be ready before all were verified.
+    a_second : parts a second, after these.
+    """
 
     before: int
     a_second: float
@@ -44,6 +49,8 @@ async def drive(service: CellService, cell: Cell, pace: Pace, cycles: int) -> in
         if success is not None:
             await service.report(answer.decision.id, success)
         await asyncio.sleep(due - loop.time())
+        while cycle < pace.before and service.engine.retraining:
+            await asyncio.sleep(READY)
     return decided
 
 

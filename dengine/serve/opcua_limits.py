@@ -20,6 +20,7 @@ from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.internal_server import InternalServer
 from asyncua.server.server import Server
 from asyncua.ua import ua_binary
+from asyncua.ua.status_codes import StatusCodes
 from asyncua.ua.uaerrors import UaError
 
 log = logging.getLogger("dengine")
@@ -76,19 +77,23 @@ class BoundedProtocol(OPCUAProtocol):
         super().data_received(data)
         if len(self._buffer) > MOST or int.from_bytes(self._buffer[4:8], "little") > MOST:
             log.warning("an OPC UA message is too long; the connection is closed")
-            self._end()
+            self._end(StatusCodes.BadTcpMessageTooLarge)
 
-    def _end(self) -> None:
+    def _end(self, code: int) -> None:
+        """Say why, and hang up."""
         self._buffer = b""
-        if self.transport is not None:
-            self.transport.abort()
+        if self.transport is not None and not self.transport.is_closing():
+            said = ua.ErrorMessage(ua.StatusCode(ua.UInt32(code)), ua.String("refused"))
+            kind: Any = ua.MessageType.Error  # bytes, which their types call something else
+            self.transport.write(ua_binary.uatcp_to_binary(kind, said))
+            self.transport.close()
 
     async def _process_one_msg(self, header: Any, buf: Any) -> bool:
         try:
             return await super()._process_one_msg(header, buf)
         except Exception as error:  # whatever a malformed message does to its readers, it is malformed
             log.info("an OPC UA message could not be read (%s); the connection is closed", type(error).__name__)
-            self._end()
+            self._end(StatusCodes.BadDecodingError)
             return False
 
 

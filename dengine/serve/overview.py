@@ -65,6 +65,7 @@ def alarm(engine: DataEngine, doing: Standing) -> str:
     """What somebody should look at, the worst first; "" where there is nothing."""
     accepts = doing.newest.bad_accepts
     said = (
+        f"The store cannot be written: {engine.store_fault}" if engine.store_fault else "",
         f"Safe mode: {engine.safe_mode}" if engine.safe_mode else "",
         f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows." if broken(doing) else "",
         f"The model failed on {doing.newest.errors} of the newest decisions." if doing.newest.errors else "",

@@ -11,7 +11,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -42,8 +43,9 @@ class Serving:
     token_file : of the token; None only where no other machine reaches the server.
     cert, key : PEM files; None: no TLS.
     allow_hosts : names by which the server is called, beside localhost.
-    opcua : the port of OPC UA, with the same token and TLS; None: none.  beside : as `create_app` takes it.
-    recorder : of the insertions of a robot that does not send its force itself; opened before the engine.
+    opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
+    opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
+    recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
     """
 
     host: str = "127.0.0.1"
@@ -57,9 +59,11 @@ class Serving:
     rate: float = Access().rate
     connections: int = 100
     interfaces: Sequence[str] = INTERFACES
+    beside: Sequence[Beside] = field(default=())
     opcua: int | None = None
-    beside: Sequence[Beside] = ()
-    recorder: AbstractContextManager[Recorder] | None = None
+    opcua_cert: Path | None = None
+    opcua_key: Path | None = None
+    recorder: Callable[[], AbstractContextManager[Recorder]] | None = None
 
     def access(self) -> Access:
         """Who may ask; SettingError where other machines reach the server and it has no token."""
@@ -70,15 +74,6 @@ class Serving:
         token = "" if self.token_file is None else read_token(self.token_file)
         names = () if is_loopback(self.host) else (self.host, socket.gethostname())
         return Access(token, (*names, *self.allow_hosts), self.largest, rate=self.rate, burst=max(1, int(2 * self.rate)))
-
-    def all_beside(self, access: Access) -> list[Beside]:
-        """What runs in the same loop: OPC UA, where it is asked for."""
-        if (port := self.opcua) is None:
-            return [*self.beside]
-        from .opcua import opcua_server
-
-        who = (self.host, access.token or None, self.cert, self.key)
-        return [*self.beside, lambda service: opcua_server(service, port, *who)]
 
     def address(self, port: int) -> str:
         """Where it is reached."""
@@ -101,12 +96,13 @@ def serve(
         log_lines_to(sys.stderr),
         quick_switches(),
         retraining_process() as executor,
-        serving.recorder or nullcontext() as recorder,
+        serving.recorder() if serving.recorder else nullcontext() as recorder,
     ):
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
-            app = create_app(service, access, serving.interfaces, serving.all_beside(access), recorder)
+            beside = (*serving.beside, *_opcua(serving, access))
+            app = create_app(service, access, serving.interfaces, beside, recorder)
             config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
@@ -114,6 +110,16 @@ def serve(
             _run(server, listening, app.state)
         finally:
             service.close()
+
+
+def _opcua(serving: Serving, access: Access) -> list[Beside]:
+    """What speaks OPC UA, where it is asked for."""
+    if serving.opcua is None:
+        return []
+    from .opcua import opcua_server
+
+    token, cert, key = access.token or None, serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
+    return [partial(opcua_server, port=serving.opcua, host=serving.host, token=token, cert=cert, key=key)]
 
 
 def uvicorn_options(serving: Serving) -> dict[str, Any]:

@@ -53,8 +53,8 @@ def _rollback(engine: DataEngine, form: Form, author: str) -> bool:
 
 
 def _retrain(engine: DataEngine, form: Form, author: str) -> bool:
-    report = engine.retrain()
-    engine.store.put_event("retrain", f"asked for on the page: {report.reason}", {"version": report.version}, author)
+    engine.store.put_event("retrain", "asked for on the page", author=author)
+    engine.start_retrain()
     return True
 
 

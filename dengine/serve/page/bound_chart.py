@@ -29,7 +29,7 @@ def bound_chart(bound: Bound, w: Words) -> Markup:
         accept=w.percent(accept, 1),
         reject=w.percent(reject, 1),
     )
-    marks = [value for value in (reject, accept) if value is not None]
+    marks = [(sign, value) for sign, value in (("✕ ≤", reject), ("✓ ≥", accept)) if value is not None]
     return picture(
         WIDTH, HEIGHT, alt, _axis(x), *zones, *_interval(x, bound.lower, bound.upper), *_values(x, marks, w), class_="bound"
     )
@@ -43,7 +43,7 @@ def bad_chart(bad: BadAccepts, w: Words) -> Markup:
     kept = _zone(x, 0.0, bad.tolerance, "zone accept")
     bar = _interval(x, bad.lower, bad.upper)
     return picture(
-        WIDTH, HEIGHT, w("alt.bad", **said), _axis(x), kept, *bar, *_values(x, [bad.tolerance], w), class_="bound"
+        WIDTH, HEIGHT, w("alt.bad", **said), _axis(x), kept, *bar, *_values(x, [("≤", bad.tolerance)], w), class_="bound"
     )
 
 
@@ -62,18 +62,10 @@ def _interval(x: Scale, lower: float, upper: float) -> list[Markup]:
     return [bar, *ends]
 
 
-def _values(x: Scale, values: list[float], w: Words) -> list[Markup]:
-    """The thresholds under their places, and the ends of the axis where there is room."""
-    far = [each for each in (x.low, x.high) if all(abs(x.at(each) - x.at(value)) > 70 for value in values)]
-    told = [(value, "middle strong") for value in values] + [(each, "start" if each == x.low else "end") for each in far]
-    return [
-        element(
-            "text",
-            w.percent(value),
-            x=min(max(x.at(value), 26.0 if "middle" in kind else 16.0), WIDTH - 26.0) if "middle" in kind else x.at(value),
-            y=HEIGHT - 10,
-            class_=kind,
-            aria_hidden="true",
-        )
-        for value, kind in told
-    ]
+def _values(x: Scale, values: list[tuple[str, float]], w: Words) -> list[Markup]:
+    """The thresholds, each with its sign, under their places; and the ends of the axis where there is room."""
+    places = [min(max(x.at(value), x.begin + 44), x.end - 44) for _, value in values]
+    told = [(f"{sign} {w.percent(value)}", at, "middle strong") for (sign, value), at in zip(values, places, strict=True)]
+    ends = ((x.low, x.begin, "start"), (x.high, x.end, "end"))
+    told += [(w.percent(end), at, kind) for end, at, kind in ends if all(abs(at - place) > 110 for place in places)]
+    return [element("text", text, x=at, y=HEIGHT - 8, class_=kind, aria_hidden="true") for text, at, kind in told]

@@ -16,7 +16,7 @@ from .looking import Looking
 from .trace_chart import TraceView
 from .words import Words
 
-RECENT = 24  # parts in the strip of the newest
+RECENT = 14  # parts in the strip of the newest
 BADS, AMONG = 10, 200  # newest bad parts that are drawn, of so many newest labels
 FRESH = 10  # new labels, after which the bad parts are looked up again
 

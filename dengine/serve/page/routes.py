@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from functools import wraps
-from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from sse_starlette.sse import EventSourceResponse
@@ -17,10 +16,10 @@ from ..service import CellService
 from . import bound_chart, course_chart, map_chart, trace_chart
 from .acts import Acts
 from .history_view import HistoryQuery, history_query, history_view
-from .how_view import how_view, mode_of
+from .how_view import PACE, HowView, how_view, mode_of
 from .looking import Looking
 from .map_view import map_view
-from .part_view import now_view, part_name, part_view, story, why
+from .part_view import PartView, now_view, part_name, part_view, story, why
 from .pulse import Pulse
 from .templating import STATIC, page
 from .words import CATALOGUES, Words, language
@@ -76,13 +75,11 @@ class LivePage:
     async def now(self, request: Request) -> Response:
         """What happens now."""
         view = await self._looking.look("now", now_view)
-        return self._page(request, "now", now=view)
+        return self._page(request, "now", now=view, how=await self._how())
 
     async def how(self, request: Request) -> Response:
         """How it is doing."""
-        seconds = self._check_seconds
-        view = await self._looking.look("how", lambda looking: how_view(looking, seconds))
-        return self._page(request, "how", how=view, check_seconds=seconds)
+        return self._page(request, "how", how=await self._how())
 
     async def map(self, request: Request) -> Response:
         """The map, and beside it the part that was chosen."""
@@ -119,7 +116,10 @@ class LivePage:
         """Server-sent events: that something changed, and what lets a page see that it is cut off."""
         return EventSourceResponse(self._pulse.events(), headers={"cache-control": "no-store"}, ping=3600)
 
-    async def _part(self, decision_id: str) -> Any:
+    async def _how(self) -> HowView:
+        return await self._looking.look("how", lambda looking: how_view(looking, self._check_seconds))
+
+    async def _part(self, decision_id: str) -> PartView | None:
         return await self._looking.look(("part", decision_id), lambda looking: part_view(looking, decision_id))
 
     def _page(self, request: Request, view: str, status: int = 200, **values: object) -> Response:
@@ -139,6 +139,8 @@ class LivePage:
             "cell": self._looking.store.cell_id,
             "mode": mode,
             "mode_reason": reason,
+            "check_seconds": self._check_seconds,
+            "pace_over": PACE,
         }
         return page(f"{view}.html", status, **about, **DRAWING, **values)
 
