@@ -426,42 +426,66 @@ def test_a_controller_that_died_finds_its_open_decision_after_a_restart(tmp_path
 
 
 def start(folder: Path, *words: str) -> tuple["subprocess.Popen[str]", str]:
-    """`dengine serve` as it is typed, and the address that it says it listens at."""
+    """`dengine serve` as it is typed, and the port that it says it listens at."""
     command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--reducer", "pca", *words]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     process = subprocess.Popen(command, cwd=folder, env=os.environ | {"PYTHONPATH": str(REPO)}, **pipes)
     assert process.stdout is not None
-    line = process.stdout.readline()
-    return process, line.split()[-1].rstrip(".") if "--token-file" in words else line.partition(" at ")[2].partition(",")[0]
+    return process, process.stdout.readline().rstrip(".\n").rpartition(":")[2]
+
+
+def certificate(folder: Path) -> None:
+    """Files for TLS by the name of localhost: cert.pem, key.pem, and locked.pem with a password; and a token."""
+    x509 = pytest.importorskip("cryptography.x509", reason="the test's certificate needs cryptography")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
+    made = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(1))
+    made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), False)
+    (folder / "cert.pem").write_bytes(made.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    locks = {"key.pem": serialization.NoEncryption(), "locked.pem": serialization.BestAvailableEncryption(b"secret")}
+    for file, lock in locks.items():
+        form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+        (folder / file).write_bytes(key.private_bytes(*form, lock))
+    (folder / "token").write_text(TOKEN, encoding="ascii")
+    (folder / "token").chmod(0o600)
 
 
 def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(
     tmp_path: Path, stream: Dataset
 ) -> None:
-    process, address = start(tmp_path, "--shadow")
+    certificate(tmp_path)
+    words = ("--shadow", "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem")
+    process, port = start(tmp_path, *words)
     try:
-        with httpx.Client(base_url=address, timeout=60, trust_env=False) as client:
+        trusted, said = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), {"authorization": f"Bearer {TOKEN}"}
+        how: dict[str, Any] = {"verify": trusted, "timeout": 60, "trust_env": False}
+        with httpx.Client(base_url=f"https://localhost:{port}", **how) as client:
+            assert client.get("/healthz").json()["status"] == "ok"
+            must_be_problem(client.get("/status"), 401)
+            client.headers.update(said)
             assert client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"] == "verify"
             assert client.get("/status").json()["shadow"] is True
-            other = CliRunner().invoke(main, ["serve", "--store", str(tmp_path / "cell.db"), "--port", "0"])
-            assert (other.exit_code, other.output.count("\n")) == (1, 1), other.output
-            assert "cell.db" in other.output
-            taken = ["serve", "--store", str(tmp_path / "b.db"), "--port", address.rpartition(":")[2]]
-            refused = CliRunner().invoke(main, taken)
-            assert (refused.exit_code, refused.output.count("\n")) == (1, 1), refused.output
-            assert "already in use" in refused.output
+            for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", port, "already in use")):
+                refused = CliRunner().invoke(main, ["serve", "--store", str(tmp_path / store), "--port", at])
+                assert (refused.exit_code, refused.output.count("\n")) == (1, 1), refused.output
+                assert text in refused.output
             process.send_signal(signal.SIGTERM)
             assert process.wait(60) == 0
     finally:
         process.kill()
-        _, said = process.communicate()
-    assert all(" level=" in line and " message=" in line for line in said.splitlines()), said
+        out, lines = process.communicate()
+    assert all(" level=" in line and " message=" in line for line in lines.splitlines()), lines
+    assert TOKEN not in out + lines
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.find("order-0").action == "verify"
 
 
 def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:
-    token = tmp_path / "token"
+    certificate(tmp_path)
+    token, locked = tmp_path / "token", ["--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "locked.pem")]
     serve = ["serve", "--store", str(tmp_path / "cell.db"), "--port", "0", "--host", "0.0.0.0"]
     for words, text, mode in (
         ([], "Expected --token-file FILE", 0o600),
@@ -469,6 +493,7 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
         (["--token-file", str(token)], "at least 16 characters", 0o600),
         (["--token-file", str(tmp_path / "none")], "Cannot read the token's file", 0o600),
         (["--cert", str(token)], "--cert and --key together", 0o600),
+        (locked, "Expected a key without a password", 0o600),
     ):
         token.write_text("short", encoding="ascii")
         token.chmod(mode)
@@ -478,40 +503,14 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
     assert not (tmp_path / "cell.db").exists()
 
 
-def test_tls_by_files_and_none_with_a_password(tmp_path: Path) -> None:
-    x509 = pytest.importorskip("cryptography.x509", reason="the test's certificate needs cryptography")
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    made = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(1))
-    made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), False)
-    (tmp_path / "cert.pem").write_bytes(made.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
-    for file, lock in (
-        ("key.pem", serialization.NoEncryption()),
-        ("locked.pem", serialization.BestAvailableEncryption(b"secret")),
-    ):
-        form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
-        (tmp_path / file).write_bytes(key.private_bytes(*form, lock))
-    (tmp_path / "token").write_text(TOKEN, encoding="ascii")
-    (tmp_path / "token").chmod(0o600)
-    files = ["--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "locked.pem")]
-    refused = CliRunner().invoke(main, ["serve", "--store", str(tmp_path / "cell.db"), *files])
-    assert (refused.exit_code, refused.output.count("\n")) == (1, 1), refused.output
-    assert "Expected a key without a password" in refused.output
-    process, address = start(
-        tmp_path, "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem"
-    )
-    try:
-        trusted, port = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), address.rpartition(":")[2]
-        with httpx.Client(base_url=f"https://localhost:{port}", verify=trusted, timeout=60, trust_env=False) as client:
-            assert client.get("/healthz").json()["status"] == "ok"
-            must_be_problem(client.get("/status"), 401)
-            assert client.get("/status", headers={"authorization": f"Bearer {TOKEN}"}).json()["version"] == 0
-            process.send_signal(signal.SIGINT)
-            assert process.wait(60) == 0
-    finally:
-        process.kill()
-        out, said = process.communicate()
-    assert TOKEN not in out + said
+def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path: Path) -> None:
+    pytest.importorskip("asyncua")
+    serve = ["serve", "--store", str(tmp_path / "cell.db"), "--reducer", "pca", "--port", "0"]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = CliRunner().invoke(main, [*serve, "--opcua", port])
+        assert (done.exit_code, done.output.count("\n")) == (1, 1), done.output
+        assert port in done.output
+    nobody = CliRunner().invoke(main, [*serve, "--robot", f"127.0.0.1:{port}"])
+    assert (nobody.exit_code, nobody.output.count("\n")) == (1, 1), nobody.output
+    assert "127.0.0.1" in nobody.output

@@ -40,9 +40,7 @@ def row(name: str, seconds: np.ndarray) -> dict[str, Any]:
 def latencies(args: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Every row: the disk, the engine itself, the network."""
     data, recipe = load_dataset(args.data, args.samples), folder / "recipe.toml"
-    chosen = (
-        Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9).with_settings(retrain_every=args.retrain_every)
-    )
+    chosen = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
     recipe.write_text(chosen.to_toml(), encoding="utf-8")
     rows = [row("fdatasync of 4 kB", syncs(folder))]
     rows += [row(name, seconds) for name, seconds in within(data, args.n, recipe, folder, args.pace)]
@@ -80,7 +78,6 @@ def main() -> None:
     parser.add_argument("--data", default="insertion")
     parser.add_argument("--samples", type=int, help="of each trace; all by default")
     parser.add_argument("--recipe", default="conv")
-    parser.add_argument("--retrain-every", type=int, default=20, help="labels")
     parser.add_argument("--pace", type=float, default=0.002, help="seconds between two parts")
     parser.add_argument("--folder", type=Path, help="where the stores are; the system's own for such files by default")
     parser.add_argument("--seed", type=int, default=0, help="of the kills' moments")

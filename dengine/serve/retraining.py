@@ -12,7 +12,6 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 
 NICE = 10  # decisions first, where cores are scarce
-END = 5.0  # seconds that a retrain under way may take to end
 
 
 @contextmanager
@@ -27,9 +26,9 @@ def retraining_process() -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.join(END)
+        for process in multiprocessing.active_children():  # a retrain that was worth waiting for, its engine has waited for
             process.kill()
+            process.join()
 
 
 def _begin() -> None:

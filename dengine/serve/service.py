@@ -38,6 +38,7 @@ from .jobs import CLOSING, Job
 log = logging.getLogger("dengine")
 DEADLINE = 0.5  # seconds in line, after which who asked verifies
 MOST = 32  # requests in line
+SOON = 0.002  # seconds after an answer, in which a report or another part often comes
 IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
 
 T = TypeVar("T")
@@ -230,13 +231,15 @@ class CellService:
                 self._tell()
 
     def _next(self, engine: DataEngine) -> Job[Any] | None:
-        """The next one in line; while nobody asks, the engine does what it has to do."""
+        """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""
+        patience = SOON  # right behind an answer, for the next part is farthest away then
         while True:
             self._beat = time.monotonic()
             try:
-                return self._jobs.get(timeout=IDLE)
+                return self._jobs.get(timeout=patience)
             except queue.Empty:
                 self._settle(engine)
+                patience = IDLE
 
     def _settle(self, engine: DataEngine) -> None:
         try:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dengine import DataEngine, Dataset, Recipe
+from dengine.records import ACTIONS
 from dengine.serve.retraining import retraining_process
 from dengine.serve.server import quick_switches
 
@@ -66,16 +67,20 @@ def over_the_network(data: Dataset, n: int, recipe: Path, folder: Path, pace: fl
         asks["HTTP, JSON, request id"] = lambda x, id_: http_.decide(x, id_, JSON)
         rpc = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{server.port}/RPC2", allow_none=True)
         if speaks_xmlrpc(rpc):
-            asks["XML-RPC, request id"] = lambda x, id_: dict(rpc.decide(x.tolist(), id_))  # type: ignore[call-overload]
-        warm = drive(data, 100, {"warm": asks["HTTP, float32"]}, http_.report, "warm", pace)
+            asks["XML-RPC, request id"] = lambda x, id_: in_words(rpc.decide(x.tolist(), id_))
+        drive(data, 100, {"warm": asks["HTTP, float32"]}, http_.report, "warm", pace)
         _settled(lambda: http_.get("/status")["version"] > 0)
         seconds, told, swaps = drive(data, n, asks, http_.report, "timed", pace)
-        del warm
         yield from seconds.items()
         yield "HTTP, report", np.array(told)
         print(f"over the network: {swaps} versions swapped in meanwhile", file=sys.stderr)
     finally:
         server.end()
+
+
+def in_words(answer: Any) -> dict[str, Any]:
+    """An answer of XML-RPC, whose actions are numbers, as HTTP gives it."""
+    return {"id": answer["id"], "action": ACTIONS[answer["action"]].value, "model_version": answer["version"]}
 
 
 def speaks_xmlrpc(rpc: xmlrpc.client.ServerProxy) -> bool:
