@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ from ..service import CellService
 from .pulse import Pulse
 
 MOST = 64  # looks that are kept
+REST = 10.0  # a look that took a second is not taken anew for so many: reading a large store is not to be felt
 
 T = TypeVar("T")
 
@@ -27,6 +29,7 @@ class Looking:
         self.service, self.pulse = service, pulse
         self._lock = threading.Lock()
         self._kept: dict[Hashable, tuple[Hashable, Any]] = {}
+        self._rests: dict[Hashable, float] = {}  # until when, by a view
 
     @property
     def store(self) -> Store:
@@ -45,7 +48,16 @@ class Looking:
         """
         if self.store is self.service.engine.store:
             return await self.service.ask(lambda engine: self._look(view, read))
-        return await asyncio.to_thread(self._look, view, read)
+        found = await asyncio.to_thread(self._look, view, read)
+        rest = self._rests.get(view, 0.0) - time.monotonic()
+        if rest > 0.0 and self._kept.get(view, (None,))[0] != self.pulse.number:
+            self.pulse.advance_in(rest)  # what was found is old by now: whoever watches is told when it is looked at anew
+        return found
+
+    def look_anew(self) -> None:
+        """Let the next look be fresh, however long it takes: somebody did something."""
+        self._rests.clear()
+        self.pulse.advance()
 
     def kept(self, what: Hashable, fits: Hashable, read: Callable[[], T]) -> T:
         """What `read` finds, or found when `fits` was the same: for what changes less often than the decisions."""
@@ -61,4 +73,12 @@ class Looking:
 
     def _look(self, view: Hashable, read: Callable[[Looking], T]) -> T:
         with self._lock:
-            return self.kept(view, self.pulse.number, lambda: read(self))
+            begin, known = time.monotonic(), self._kept.get(view)
+            if known is not None and begin < self._rests.get(view, 0.0):
+                found: T = known[1]
+                return found
+            fresh = self.kept(view, self.pulse.number, lambda: read(self))
+            end = time.monotonic()
+            self._rests = {each: until for each, until in self._rests.items() if until > end}
+            self._rests[view] = end + REST * (end - begin)
+            return fresh

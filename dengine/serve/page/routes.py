@@ -52,7 +52,7 @@ class LivePage:
     def __init__(self, service: CellService, check_seconds: float) -> None:
         self._pulse = Pulse(service)
         self._looking = Looking(service, self._pulse)
-        self._acts = Acts(service, self._pulse)
+        self._acts = Acts(self._looking)
         self._check_seconds = check_seconds
 
     def routes(self) -> list[BaseRoute]:
