@@ -223,7 +223,7 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
 
     def _known(self, decision_id: str) -> StoredDecision | None:
         try:
-            return self._keeper.find(decision_id)
+            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
         except StoreError as error:  # the store is away: what was decided lately is known all the same
             log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
             return None

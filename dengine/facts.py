@@ -34,6 +34,14 @@ class EngineFacts:
         """A decision with its trace, and with its label where it has one; None for an unknown id."""
         return self._keeper.find(as_id(decision_id))
 
+    def know_ids(self) -> None:
+        """Learn which ids are taken, so that `decide` looks no new one up in the store: quicker, where callers name them.
+
+        It reads every id once, a second for a million of them.
+        """
+        self.flush()
+        self._keeper.recent.know(self.store.decision_ids())
+
     def flush(self) -> None:
         """Return when all that is known so far is on the disk."""
         self._feedback.store_waiting()

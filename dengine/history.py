@@ -35,11 +35,13 @@ def history(
     label: str | None = None,
     since: float | None = None,
     until: float | None = None,
+    predicted: Action | str | None = None,
 ) -> Iterator[PastDecision]:
     """The decisions of a store, newest last, one after the other as they are read.
 
     last : the newest so many of those that are meant; None: all.
     action, reason : an `Action` and a `Reason`, or their values.  label : good, bad or none.
+    predicted : an `Action` or its value: what the model alone would have done, as in an audit or in the shadow mode.
     since, until : times in seconds since 1970; the first included, the last not.
     Raises SettingError for a value that is none of these.
     """
@@ -47,7 +49,7 @@ def history(
         raise SettingError(f"Expected last to be 1 or more, got {last!r}; leave it out for all decisions.")
     if label is not None and label not in LABELS:
         raise SettingError(f"Expected label to be one of {', '.join(LABELS)}, got {label!r}.")
-    where = HistoryFilter(_named(Action, action), _named(Reason, reason), label, since, until)
+    where = HistoryFilter(_named(Action, action), _named(Reason, reason), label, since, until, _named(Action, predicted))
     return _forward(store, where) if last is None else iter(_newest(store, where, last))
 
 

@@ -49,7 +49,7 @@ class Keeper:
         self.fault = ""
         self._fault_began = 0.0
         self._beat_began: float | None = None
-        self._recent = RecentDecisions()
+        self.recent = RecentDecisions()
         self._pid = os.getpid()
         self._closed, self._reading, self._patient = False, not owning, patient
         self._jobs: queue.SimpleQueue[Asked[Any] | None] = queue.SimpleQueue()
@@ -109,7 +109,7 @@ class Keeper:
     def decided(self, item: DecidedTrace) -> None:
         """Take a decision and its trace without waiting."""
         self.check()
-        self._recent.add(stored_decision(item))
+        self.recent.add(stored_decision(item))
         backlog = self._backlog
         if backlog is None:
             self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
@@ -132,16 +132,16 @@ class Keeper:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
         if self._backlog is None:
             return self.store.get_decision(decision_id)
-        known = self._recent.find(decision_id) or self._backlog.find(decision_id)
+        known = self.recent.find(decision_id) or self._backlog.find(decision_id)
         return known or self.ask(lambda: self.store.get_decision(decision_id))
 
     def labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
         """Commit labels; returns their numbers, 0 for those that wait in the journal. ReportError as `Store.put_labels`."""
         now = time.time()
-        self._recent.refuse_repeats(labels)
+        self.recent.refuse_repeats(labels)
         late = [LateLabel(label, now) for label in labels]
         numbers = self._store(lambda: self.store.put_labels(labels), late)
-        self._recent.label(labels)
+        self.recent.label(labels)
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
     def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int | None:
@@ -169,7 +169,7 @@ class Keeper:
 
     def forget(self, decision_id: str) -> None:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
-        self._recent.forget(decision_id)
+        self.recent.forget(decision_id)
 
     def ask(self, work: Callable[[], T], more: float = 0.0) -> T:
         """Call the store with the time limit; StoreError where it is away. more : seconds for a commit under way."""

@@ -37,9 +37,10 @@ class EngineReview:
         label: str | None = None,
         since: float | None = None,
         until: float | None = None,
+        predicted: Action | str | None = None,
     ) -> Iterator[PastDecision]:
         """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
-        return history(self.store, last, action, reason, label, since, until)
+        return history(self.store, last, action, reason, label, since, until, predicted)
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""

@@ -60,7 +60,8 @@ class WouldHave:
     """What the model would have done with parts that were checked all the same: audits, in the shadow mode every one.
 
     n : checked parts that it would have accepted, or rejected.  wrong : of these, those that it was wrong about.
-    lower, upper : Wilson interval of the share of wrong ones at the policy's alpha, at one look; 0 and 1 where n is 0.
+    lower, upper : 95 % Wilson interval of the share of wrong ones, at one look; 0 and 1 where n is 0. Not at the policy's
+        alpha: at 0.5 that would be an even bet, and somebody decides by this whether the model may.
     tolerance : 1 - LB.
     """
 
@@ -175,7 +176,7 @@ def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
 
 
 def _would_have(n: int, wrong: int, policy: Policy) -> WouldHave:
-    low, high = wilson_interval(n - wrong, wrong, policy.alpha)
+    low, high = wilson_interval(n - wrong, wrong, 0.05)
     return WouldHave(n, wrong, 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound)
 
 

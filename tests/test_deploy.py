@@ -2,6 +2,7 @@
 
 import http.server
 import json
+import os
 import re
 import shlex
 import shutil
@@ -9,6 +10,8 @@ import subprocess
 import sys
 import threading
 import tomllib
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +20,7 @@ import click
 import pytest
 
 from dengine.cli import main
+from dengine.errors import SettingError
 
 REPO = Path(__file__).resolve().parents[1]
 DEPLOY = REPO / "deploy"
@@ -130,7 +134,57 @@ def test_the_health_check_asks_healthz_and_knows_well_from_ill(status: int, heal
     assert (done.returncode == 0) is healthy
 
 
+@pytest.mark.skipif(os.name == "nt", reason="SIGTERM is no signal there")
+def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengine[serve]'")
+    for package in ("starlette", "msgpack", "prometheus_client"):
+        pytest.importorskip(package)
+    token = tmp_path / "token"
+    token.write_text("a-token-of-24-characters", encoding="ascii")
+    token.chmod(0o400)
+    changed = {"/var/lib/dengine/cell.db": str(tmp_path / "cell.db"), "/run/secrets/dengine_token": str(token), "8000": "0"}
+    words = [changed.get(word, word) for word in json.loads(steps("CMD")[0])]
+    command = [sys.executable, "-m", "dengine", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        try:
+            assert server.stdout is not None
+            line = server.stdout.readline()
+            found = re.search(r":(\d+)", line)
+            assert found is not None, line
+            _, *check = json.loads(steps("HEALTHCHECK")[0].split("CMD", 1)[1])
+            asked = [word.replace(":8000/", f":{found[1]}/") for word in check]
+            assert subprocess.run([sys.executable, *asked], timeout=60, check=False).returncode == 0
+            with pytest.raises(urllib.error.HTTPError, match="401"):
+                urllib.request.urlopen(f"http://127.0.0.1:{found[1]}/status", timeout=30)
+        finally:
+            server.terminate()  # as the container's end does
+        assert server.wait(60) == 0
+    assert (tmp_path / "cell.db").is_file()
+
+
 # --------------------------------------------------------------------------------------------------------- the service
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such modes")
+@pytest.mark.parametrize(("mode", "handed", "taken"), [
+    (0o440, True, True), (0o440, False, False), (0o444, True, False), (0o460, True, False), (0o400, False, True)
+])  # fmt: skip
+def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_right_of_the_group(
+    mode: int, handed: bool, taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("starlette", reason="needs the extra serve: pip install 'dengine[serve]'")
+    from dengine.serve.access import read_token
+
+    if handed:
+        monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    token = tmp_path / "token"
+    token.write_text("a-token-of-24-characters\n", encoding="ascii")
+    token.chmod(mode)
+    if taken:
+        assert read_token(token) == "a-token-of-24-characters"
+    else:
+        with pytest.raises(SettingError, match="its owner's alone"):
+            read_token(token)
 
 
 def test_what_the_unit_starts_is_an_option_each_of_serve_with_those_of_its_file_behind() -> None:
@@ -154,6 +208,7 @@ def test_the_token_is_a_credential_and_in_no_file_or_option() -> None:
 def test_the_unit_starts_again_after_a_failure_and_is_given_time_to_end() -> None:
     assert settings("Restart") == ["on-failure"]
     assert settings("StartLimitIntervalSec") == ["0"]
+    assert settings("KillMode") == ["mixed"]  # the process that trains is ended by the server, not beside it
     assert float(settings("TimeoutStopSec")[0]) >= 10
 
 

@@ -74,6 +74,9 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
         found = document("history", store, "--last", 1000, option, value)["decisions"]
         assert found
         assert {each[option[2:]] for each in found} == {value}
+    found = document("history", store, "--last", 1000, "--model", "accept", "--action", "verify")["decisions"]
+    assert found
+    assert {(each["predicted"], each["action"]) for each in found} == {("accept", "verify")}
     assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
     assert document("history", store, "--since", "2100-01-01")["decisions"] == []
     assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"

@@ -67,6 +67,7 @@ VERBS = {  # every verb that takes a store
     "status as JSON": ["status", NOBODY, "--json"],
     "train": ["train", "--data", "insertion", "--store", NOBODY],
     "run": ["run", "--cell", "replay", "--cycles", "1", "--store", NOBODY],
+    "serve": ["serve", "--port", "0", "--store", NOBODY],
     "export": ["export", NOBODY, "--out", "{out}"],
     "import-labels": ["import-labels", "{journal}", "--store", NOBODY],
     **{

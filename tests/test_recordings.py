@@ -739,7 +739,7 @@ def test_an_archives_facts_are_checked(small: Dataset, tmp_path: Path) -> None:
 def test_a_file_of_another_kind_lists_those_that_are_read(tmp_path: Path) -> None:
     for name in ("data.xlsx", "data.txt", "data.npy"):
         (tmp_path / name).write_text("FZ_0,FZ_1,label")
-        with pytest.raises(DataError, match=r"Expected a file \.npz, \.csv, \.parquet or \.h5, got"):
+        with pytest.raises(DataError, match=r"Expected a file \.npz, \.csv, \.parquet, \.h5 or \.mcap, got"):
             load_dataset(tmp_path / name)
 
 

@@ -12,6 +12,7 @@ import pytest
 from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, Source
 from dengine.errors import ReportError, SettingError, TraceError
 from dengine.keeping import Keeper
+from dengine.recent import TakenIds
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=POLICY)
@@ -28,6 +29,26 @@ def drive(engine: DataEngine, data: Dataset, first: int, last: int) -> list:
 
 
 # ------------------------------------------------------------------------------------------------ ids of the caller's
+
+
+def test_a_new_id_is_not_looked_up_once_the_taken_ones_are_known(tmp_path: Path, stream: Dataset) -> None:
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        first = engine.decide(stream.X[0], decision_id="order-0")
+    with DataEngine.open(tmp_path / "cell.db") as engine:
+        recent = engine._keeper.recent
+        assert not recent.is_new("order-1")  # that is not known yet
+        engine.know_ids()
+        assert not recent.is_new("order-0")
+        assert recent.is_new("order-1")
+        engine.decide(stream.X[1], decision_id="order-1")
+        assert not recent.is_new("order-1")
+        assert engine.decide(stream.X[0], decision_id="order-0") == first
+
+
+def test_taken_ids_are_never_taken_for_new_ones() -> None:
+    taken = TakenIds(f"order-{i}" for i in range(20_000))
+    assert all(taken.may_hold(f"order-{i}") for i in range(20_000))
+    assert not any(taken.may_hold(f"part-{i}") for i in range(1_000))
 
 
 @pytest.mark.parametrize("stored", [False, True])

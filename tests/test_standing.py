@@ -43,7 +43,7 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     assert (accept["n"], accept["wrong"]) == (len(said[Action.ACCEPT]), bad)
     assert (reject["n"], reject["wrong"]) == (len(said[Action.REJECT]), good)
     assert accept["n"] > 50
-    lower, upper = wilson_interval(accept["n"] - bad, bad, POLICY.alpha)
+    lower, upper = wilson_interval(accept["n"] - bad, bad, 0.05)  # whatever the policy's alpha
     assert (accept["lower"], accept["upper"]) == pytest.approx((1 - upper, 1 - lower))
     assert accept["verdict"] == "kept"
     certified = told["certificate"]

@@ -401,6 +401,7 @@ def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store)
     assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
     store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
     assert store.unreported_accepts() == ["amy", "kim", "ann"]
+    assert sorted(store.decision_ids()) == sorted([*names, "verified", "rejected"])
 
 
 def test_unreported_accepts_are_oldest_first_when_the_clock_went_back(store: Store) -> None:

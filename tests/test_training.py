@@ -241,3 +241,11 @@ def test_the_recipes_are_written_where_they_are_asked_for(run: Run, tmp_path: Pa
     run("write_recipes", "--out", tmp_path)
     shipped = FOLDER.parent / "models" / "recipes"
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {p.name: p.read_text() for p in shipped.glob("*.toml")}
+
+
+def test_a_choice_by_cost_is_tried_on_the_parts_that_it_did_not_see(run: Run, tiny: Path, tmp_path: Path) -> None:
+    words = ("--data", tiny, "--parts", 30, "--repeats", 2, "--escapes", "30,60", "--n-jobs", 1, "--out", tmp_path)
+    said = run("check_cost_choice", *words)
+    assert "2 sets of 30 parts, 2 shuffles, 4 choices" in said
+    rows = (tmp_path / "cost_choice.csv").read_text(encoding="utf-8").splitlines()
+    assert len(rows) == 1 + 2 * 4

@@ -155,6 +155,21 @@ def test_the_controllers_own_words_are_in_the_error() -> None:
         client.close()
 
 
+def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() -> None:
+    with FakeController(speed=None, patience=0.2) as fake:
+        idle = RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force", "actual_q"))
+        with RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
+            while fake._connections[0].started:
+                stream.after(stream.position, WAIT)
+            begun = stream.position
+            assert stream.after(begun + 100, 0.0)[0] == []
+            while stream.position < begun + 100:
+                stream.after(stream.position, WAIT)
+        with pytest.raises(CellError, match="Expected packages"):
+            read_on(idle)
+        idle.close()
+
+
 def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:
     late = Lateness()
     drifting = [late.is_late(t, 1.0005 * t + 5.0) for t in np.arange(0.0, 60.0, 0.002)]
@@ -202,11 +217,28 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(pa
     assert report.missing >= len(fake.lost)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_so_it_is_with_any_faults_at_any_samples(parts: Dataset, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = ("drop", "hold", "close", "half", "garbage", "repeat")
+    samples = rng.integers(SAMPLES, size=40) * (rng.random(40) < 0.8)  # the first more often than by chance
+    wrong = [Trouble(i, int(samples[i]), str(rng.choice(kinds)), int(rng.integers(1, 200))) for i in range(40)]
+    with FakeController(RobotProgram(parts), speed=None, troubles=wrong) as fake, cell_of(fake) as cell:
+        for part in range(40):
+            trace = cell.insert()
+            lost = {place for place in fake.lost if place[0] == part}
+            unseen = (part, 0) in lost
+            assert nan_places(part, trace) == ({(part, i) for i in range(SAMPLES)} if unseen else lost), wrong[part]
+            there = ~np.isnan(trace)
+            np.testing.assert_array_equal(trace[there], parts.X[part][there])
+            assert cell.verify() == bool(parts.y[part])
+
+
 def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
     with FakeController(RobotProgram(parts), troubles=[Trouble(0, 10, "hold", 60)]) as fake, cell_of(fake) as cell:
         trace = cell.insert()  # in real time
     np.testing.assert_array_equal(trace, parts.X[0])
-    assert cell.last.late >= 40
+    assert cell.last.late >= 20  # of 60, those that came over 0.02 s late
     assert cell.last.missing == 0
 
 
@@ -285,6 +317,16 @@ def test_a_recorder_cuts_by_any_trigger_with_samples_from_before_it(trigger, col
     with FakeController(program, speed=None) as fake, RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder:
         for _ in range(3):
             np.testing.assert_array_equal(recorder.record(WAIT).trace, contact()[180:240].astype(np.float32))
+
+
+def test_a_controller_is_asked_for_the_rate_that_a_trace_has() -> None:
+    with FakeController(Signals(FZ_Base=contact()), speed=None) as fake:  # 500 cycles a second: it sends every fourth
+        how = {"samples": 20, "rate_hz": 125.0, "port": fake.port}
+        with RtdeRecorder(fake.host, ContactTrigger(5.0, quiet_s=0.1), **how) as recorder:
+            insertion = recorder.record(WAIT)
+    assert insertion.complete
+    starts = [contact()[first : first + 80 : 4].astype(np.float32).tolist() for first in range(200, 204)]
+    assert insertion.trace.tolist() in starts
 
 
 def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts: Dataset) -> None:
@@ -409,7 +451,7 @@ class Deaf(RobotProgram):
 
 @pytest.fixture
 def short() -> dict:
-    return {"order_timeout": 0.3, "start_timeout": 0.3, "samples": SAMPLES}
+    return {"order_timeout": 0.3, "start_timeout": 1.0, "samples": SAMPLES}
 
 
 def test_a_robot_that_does_not_answer_is_an_error_that_says_which_order(parts: Dataset, short: dict) -> None:
@@ -458,22 +500,40 @@ def test_an_order_given_while_there_is_no_connection_is_carried_out_once_there_i
     assert program.played == [0]
 
 
-def test_a_controller_that_was_switched_off_is_not_told_an_old_order_again() -> None:
-    with FakeController(speed=20.0) as fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+def reconnected(fake: FakeController, stream: RtdeStream) -> float | None:
+    """What the order's register holds once the connection was lost and made again."""
+    before = stream.report().reconnects
+    fake.hang_up()
+    while stream.report().reconnects == before:
+        stream.after(stream.position, 0.05)
+    begun = stream.position
+    while stream.position < begun + 50:
+        stream.after(stream.position, WAIT)
+    return fake._inputs.get(ORDER)
+
+
+def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
+    now, order = [0.0], word(7, Verb.INSERT)
+    fake = FakeController(speed=20.0)
+    fake._cycle = 10**6
+    how = {"port": fake.port, "clock": lambda: now[0]}
+    with fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), **how) as stream:
         stream.after(0, WAIT)
-        stream.write((word(7, Verb.INSERT),))
-        while fake._inputs.get(ORDER) != word(7, Verb.INSERT):
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
+            stream.after(stream.position, WAIT)
+        fake._inputs.clear()  # as if it had been lost on the way
+        assert reconnected(fake, stream) == order
+        fake._inputs.clear()
+        now[0] = 11.0
+        assert reconnected(fake, stream) is None
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
             stream.after(stream.position, WAIT)
         with fake._lock:  # off and on
             fake._inputs.clear()
             fake._begin = fake._cycle
-        fake.hang_up()
-        while stream.report().reconnects == 0:
-            stream.after(stream.position, 0.05)
-        begun = stream.position
-        while stream.position < begun + 50:
-            stream.after(stream.position, WAIT)
-        assert fake._inputs.get(ORDER) is None
+        assert reconnected(fake, stream) is None
 
 
 # From the shell.
@@ -498,6 +558,27 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dat
         kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
         assert engine.store.status()["decisions"] == 15
     assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
+
+
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts: Dataset, tmp_path: Path
+) -> None:
+    program, store = RobotProgram((parts.X[:10], parts.y[:10])), str(tmp_path / "cell.db")  # then its bin is empty
+    with FakeController(program, speed=None) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "14")
+        said = " ".join(done.output.split())
+        assert done.exit_code == 1
+        assert "1 to 10 100 %" in said
+        assert (
+            "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14 cycles were done."
+            in said
+        )
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in said
+        program.played.clear()  # somebody has filled it
+        assert run(*words[:-2], "--cycles", "4").exit_code == 0
+    with DataEngine.open(store) as engine:
+        assert engine.store.status()["decisions"] == 14
 
 
 @pytest.mark.parametrize(
@@ -529,6 +610,17 @@ def test_a_controller_without_a_robot_is_started_from_the_shell() -> None:
             process.terminate()
 
 
+def test_an_owner_that_thinks_for_long_between_two_orders_goes_on(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=None) as fake, cell_of(fake) as cell:
+        cell.insert()
+        cell.recorder.stream._most = 20  # packages that are kept, instead of a minute's
+        begun = cell.recorder.stream.position
+        while cell.recorder.stream.position < begun + 200:
+            assert cell.recorder.stream.after(10**9, 0.01)[0] == []
+        cell.recorder.stream._most = 10**5
+        assert cell.verify() == bool(parts.y[0])
+
+
 def test_orders_are_numbered_so_that_they_fit_a_register_for_ever() -> None:
     assert after(0) == 1
     assert after(2 * 10**8) == 1
@@ -544,6 +636,24 @@ def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: 
         assert f"{verb}_integer_register({number}" in text
     for each in (*Verb, *Answer):
         assert f"{type(each).__name__.upper()}_{each.name} = {each.value}\n" in text
+
+
+def test_every_block_of_the_robots_program_is_closed_where_it_was_opened(repo: Path) -> None:
+    blocks: list[int] = []
+    for line in (repo / "training" / "ur_cell.script").read_text(encoding="utf-8").splitlines():
+        indent, words = len(line) - len(line.lstrip()), line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0] in ("def", "if", "while"):
+            assert words[-1].endswith(":"), line
+            blocks.append(indent)
+        elif words[0] in ("end", "elif"):
+            assert indent == blocks[-1], line
+            if words == ["end"]:
+                blocks.pop()
+        else:
+            assert indent == 2 * len(blocks), line
+    assert not blocks
 
 
 # Another client than ours, against the same controller.

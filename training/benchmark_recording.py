@@ -21,6 +21,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +160,8 @@ def main() -> None:
     parser.add_argument("--ur-rtde", type=float, default=0.0, metavar="SECONDS", help="measure ur_rtde's recorder too")
     parser.add_argument("--out", type=Path, default=None, help="folder for recording.csv")
     asked = parser.parse_args()
+    if asked.ur_rtde > 0 and find_spec("rtde_receive") is None:
+        parser.error('expected ur_rtde for --ur-rtde, it is not installed: pip install "dengine[ur]"')
     data = load_dataset("insertion", asked.samples)
     wrong = troubles(asked.insertions, data.X.shape[-1], np.random.default_rng(asked.seed))
     begin = time.perf_counter()

@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 COST = click.FloatRange(0.0)
 CAPTION = (
-    "cost: of a part, the mean over {reporting} shuffles of {cycles} parts; below it what it would be with the errors at "
-    "the ends of their 95 % intervals. LB all: everything is verified. late: over the last third of each shuffle, once "
-    "something was learned. verified: share of the parts that were checked. bad of accepted, good of rejected: over all "
-    "these shuffles; below them their intervals. The choice, >, is the cheapest of other shuffles, {choosing}, so that its "
+    "cost: of a part, the mean over shuffles of {cycles} parts, {reporting} of them; below it what it would be with the "
+    "errors at the ends of their 95 % intervals. LB all: everything is verified. late: over the last third of a shuffle, "
+    "once something was learned. verified: share of the parts that were checked. bad of accepted, good of rejected: over "
+    "these shuffles; below them their intervals. The choice, >, was the cheapest in the other half of the shuffles, so its "
     "figures here are not those that it was picked for. All shuffles play the same parts: parts that were recorded later "
     "are the clean test."
 )
@@ -197,7 +197,7 @@ def _table(curve: CostCurve, unit: str) -> Table:
     from rich.table import Table
 
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
-    said = CAPTION.format(reporting=curve.reporting, cycles=curve.cycles, choosing=curve.choosing)
+    said = CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)
     title = f"\n{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB\n"
     table = Table(title=title, caption=f"\n{said}\n", pad_edge=False, show_edge=False, **look)
     for name in ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected"):

@@ -34,8 +34,8 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     """Say what a data set is, and what is wrong with it.
 
     A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz or .h5
-    with X (traces, samples) and y (1 success, 0 failure); the file of a store, for what is labelled in it; or the bundled
-    set, insertion.
+    with X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
+    is labelled in it; or the bundled set, insertion.
     """
     from ..experiments.survey import survey
 

@@ -69,8 +69,8 @@ def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
     yield "of them bad", _bad(span.bad_accepts, alpha) if span.accepted else "none was accepted"
     yield "rejected", _of(span.rejected, span)
     yield "audits", _of(span.audits, span)
-    yield "would accept", _would(span.would_accept, "bad", alpha)
-    yield "would reject", _would(span.would_reject, "good", alpha)
+    yield "would accept", _would(span.would_accept, "bad")
+    yield "would reject", _would(span.would_reject, "good")
     yield "novel", _of(span.novel, span)
     yield "safe mode", _of(span.safe_mode, span)
     yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
@@ -94,11 +94,11 @@ def _bad(bad: BadAccepts, alpha: float) -> str:
     return f"{lead}{stops}: {between}, {WORDS[bad.verdict]} {100 * bad.tolerance:g} %"
 
 
-def _would(said: WouldHave, wrong: str, alpha: float) -> str:
+def _would(said: WouldHave, wrong: str) -> str:
     """What checks said of parts that the model was certain of."""
     if not said.n:
         return "none was checked"
-    between = f"{100 * said.lower:.1f} to {100 * said.upper:.1f} % at alpha {alpha:g}"
+    between = f"{100 * said.lower:.1f} to {100 * said.upper:.1f} % at 95 %"
     held = f"{WORDS[said.verdict]} {100 * said.tolerance:g} %"
     return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {between}, {held}"
 

@@ -54,6 +54,12 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 @cell_options()
 @click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
 @click.option("--action", type=click.Choice([each.value for each in Action]), help="Only what was decided so.")
+@click.option(
+    "--model",
+    "predicted",
+    type=click.Choice([each.value for each in Action]),
+    help="Only what the model alone would have done so, as in an audit or in the shadow mode.",
+)
 @click.option("--reason", type=click.Choice([each.value for each in Reason]), metavar="REASON", help=(
     f"Only for this reason: {', '.join(each.value for each in Reason)}."
 ))  # fmt: skip

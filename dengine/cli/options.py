@@ -68,12 +68,14 @@ class DataChoice:
     labels: str | None = None
     fit: str | None = None
     rate_hz: float | None = None
+    trigger: str | None = None
+    topic: str | None = None
 
     def load(self, quiet: bool = False) -> Dataset:
         """The data set; what was left out of it is said on stderr, or not. DataError for what cannot be read."""
         from ..datasets import load_dataset
 
-        how = {name: getattr(self, name) for name in ("channel", "label", "labels", "fit", "rate_hz")}
+        how = {name: getattr(self, name) for name in ("channel", "label", "labels", "fit", "rate_hz", "trigger", "topic")}
         data = load_dataset(self.data, self.samples, self.part, **how)
         if data.faults and not quiet:
             click.echo(left_out(data), err=True)
@@ -190,6 +192,13 @@ DATA = {  # how a data set is read: what `load_dataset` calls them
         metavar="HZ",
         help="Instead of what timestamps tell.",
     ),
+    "trigger": click.option(
+        "--trigger",
+        metavar="TEXT",
+        help="When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), "
+        "bit=0 (a digital output), motion=0.01 (m/s).",
+    ),
+    "topic": click.option("--topic", metavar="NAME", help="Of the wrench in an .mcap file.  [default: the only one]"),
     "part": click.option(
         "--part",
         metavar="KEY",
@@ -220,7 +229,7 @@ def data_options(default: str | None = "insertion") -> Callable[[Command], Comma
         "--data",
         metavar="NAME|FILE|FOLDER",
         help="The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv "
-        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); or a store's file, .db.",
+        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db.",
         **shown,
     )
     return lambda command: option(reading_options(command))

@@ -10,6 +10,7 @@ from zlib import crc32
 
 import click
 
+from ..errors import CellError
 from .interrupting import EndAskedError, end_interrupted, interruptible
 from .naming import cell_options
 from .options import (
@@ -26,7 +27,7 @@ from .options import (
     short_name,
 )
 from .output import certificate_record, progress, refusals_last, show, write_json
-from .robot import RobotChoice, recording_line, recording_record, robot_options
+from .robot import host_option, open_robot, recording_line, recording_record
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
@@ -48,7 +49,7 @@ STRETCHES = 6
     show_default=True,
     help="simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller.",
 )
-@robot_options
+@host_option
 @data_options()
 @scenario_option
 @click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
@@ -64,7 +65,7 @@ STRETCHES = 6
 def run(
     choice: RecipeChoice,
     kind: str,
-    robot: RobotChoice,
+    host: str | None,
     source: DataChoice,
     scenario: str,
     cycles: int,
@@ -78,7 +79,7 @@ def run(
 
     With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
     on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
-    training/ur_cell.script, or a program of the same handshake; --samples, --channel and --rate say what is recorded of it.
+    training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
     Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
     safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
     """
@@ -90,13 +91,15 @@ def run(
     with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=recipe) as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, robot)
+        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
         opened.callback(getattr(cell, "close", lambda: None))
-        log, changes = _drive(engine, cell, cycles, name, as_json)
+        log, changes, failure = _drive(engine, cell, cycles, name, as_json)
         told = Told(changes, engine.safe_mode, engine.certificate())
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
         _report(log, told, cell, kind, title, cycles, out, as_json)
+    if failure is not None:
+        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {_kept(len(log), cycles, store)}") from failure
     if len(log) < cycles:
         _say_interrupted(len(log), cycles, store)
 
@@ -124,7 +127,10 @@ class Told:
     certificate: Certificate
 
 
-def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) -> tuple[RunLog, list[ModeChange]]:
+def _drive(
+    engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
+) -> tuple[RunLog, list[ModeChange], CellError | None]:
+    """What was done, and what ended it, where the cell failed: what was done before that is shown first."""
     from ..experiments.live import RunRecorder
 
     recorder, changes, mode = RunRecorder(cell), list[ModeChange](), engine.safe_mode
@@ -142,23 +148,27 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool) 
                 raise EndAskedError
 
         # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
-        with suppress(EndAskedError, KeyboardInterrupt):
-            recorder.follow(engine, cycles, count)
-    return recorder.log(), changes
+        try:
+            with suppress(EndAskedError, KeyboardInterrupt):
+                recorder.follow(engine, cycles, count)
+        except CellError as error:
+            return recorder.log(), changes, error
+    return recorder.log(), changes, None
 
 
 def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
     shown = "the table shows those" if done else "there is nothing to show"
-    kept = f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
-    forgotten = "Nothing was stored: --store FILE keeps a run, and goes on with it."
-    end_interrupted(
-        f"Interrupted: {done} of {cycles} cycles were done; {shown}.",
-        forgotten if store is None else kept,
-    )
+    end_interrupted(f"Interrupted: {done} of {cycles} cycles were done; {shown}.", _kept(done, cycles, store))
+
+
+def _kept(done: int, cycles: int, store: str | None) -> str:
+    if store is None:
+        return "Nothing was stored: --store FILE keeps a run, and goes on with it."
+    return f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
 
 
 def _simulated(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
 ) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
     from ..store.shared import is_shared
@@ -171,7 +181,7 @@ def _simulated(
 
 
 def _recorded(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
 ) -> tuple[Cell, str]:
     import numpy as np
 
@@ -197,8 +207,8 @@ def _recorded(
     return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
 
 
-def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, robot: RobotChoice) -> tuple[Cell, str]:
-    return robot.open(source), f"robot at {robot.host}"
+def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None) -> tuple[Cell, str]:
+    return open_robot(host, source), f"robot at {host}"
 
 
 CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
     from ..engine import DataEngine
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml")
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 
@@ -54,20 +55,37 @@ FILE = click.Path(dir_okay=False, path_type=Path)
     "--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as a robot's program speaks it."
 )
 @click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
+@click.option(
+    "--opcua", type=click.IntRange(1, 65535), metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840."
+)
+@click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
+@click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
+@click.option("--robot", metavar="HOST", help="Record the force of this Universal Robots controller, for XML-RPC.")
+@click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
+@click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
 @recipe_options
-def serve(choice: RecipeChoice, store: str, shadow: bool, xmlrpc: bool, page: bool, seed: int | None, **how: Any) -> None:
+def serve(
+    choice: RecipeChoice,
+    store: str,
+    shadow: bool,
+    xmlrpc: bool,
+    page: bool,
+    robot: str | None,
+    trigger: str,
+    samples: int,
+    seed: int | None,
+    **how: Any,
+) -> None:
     """Let robots, controllers and people ask one engine over the network.
 
     It goes on with its store, or starts a new one, and retrains in a process beside it. SIGTERM and Ctrl-C end it in order:
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
     machines reach it only with --host, which wants --token-file, and should have --cert and --key.
     """
-    must_have_serve()
-    import sys
-
+    must_have_serve(*(["asyncua"] if how["opcua"] else []))
+    from ..cells import RtdeRecorder
     from ..engine import DataEngine
-    from ..serve.logs import log_lines_to
     from ..serve.server import Serving, tell_safe_mode
     from ..serve.server import serve as serve_cell
 
@@ -78,12 +96,13 @@ def serve(choice: RecipeChoice, store: str, shadow: bool, xmlrpc: bool, page: bo
             engine.set_shadow(True, "dengine serve --shadow")
         return engine
 
-    log_lines_to(sys.stderr)
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
-    serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
+    recorder = partial(RtdeRecorder, robot, trigger, samples) if robot else None
+    serve_cell(make, store, Serving(interfaces=interfaces, recorder=recorder, **how), click.echo)
 
 
-def must_have_serve() -> None:
+def must_have_serve(*beside: str) -> None:
     """SettingError where the server cannot run; asked before anything is made or begun."""
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[serve]".')
+    if missing := [name for name in (*NEEDED, *beside) if find_spec(name) is None]:
+        extras = "serve,opcua" if "asyncua" in missing else "serve"
+        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[{extras}]".')

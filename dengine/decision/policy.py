@@ -81,6 +81,7 @@ class Policy:
         check, escape, false_reject : what a verification, a bad part accepted and a good part rejected cost, in one unit.
         how : `recipe`, `alphas`, `lower_bounds`, `repeats`, `n_jobs` and more, as `experiments.cost_curve.cost_curve` takes
             them; its `CostCurve` says what each policy would have cost, and how sure that is.
+        It pays, or may pay: only `CostCurve.verdict` tells the two apart, so try it in the shadow mode first.
         Raises SettingError where nothing is cheaper than verifying everything, with what the cheapest policy costs.
         """
         curve = import_module(CURVE).cost_curve(  # from far above: it plays engines

@@ -12,7 +12,8 @@ What the choice does to its own figures: the cheapest of many candidates is part
 of the shuffles, with half an error added to each count of them, and reported on the other. That takes the luck of the order
 out, and not that of the recordings: every shuffle plays the same parts. Their luck is what the interval is for, whose unit
 is a part and not a decision; it holds for a policy that was named before, and is a little too narrow for one that was
-picked among many. Parts that were recorded later, and played no role in the choice, are the only clean test.
+picked among many. Nor does it know that other recordings may let more or less be decided. Parts that were recorded later,
+and played no role in the choice, are the only clean test; what choices were worth on such is among what was measured.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from ..errors import DataError
 from ..records import FITS
@@ -21,6 +22,8 @@ class Asked:
     labels: str | os.PathLike[str] | None = None
     fit: str | None = None
     rate_hz: float | None = None
+    trigger: Any = None
+    topic: str | None = None
 
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
@@ -35,6 +38,12 @@ class Asked:
             raise DataError(f"Expected 1 or more samples, got {self.samples}.")
         if len(set(self.channels)) != len(self.channels):
             raise DataError(f"Expected each channel once, got {', '.join(self.channels)}.")
+
+    def refuse_cutting(self, what: str) -> None:
+        """DataError for options that cut a stream, where what is read is no stream."""
+        idle = [name for name in ("trigger", "topic") if getattr(self, name) is not None]
+        if idle:
+            raise DataError(f"Expected no {' or '.join(idle)} for {what}: it is cut into insertions already; leave it out.")
 
     def refuse(self, what: str, *names: str) -> None:
         """DataError for options that say nothing to what is read."""

@@ -25,7 +25,7 @@ NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
 LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
-FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source")
+FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion")
 
 
 def label_of(word: Any) -> int:

@@ -14,10 +14,13 @@ from ..errors import DataError
 from ..outputs import DATABASES
 from .arrays import from_pair, read_hdf5, read_npz
 from .asked import Asked, names_of
+from .bag import is_stream
 from .dataset import Dataset
 from .folder import read_folder
+from .insertions import read_bag
 from .lengths import refit
 from .tables import from_frame, read_csv, read_parquet
+from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 Reader = Callable[[Path, str, Asked], Dataset]
@@ -42,13 +45,15 @@ def load_dataset(
     labels: str | os.PathLike[str] | None = None,
     fit: str | None = None,
     rate_hz: float | None = None,
+    trigger: Trigger | str | None = None,
+    topic: str | None = None,
 ) -> Dataset:
     """A data set from recordings as people have them.
 
     source : the name of a bundled set; a folder of CSV files, one an insertion; a wide table, a row an insertion, as .csv,
-        .parquet or a DataFrame; an .npz or HDF5 file with X (n, T) or (n, C, T), times the number `scale` where one is
-        stored, and y (n,); the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y), where X
-        may be a list of traces of any length.
+        .parquet or a DataFrame; one long recording as .mcap, or a rosbag2 folder of them; an .npz or HDF5 file with
+        X (n, T) or (n, C, T), times the number `scale` where one is stored, and y (n,); the SQLite file of a store, for the
+        labelled traces in it; a `Dataset`; a pair (X, y), where X may be a list of traces of any length.
     samples : of each trace, the first so many; with `fit="resample"` the points that the whole is put on.
     part : the name of the array, or column, of parts' numbers, texts or whole numbers; for a folder a column of `labels`.
         Where there is no `part`, every trace is a part of its own.
@@ -60,12 +65,17 @@ def load_dataset(
     fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
         are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
     rate_hz : instead of what the timestamps tell, which are then not looked at.
+    trigger : of one long recording, when an insertion begins, a `Trigger` or its text (`as_trigger`).  topic : of its
+        wrench, where there are several. Its channels are FX ... MZ, FZ if not given; its `label` is the topic that tells
+        them, and its file of `labels` names the insertions by number. Not given, `samples` is two seconds.
 
     A recording that cannot be read, or not honestly be fitted, becomes a `Fault` in `faults`, and the others are kept. A
     number that is missing is a NaN, which the engine finds. `spec` is the contract for live traces of the same form.
     Raises DataError where nothing can be read, or the options do not fit what is there.
     """
-    asked = Asked(samples, part, names_of(channel), label, labels, fit, rate_hz)
+    asked = Asked(samples, part, names_of(channel), label, labels, fit, rate_hz, trigger, topic)
+    if not is_stream(source):
+        asked.refuse_cutting("what is no .mcap file, nor a bag")
     if isinstance(source, Dataset):
         asked.refuse("a Dataset", "label", "labels")
         return refit(source, asked)
@@ -83,12 +93,14 @@ def load_dataset(
 
 
 def _read(path: Path, asked: Asked) -> Dataset:
+    if is_stream(path):
+        return read_bag(path, path.stem, asked)
     if path.is_dir():
         return read_folder(path, asked)
     if not path.is_file():
         raise DataError(
-            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5), a store, or a folder of "
-            f"CSV files; {path} is none of these."
+            f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5, .mcap), a store, or a "
+            f"folder of CSV files; {path} is none of these."
         )
     suffix = path.suffix.lower()
     if _is_database(path):
@@ -96,7 +108,7 @@ def _read(path: Path, asked: Asked) -> Dataset:
         found: Dataset = import_module(STORED).read_store(path, path.stem, asked)
         return found
     if suffix not in (".npz", *READERS) and not zipfile.is_zipfile(path):
-        raise DataError(f"Expected a file .npz, .csv, .parquet or .h5, got {path}; save it as one of these.")
+        raise DataError(f"Expected a file .npz, .csv, .parquet, .h5 or .mcap, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
 

@@ -75,7 +75,8 @@ def read_token(file: Path) -> str:
             mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(4096)
     except OSError as error:
         raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
-    if mode & 0o077:
+    # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
+    if mode & (0o037 if _is_credential(file) else 0o077):
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
     token = text.strip()
     if len(token) < SHORTEST or not token.isascii() or not token.decode("ascii").isprintable() or b" " in token:
@@ -84,6 +85,12 @@ def read_token(file: Path) -> str:
             f"make one: (umask 077; openssl rand -hex 24 > {file})"
         )
     return token.decode("ascii")
+
+
+def _is_credential(file: Path) -> bool:
+    """Whether systemd handed this file to the service, `LoadCredential`: nobody else gets into its folder."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY", "")
+    return folder != "" and file.absolute().parent == Path(folder)
 
 
 def is_loopback(host: str) -> bool:

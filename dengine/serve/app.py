@@ -7,16 +7,18 @@ Each interface is a module of this package with `routes(service)`; `INTERFACES` 
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.routing import BaseRoute
 
 from .access import Access
+from .calls import Recorder
 from .guard import Guard
 from .problems import HANDLERS
 from .service import CellService
@@ -30,14 +32,17 @@ def create_app(
     access: Access | None = None,
     interfaces: Sequence[str] = INTERFACES,
     beside: Sequence[Beside] = (),
+    recorder: Recorder | None = None,
 ) -> Starlette:
     """The application; whoever made the service closes it, once the application has ended.
 
     access : who may ask, and how much; None: whoever is on this machine.
     interfaces : modules of this package that answer.
     beside : what runs in the same loop as long as the application does, an OPC UA server for one.
+    recorder : of what a robot's program asks to decide on by `decide_recorded`; whoever made it closes it.
     """
-    routes: list[BaseRoute] = [route for name in interfaces for route in routes_of(name, service)]
+    given: dict[str, dict[str, Any]] = {"xmlrpc": {"recorder": recorder}}
+    routes: list[BaseRoute] = [route for name in interfaces for route in routes_of(name, service, given.get(name, {}))]
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -51,11 +56,13 @@ def create_app(
             yield
 
     guard = Middleware(Guard, access=access or Access())
-    return Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app.router.redirect_slashes = False  # a robot does not follow; and where to, a request's Host would say
+    return app
 
 
-def routes_of(name: str, service: CellService) -> Sequence[BaseRoute]:
-    """The routes of one interface."""
+def routes_of(name: str, service: CellService, given: Mapping[str, Any]) -> Sequence[BaseRoute]:
+    """The routes of one interface, given what it wants beside the service."""
     module = f"{__package__}.{name}"
-    found: Sequence[BaseRoute] = import_module(module).routes(service) if find_spec(module) else ()
+    found: Sequence[BaseRoute] = import_module(module).routes(service, **given) if find_spec(module) else ()
     return found

@@ -19,6 +19,7 @@ from starlette.routing import BaseRoute, Route
 from .. import __version__
 from ..documents import plain
 from ..errors import ReportError, TraceError
+from ..labels import as_success
 from ..records import Action, Decision
 from ..store.base import Store
 from ..store.records import StoredDecision
@@ -69,14 +70,15 @@ class HttpApi:
     async def report(self, request: Request) -> Response:
         """Report what became of a decision; 404 for an unknown one, 409 for a label against the first."""
         said = await report(request)
+        success = as_success(said.success)
         try:
-            told = await self.service.report(said.id, said.success)
+            told = await self.service.report(said.id, success)
         except ReportError as error:
             raise Refusal(await self._status_of(said.id), str(error)) from error
         return answered(plain(told))
 
     async def _status_of(self, decision_id: str) -> int:
-        """Why a report was refused: its id or its label is none, its decision is unknown, or contradicts it."""
+        """Why a report was refused: its id is none, its decision is unknown, or contradicts it."""
         try:
             known = await self.service.find(decision_id)
         except ReportError:  # it is no id

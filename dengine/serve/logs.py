@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TextIO
 
@@ -30,16 +32,22 @@ def _said(text: str) -> str:
     return json.dumps(without_password(text))
 
 
-def log_lines_to(stream: TextIO) -> None:
-    """Have every logger write such lines; uvicorn only what it fails at, for what it refuses is answered and not told."""
+@contextmanager
+def log_lines_to(stream: TextIO) -> Iterator[None]:
+    """Have every logger write such lines; uvicorn none, for what it refuses is answered, and what fails is told here."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(Lines())
-    root = logging.getLogger()
+    root, ours, theirs = (logging.getLogger(name) for name in ("", "dengine", "uvicorn"))
+    handlers, levels = root.handlers[:], [logger.level for logger in (root, ours, theirs)]
     root.handlers[:] = [handler]
-    root.setLevel(logging.WARNING)
-    logging.getLogger("dengine").setLevel(logging.INFO)
-    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "uvicorn.asgi"):
-        logger = logging.getLogger(name)
-        logger.handlers.clear()
-        logger.propagate = True
-        logger.setLevel(logging.CRITICAL)
+    _set_levels((root, ours, theirs), (logging.WARNING, logging.INFO, logging.CRITICAL))
+    try:
+        yield
+    finally:
+        root.handlers[:] = handlers
+        _set_levels((root, ours, theirs), levels)
+
+
+def _set_levels(loggers: Iterable[logging.Logger], levels: Iterable[int]) -> None:
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from http import HTTPStatus
 
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from ..errors import BusyError, DengineError, StoreError
@@ -65,6 +65,11 @@ def of_http_exception(request: Request, error: Exception) -> Response:
     return problem(error.status_code, said.get(error.status_code, str(error.detail)), error.headers)
 
 
+def of_disconnect(request: Request, error: Exception) -> Response:
+    """What nobody reads: the client hung up within its request."""
+    return problem(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
+
+
 def of_fault(request: Request, error: Exception) -> Response:
     """The answer to what nobody foresaw; the log says what it was, the answer does not."""
     log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
@@ -75,5 +80,6 @@ HANDLERS = {
     Refusal: of_refusal,
     DengineError: of_dengine_error,
     HTTPException: of_http_exception,
+    ClientDisconnect: of_disconnect,
     Exception: of_fault,
 }

@@ -7,10 +7,12 @@ import signal
 import socket
 import ssl
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -22,7 +24,9 @@ from ..errors import SettingError
 from ..records import RetrainReport
 from .access import Access, is_loopback, read_token
 from .app import INTERFACES, Beside, create_app
+from .calls import Recorder
 from .connections import limited
+from .logs import log_lines_to
 from .retraining import retraining_process
 from .service import DEADLINE, Answer, CellService, Told
 
@@ -39,6 +43,9 @@ class Serving:
     token_file : of the token; None only where no other machine reaches the server.
     cert, key : PEM files; None: no TLS.
     allow_hosts : names by which the server is called, beside localhost.
+    opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
+    opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
+    recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
     """
 
     host: str = "127.0.0.1"
@@ -53,6 +60,10 @@ class Serving:
     connections: int = 100
     interfaces: Sequence[str] = INTERFACES
     beside: Sequence[Beside] = field(default=())
+    opcua: int | None = None
+    opcua_cert: Path | None = None
+    opcua_key: Path | None = None
+    recorder: Callable[[], AbstractContextManager[Recorder]] | None = None
 
     def access(self) -> Access:
         """Who may ask; SettingError where other machines reach the server and it has no token."""
@@ -79,14 +90,20 @@ def serve(
     say : told where it listens, once it does.
     SettingError for a port that is in use, and for files that cannot be used; what `make` raises.
     """
-    access, tls = serving.access(), _tls(serving.cert, serving.key)
-    sys.setswitchinterval(SWITCH)
-    with bound(serving.host, serving.port) as listening, retraining_process() as executor:
+    tls, access = _tls(serving.cert, serving.key), serving.access()
+    with (
+        bound(serving.host, serving.port) as listening,
+        log_lines_to(sys.stderr),
+        quick_switches(),
+        retraining_process() as executor,
+        serving.recorder() if serving.recorder else nullcontext() as recorder,
+    ):
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
-            app = create_app(service, access, serving.interfaces, serving.beside)
-            config = uvicorn.Config(app, **_how(serving) | tls)
+            beside = (*serving.beside, *_opcua(serving, access))
+            app = create_app(service, access, serving.interfaces, beside, recorder)
+            config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
             server = CellServer(config, service, lambda: say(f"{line}{'' if access.token else ', to this machine alone'}."))
@@ -95,7 +112,17 @@ def serve(
             service.close()
 
 
-def _how(serving: Serving) -> dict[str, Any]:
+def _opcua(serving: Serving, access: Access) -> list[Beside]:
+    """What speaks OPC UA, where it is asked for."""
+    if serving.opcua is None:
+        return []
+    from .opcua import opcua_server
+
+    token, cert, key = access.token or None, serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
+    return [partial(opcua_server, port=serving.opcua, host=serving.host, token=token, cert=cert, key=key)]
+
+
+def uvicorn_options(serving: Serving) -> dict[str, Any]:
     """What uvicorn is told; its own words in the log are ours to say."""
     limits = {"timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE, "ws": "none", "lifespan": "on"}
     silent = {"log_config": None, "access_log": False, "server_header": False, "proxy_headers": False}
@@ -125,6 +152,9 @@ class CellServer(uvicorn.Server):
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """SIGTERM and SIGINT ask for an end; uvicorn would raise them again once it has come."""
+        if threading.current_thread() is not threading.main_thread():  # Python delivers signals to that one alone
+            yield
+            return
 
         def end(number: int, frame: FrameType | None) -> None:
             log.info("%s: ending, what is in line is answered", signal.Signals(number).name)
@@ -137,6 +167,17 @@ class CellServer(uvicorn.Server):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+@contextmanager
+def quick_switches() -> Iterator[None]:
+    """Have the engine's thread and the one that answers give each other Python's lock without delay."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 @contextmanager

@@ -112,7 +112,13 @@ class CellService:
         TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
         """
         begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else as_id(request)
-        job = self._put(lambda engine, late: engine.decide(trace, part, decision_id=id_, late=late))
+
+        def work(engine: DataEngine, late: bool) -> Decision:
+            # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
+            given = id_ if late or request is not None else None
+            return engine.decide(trace, part, decision_id=given, late=late)
+
+        job = self._put(work)
         answer = asyncio.wrap_future(job.future)
         await asyncio.wait([answer], timeout=self.deadline)
         if answer.done() or not job.give_up():
@@ -213,7 +219,7 @@ class CellService:
 
     def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
         try:
-            engine = make()
+            engine = _opened(make)
         except BaseException as error:  # raised where the service is made
             opened.set_exception(error)
             return
@@ -244,6 +250,16 @@ class CellService:
         for loop, changed in tuple(self._listeners):
             with suppress(RuntimeError):  # its loop has ended
                 loop.call_soon_threadsafe(changed.set)
+
+
+def _opened(make: Callable[[], DataEngine]) -> DataEngine:
+    engine = make()
+    try:
+        engine.know_ids()
+    except BaseException:
+        engine.close()
+        raise
+    return engine
 
 
 def _report(engine: DataEngine, decision_id: str, success: bool) -> Told:

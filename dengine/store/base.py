@@ -88,6 +88,9 @@ class Store(StoreViews, Protocol):
     def get_decision(self, decision_id: str) -> StoredDecision | None:
         """Return the decision with its trace, queued ones included; None where it is unknown."""
 
+    def decision_ids(self) -> list[str]:
+        """Return the ids of every decision, in any order."""
+
     def put_label(
         self,
         decision_id: str,

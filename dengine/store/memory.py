@@ -101,6 +101,10 @@ class MemoryStore(MemoryHistory, MemoryViews):
             return stored_decision(kept)
         return stored_decision(kept, self._said.get(decision_id, label.given.success), label.given.source)
 
+    def decision_ids(self) -> list[str]:
+        """Return the ids of every decision, in any order."""
+        return [*self._open, *self._done]
+
     def put_label(
         self,
         decision_id: str,

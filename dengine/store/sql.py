@@ -137,6 +137,12 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         check_trace(rows[0], self._database.name)
         return read_decision(rows[0])
 
+    def decision_ids(self) -> list[str]:
+        """Return the ids of every decision, in any order; what is queued is written first."""
+        self.flush()
+        with self._database.transaction(write=False) as connection:
+            return list(connection.execute(ask.ids_query(self.cell_id)).scalars())
+
     # Labels
 
     def put_label(

@@ -50,6 +50,11 @@ def decision_query(cell_id: str, decision_id: str) -> Query:
     return sa.select(*columns).select_from(DECISION.join(TRACE, traces).outerjoin(LABEL, LABEL_OF_DECISION)).where(mine)
 
 
+def ids_query(cell_id: str) -> Query:
+    """The ids of every decision."""
+    return sa.select(DECISION.c.id).where(DECISION.c.cell_id == cell_id)
+
+
 def held_query(cell_id: str, ids: Sequence[str]) -> Query:
     """What labels repeat of these decisions, and the labels that they have already."""
     columns = (

@@ -61,6 +61,8 @@ def _meant(where: HistoryFilter) -> list[sa.ColumnElement[bool]]:
     found: list[sa.ColumnElement[bool]] = []
     if where.action is not None:
         found.append(DECISION.c.action == where.action.value)
+    if where.predicted is not None:
+        found.append(DECISION.c.predicted == where.predicted.value)
     if where.reason is not None:
         found.append(DECISION.c.reason == where.reason.value)
     if where.label is not None:

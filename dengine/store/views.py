@@ -63,6 +63,7 @@ class PastDecision:
 class HistoryFilter:
     """Which decisions are meant; None: all.
 
+    predicted : what the model alone would have done.
     label : good, bad or none.  since, until : times in seconds, the first included, the last not.
     Raises StoreError for a label that is none of these.
     """
@@ -72,6 +73,7 @@ class HistoryFilter:
     label: str | None = None
     since: float | None = None
     until: float | None = None
+    predicted: Action | None = None
 
     def __post_init__(self) -> None:
         if self.label is not None and self.label not in LABELS:
@@ -85,6 +87,7 @@ class HistoryFilter:
             and (self.label is None or past.label == self.label)
             and (self.since is None or past.time >= self.since)
             and (self.until is None or past.time < self.until)
+            and (self.predicted is None or past.predicted is self.predicted)
         )
 
 

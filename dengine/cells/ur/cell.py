@@ -82,7 +82,6 @@ class UrCell:
 
     def insert(self) -> NDArray[np.float32]:
         """Pick a part, push it in, and give the force: (T,) or (C, T), NaN where a sample never came."""
-        self.recorder.arm()
         self._ask(Verb.INSERT)
         if self.last is None:  # answered, and no start was seen: the trigger fell into a gap, or is the wrong one
             self.last = self.recorder.cutter.cut()
@@ -103,6 +102,7 @@ class UrCell:
 
     def _ask(self, verb: Verb) -> Answer:
         """Give one order, and read until it is answered; an insertion also until its trace is over."""
+        self.recorder.arm()  # what came while nothing was asked is nobody's
         self._number = after(self._number)
         self.last = None if verb is Verb.INSERT else self.last
         self.recorder.stream.write((word(self._number, verb),))

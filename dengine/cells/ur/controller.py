@@ -65,6 +65,7 @@ class FakeController:
     speed : cycles against real time; None: as fast as clients read.  troubles : what goes wrong, and when.
     held : input fields that another client holds.  unknown : output fields that it does not have.
     refuses : requests that it says no to, Kind.VERSION or Kind.START.  version : of its software.
+    patience : seconds after which it hangs up on a client that does not read, as real ones do when their buffer is full.
     `lost` : part and sample of every package of an insertion that no client was sent.  `said` : texts that clients sent.
     """
 
@@ -79,9 +80,11 @@ class FakeController:
         unknown: Collection[str] = (),
         refuses: Collection[Kind] = (),
         version: tuple[int, int, int, int] = (5, 11, 0, 0),
+        patience: float = 5.0,
     ) -> None:
         self.program, self.host, self.speed = program, host, speed
         self.held, self.unknown, self.refuses, self.version = set(held), set(unknown), set(refuses), version
+        self.patience = struct.pack("ll", int(patience), int(patience % 1 * 10**6))  # a timeval
         self.lost: set[tuple[int, int]] = set()
         self.said: list[str] = []
         self.connections_made = 0
@@ -145,6 +148,7 @@ class FakeController:
             except OSError:  # closed
                 return
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, self.patience)
             thread = threading.Thread(target=self._serve, args=(Connection(sock),), daemon=True)
             self._threads.append(thread)
             thread.start()

@@ -29,8 +29,8 @@ class Connection:
         """Whether the socket took it."""
         try:
             self.socket.sendall(data)
-        except OSError:
-            self.started = False
+        except OSError:  # gone, or it does not read
+            self.hang_up()
         return self.started
 
     def hang_up(self) -> None:

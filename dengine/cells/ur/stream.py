@@ -16,6 +16,7 @@ from .protocol import PORT
 LATE_S = 0.02  # beyond the quickest package's way: ten packages
 CREEP = 0.01  # two clocks drift apart; a controller's is not off by a hundredth
 KEPT_S = 60.0  # of packages, for whoever reads them late
+FRESH_S = 10.0  # an input that is older is not repeated: no controller is off and on again sooner
 RETRY_S = (0.05, 1.0)  # between attempts to connect: the first, and the longest
 
 
@@ -72,8 +73,8 @@ class RtdeStream:
     """Reads in a thread of its own, so that no package waits for whoever uses them. Opened by `with`, or `open`.
 
     Connecting for the first time raises CellError; a connection lost later is made again, for as long as it takes, and what
-    was written last is written again, unless the controller itself began anew: it knows nothing of what it was told before.
-    clock : seconds, for telling late packages.
+    was written last is written again, unless that was long ago, or the controller itself began anew: it knows nothing of
+    what it was told before. clock : seconds, for telling late packages, and old inputs.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class RtdeStream:
         self._first = 0  # the position of the first row that is kept
         self._news = threading.Condition()
         self._written: tuple[float, ...] | None = None
+        self._written_at = 0.0
         self._client: RtdeClient | None = None
         self._session = 0
         self._closing = threading.Event()
@@ -154,7 +156,7 @@ class RtdeStream:
     def write(self, values: Sequence[float] | None) -> None:
         """Set the inputs: now, or as soon as there is a connection again. None: what was written is not to be repeated."""
         with self._news:
-            self._written = None if values is None else tuple(values)
+            self._written, self._written_at = None if values is None else tuple(values), self._clock()
             self._send()
 
     def _send(self) -> None:
@@ -180,9 +182,13 @@ class RtdeStream:
             arrival = self._clock()
             self._keep([Row(values, late.is_late(values[0], arrival), self._session) for values in rows])
             if again:
-                with self._news:
-                    self._send()
+                self._write_again()
             again = False
+
+    def _write_again(self) -> None:
+        with self._news:
+            if self._clock() - self._written_at < FRESH_S:
+                self._send()
 
     def _keep(self, rows: list[Row]) -> None:
         with self._news:

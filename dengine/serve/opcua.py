@@ -1,0 +1,276 @@
+"""OPC UA: what a PLC calls and a SCADA reads.
+
+    async with opcua_server(service, port=4840):
+        ...
+
+One object, Cell, in the namespace `urn:dengine:cell`: the methods Decide and Report, and read-only variables, by NodeIds of
+text that stay as they are (`VARIABLES`). The variables follow the store, at most twice a second. The begin and the end of
+an alarm are events of the Server object as well.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
+from functools import wraps
+from typing import Any
+
+import numpy as np
+from asyncua import ua
+from asyncua.common.node import Node
+from asyncua.server.event_generator import EventGenerator
+from asyncua.ua import VariantType
+from asyncua.ua.attribute_ids import AttributeIds
+from asyncua.ua.status_codes import StatusCodes
+
+from ..errors import DengineError, SettingError
+from .calls import RobotCalls
+from .opcua_limits import BoundedServer
+from .overview import Overview, overview
+from .service import CellService
+
+log = logging.getLogger("dengine")
+NAMESPACE = "urn:dengine:cell"
+CELL = "Cell"
+EVERY, SELDOM = 0.5, 5.0  # seconds between two looks at the store, at least and at most
+ALARM, ALARM_ENDED = 700, 100  # severities, of 1 to 1000
+MOST_CHANNELS = 1000
+
+Value = Callable[[Overview], Any]
+VARIABLES: Mapping[str, tuple[VariantType, Value, str]] = {
+    "Decisions": (VariantType.UInt32, lambda o: o.decisions, "decisions since the cell's birth"),
+    "VerifiedShare": (VariantType.Double, lambda o: o.verified_share, "verified share of the newest 500 decisions, 0 to 1"),
+    "Accepted": (VariantType.UInt32, lambda o: o.accepted, "parts accepted without a check"),
+    "Rejected": (VariantType.UInt32, lambda o: o.rejected, "parts rejected without a check"),
+    "Bad": (VariantType.UInt32, lambda o: o.bad, "accepted parts that are known to have been bad"),
+    "ModelVersion": (VariantType.UInt32, lambda o: o.version, "of the model that answers; 0 before the first retrain"),
+    "SafeMode": (VariantType.Boolean, lambda o: bool(o.safe_mode), "everything is verified, by the engine's own choice"),
+    "SafeModeReason": (VariantType.String, lambda o: o.safe_mode, "why; empty where it is not"),
+    "Shadow": (VariantType.Boolean, lambda o: o.shadow, "everything is verified, the model is only asked"),
+    "Alarm": (VariantType.Boolean, lambda o: bool(o.alarm), "somebody should look"),
+    "AlarmText": (VariantType.String, lambda o: o.alarm, "at what; empty where there is nothing"),
+    "Waiting": (VariantType.UInt32, lambda o: o.waiting, "requests in line"),
+    "Late": (VariantType.UInt32, lambda o: o.late, "answers that came too late, since the server's start"),
+    "Busy": (VariantType.UInt32, lambda o: o.busy, "requests that were refused since the line was full, since the start"),
+}
+REFUSED = "LastRefused"  # a variable too: why the newest call was refused, for who sets a PLC up
+
+Argument = tuple[str, VariantType, bool, str]  # name, type, an array, what it is
+DECIDE: tuple[list[Argument], list[Argument]] = (
+    [
+        ("Trace", VariantType.Float, True, "samples, channel by channel"),
+        ("Channels", VariantType.UInt32, False, "1, or how many channels the trace has"),
+        ("Request", VariantType.String, False, "an id of the caller's, once for every part; empty: one is made"),
+        ("Part", VariantType.String, False, "the part's number; empty: none"),
+    ],
+    [
+        ("Action", VariantType.Int32, False, "0 verify, 1 accept, 2 reject"),
+        ("Id", VariantType.String, False, "for Report; empty: nothing was recorded, verify"),
+        ("Reason", VariantType.String, False, "why, as in Reason; busy: the line is full"),
+        ("Lower", VariantType.Double, False, "bound on the success probability, from below"),
+        ("Upper", VariantType.Double, False, "and from above"),
+        ("ModelVersion", VariantType.UInt32, False, "of the model that answered"),
+    ],
+)
+REPORT: tuple[list[Argument], list[Argument]] = (
+    [("Id", VariantType.String, False, "as Decide gave it"), ("Success", VariantType.Boolean, False, "True: good")],
+    [("Kept", VariantType.Boolean, False, "False: nothing under this id was recorded, or the server is busy")],
+)
+
+
+@asynccontextmanager
+async def opcua_server(
+    service: CellService,
+    port: int = 4840,
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    cert: str | os.PathLike[str] | None = None,
+    key: str | os.PathLike[str] | None = None,
+) -> AsyncIterator[BoundedServer]:
+    """Serve the cell over OPC UA in this loop, as long as the context lasts.
+
+    port : 0 takes a free one, `server.port`.  token : the password of the user `dengine`; None: anyone may ask.
+    cert, key : PEM or DER files; with them only Basic256Sha256, signed and encrypted, is spoken.
+    SettingError for an address other than this machine's without token, cert and key; OSError for a port in use.
+    """
+    secure = cert is not None and key is not None
+    if not (_is_local(host) or (secure and token)):
+        raise SettingError(f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on 127.0.0.1.")
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it writes tracebacks of whatever strangers send
+    server = BoundedServer(token)
+    await server.init()
+    server.set_endpoint(f"opc.tcp://{_in_url(host)}:{port}/dengine")
+    server.set_server_name("dengine")
+    await server.set_application_uri("urn:dengine:server")
+    policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt if secure else ua.SecurityPolicyType.NoSecurity
+    server.set_security_policy([policy])
+    if cert is not None and key is not None:
+        await server.load_certificate(os.fspath(cert))
+        await server.load_private_key(os.fspath(key))
+    space = AddressSpace(server, service)
+    await space.build()
+    async with server:
+        following = asyncio.create_task(space.follow())
+        try:
+            yield server
+        finally:
+            following.cancel()
+            with suppress(asyncio.CancelledError):
+                await following
+
+
+def _is_local(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+class AddressSpace:
+    """The nodes of one cell."""
+
+    def __init__(self, server: BoundedServer, service: CellService) -> None:
+        self._server, self._service, self._calls = server, service, RobotCalls(service)
+        self._nodes: dict[str, Node] = {}
+        self._alarm = ""
+
+    async def build(self) -> None:
+        """Make the object, its variables and methods, and what tells of alarms."""
+        self._index = await self._server.register_namespace(NAMESPACE)
+        cell = await self._server.nodes.objects.add_object(self._id(CELL), self._name(CELL))
+        for name, (type_, _, text) in VARIABLES.items():
+            await self._variable(cell, name, type_, text)
+        await self._variable(cell, REFUSED, VariantType.String, "why the newest call was refused")
+        for name, call, (taken, given) in (("Decide", self.decide, DECIDE), ("Report", self.report, REPORT)):
+            checked = self._checked(call, taken, given)
+            arguments = [_argument(*each) for each in taken], [_argument(*each) for each in given]
+            await cell.add_method(self._id(f"{CELL}.{name}"), self._name(name), checked, *arguments)
+        self._events: EventGenerator = await self._server.get_event_generator()
+        self._events.event.SourceNode, self._events.event.SourceName = cell.nodeid, CELL
+
+    async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
+        """Decide on a trace, flat, channel by channel."""
+        if not 1 <= channels <= MOST_CHANNELS or len(trace) % channels or not trace:
+            raise SettingError(f"Expected as many samples of each channel, got {len(trace)} of {channels} channels.")
+        x = np.array(trace, dtype=np.float32).reshape(channels, -1)
+        answer = await self._calls.decide_on(x, request or "", part or "")
+        return [answer[name] for name in ("action", "id", "reason", "lower", "upper", "version")]
+
+    async def report(self, decision_id: str, success: bool) -> list[Any]:
+        """Report what became of a part."""
+        return [await self._calls.report(decision_id, success)]
+
+    async def follow(self) -> None:
+        """Bring the variables up to date whenever something has changed, and now and then, for ever."""
+        changed = asyncio.Event()
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._listen(changed))
+            while True:
+                changed.clear()
+                await self._look()
+                await asyncio.sleep(EVERY)  # what was decided just now is in the store by then
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(changed.wait(), SELDOM)
+
+    async def _listen(self, changed: asyncio.Event) -> None:
+        async for _ in self._service.changes():
+            changed.set()
+
+    async def _look(self) -> None:
+        try:
+            await self.update(await overview(self._service))
+        except Exception as error:  # the store is away, or the line is full: the values stay, and say that they are old
+            log.warning("the OPC UA variables could not be brought up to date: %s", error)
+            await self._grow_old()
+
+    async def update(self, now: Overview) -> None:
+        """Write how the cell is doing into the variables; an alarm that begins or ends is an event."""
+        for name, (type_, value, _) in VARIABLES.items():
+            await self._nodes[name].write_value(ua.DataValue(ua.Variant(value(now), type_)))
+        if now.alarm != self._alarm:
+            self._events.event.Severity = ALARM if now.alarm else ALARM_ENDED
+            await self._events.trigger(message=now.alarm or f"Over: {self._alarm}")
+            self._alarm = now.alarm
+
+    async def _grow_old(self) -> None:
+        for name in VARIABLES:
+            old = await self._nodes[name].read_data_value(raise_on_bad_status=False)
+            status = _status(StatusCodes.UncertainLastUsableValue)
+            await self._nodes[name].write_value(ua.DataValue(old.Value, status))
+
+    async def _variable(self, cell: Node, name: str, type_: VariantType, text: str) -> None:
+        first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
+        node = await cell.add_variable(self._id(f"{CELL}.{name}"), self._name(name), first, type_)
+        await node.write_attribute(AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
+        self._nodes[name] = node
+
+    def _checked(
+        self, call: Callable[..., Awaitable[list[Any]]], taken: list[Argument], given: list[Argument]
+    ) -> Callable[..., Awaitable[Any]]:
+        """A method as asyncua calls it: what is wrong is a status, and a line in LastRefused; nothing is raised."""
+
+        @wraps(call)
+        async def method(parent: ua.NodeId, *arguments: ua.Variant) -> Any:
+            if (wrong := _wrong(arguments, taken)) is not None:
+                return await self._refuse(wrong.StatusCode, f"Expected {_listed(taken)}.", wrong)
+            try:
+                answer = await call(*(each.Value for each in arguments))
+            except DengineError as error:
+                return await self._refuse(_status(StatusCodes.BadInvalidArgument), str(error))
+            except Exception:  # ours: the log has it, the caller verifies
+                log.exception("a call over OPC UA failed")
+                return await self._refuse(_status(StatusCodes.BadInternalError), "The server failed on this call.")
+            return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
+
+        return method
+
+    async def _refuse(self, status: ua.StatusCode, text: str, result: Any = None) -> Any:
+        line = "".join(c if c.isprintable() else " " for c in text)[:300]
+        await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(line, VariantType.String)))
+        return status if result is None else result
+
+    def _id(self, text: str) -> ua.NodeId:
+        return ua.NodeId(ua.String(text), ua.Int16(self._index))
+
+    def _name(self, text: str) -> ua.QualifiedName:
+        return ua.QualifiedName(text, self._index)
+
+
+def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> ua.CallMethodResult | None:
+    """What is wrong with a call's arguments, each by itself; None where nothing is."""
+    if len(arguments) != len(taken):
+        few = len(arguments) < len(taken)
+        return _result(StatusCodes.BadArgumentsMissing if few else StatusCodes.BadTooManyArguments)
+    good = [
+        each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
+        for each, (_, type_, array, _) in zip(arguments, taken, strict=True)
+    ]
+    if all(good):
+        return None
+    codes = [StatusCodes.Good if fine else StatusCodes.BadTypeMismatch for fine in good]
+    return _result(StatusCodes.BadInvalidArgument, codes)
+
+
+def _result(code: int, each: list[int] | None = None) -> ua.CallMethodResult:
+    return ua.CallMethodResult(_status(code), [_status(one) for one in each or []])
+
+
+def _status(code: int) -> ua.StatusCode:
+    return ua.StatusCode(ua.UInt32(code))
+
+
+def _argument(name: str, type_: VariantType, array: bool, text: str) -> ua.Argument:
+    rank, dimensions = (ua.ValueRank.OneDimension, [0]) if array else (ua.ValueRank.Scalar, [])
+    return ua.Argument(name, ua.NodeId(ua.Int32(type_.value)), rank, dimensions, ua.LocalizedText(text))
+
+
+def _listed(taken: list[Argument]) -> str:
+    return ", ".join(f"{name} ({type_.name}{' array' if array else ''})" for name, type_, array, _ in taken)

@@ -1,0 +1,129 @@
+"""XML-RPC, as a robot's program speaks it: `rpc_factory("xmlrpc", "http://HOST:8000/RPC2")`.
+
+    app = Starlette(routes=xmlrpc.routes(service))
+
+The calls are those of `RobotCalls`. Every answer is HTTP's 200 with a value or a fault, as XML-RPC wants it; only what is
+no XML-RPC at all is a 405, 413 or 415. A fault is a code and one line. The XML is read by defusedxml: no document type, no
+entity, nothing from outside; only numbers, booleans, texts and lists are taken.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import xmlrpc.client
+from collections.abc import Callable
+from typing import Any
+
+from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route
+
+from ..errors import DengineError, ReportError
+from .calls import PATIENCE, Recorder, RobotCalls
+from .service import CellService
+
+log = logging.getLogger("dengine")
+MOST = 2 << 20  # bytes of a call: 40,000 samples, as robots write them
+SMALL = 1 << 16  # bytes of a call that is read at once; more is read in a thread
+LONGEST = 300  # characters of a fault's line
+TYPES = ("text/xml", "application/xml")
+TAGS = ("int", "i4", "double", "boolean", "string", "array", "value", "params", "methodName")
+ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1")
+
+NOT_XML, NO_CALL, NO_METHOD, WRONG_ARGUMENTS, OURS = -32700, -32600, -32601, -32602, -32603  # as XML-RPC servers agreed on
+REFUSED, NO_REPORT = 1, 2  # a trace, or anything else, that breaks the contract; a report that does
+
+
+class Values(xmlrpc.client.Unmarshaller):
+    """Reads a call of numbers, booleans, texts and lists; anything else is a ResponseError."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.dispatch = {name: xmlrpc.client.Unmarshaller.dispatch[name] for name in TAGS}
+
+    def xml(self, encoding: str | None, standalone: int) -> None:
+        """The document's encoding; a ValueError for a strange one."""
+        if (encoding or "utf-8").lower() not in ENCODINGS:
+            raise ValueError(f"expected one of {', '.join(ENCODINGS)}")
+        self._encoding = ""  # expat gives text
+
+
+def parsed(body: bytes) -> tuple[str, tuple[Any, ...]]:
+    """A call's name and arguments; ValueError for what is none."""
+    values = Values()
+    parser = DefusedExpatParser(values, forbid_dtd=True)
+    parser._parser.XmlDeclHandler = lambda version, encoding, standalone: values.xml(encoding, standalone)
+    try:
+        parser.feed(body)
+        parser.close()
+        arguments, name = values.close(), values.getmethodname()
+    except Exception as error:  # whatever malformed XML does to its readers, it is malformed
+        raise ValueError(f"Expected an XML-RPC call, got what cannot be read: {type(error).__name__}.") from error
+    if name is None:
+        raise ValueError("Expected an XML-RPC call, got XML without a method's name.")
+    return name, arguments
+
+
+def routes(
+    service: CellService, recorder: Recorder | None = None, patience: float = PATIENCE, most: int = MOST
+) -> list[Route]:
+    """POST /RPC2. recorder : of the traces of `decide_recorded`, whose owner closes it.  most : bytes of a call."""
+    calls = RobotCalls(service, recorder, patience).table()
+
+    async def rpc(request: Request) -> Response:
+        if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in TYPES:
+            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
+        if request.headers.get("content-encoding", "identity") != "identity":
+            return PlainTextResponse("Expected a call that is not compressed.\n", 415)
+        body = await read(request, most)
+        if body is None:
+            return PlainTextResponse(f"Expected at most {most} bytes.\n", 413)
+        return Response(await answered(calls, body), media_type="text/xml")
+
+    return [Route("/RPC2", rpc, methods=["POST"])]
+
+
+async def read(request: Request, most: int) -> bytes | None:
+    """A request's body; None where it is longer than that, and what is too long is not read."""
+    length = request.headers.get("content-length", "0")
+    if not length.isascii() or not length.isdigit() or int(length[:12]) > most:
+        return None
+    body = bytearray()
+    try:
+        async for piece in request.stream():
+            body += piece
+            if len(body) > most:
+                return None
+    except ClientDisconnect:
+        log.info("a client hung up within its call")
+    return bytes(body)
+
+
+async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: bytes) -> bytes:
+    """The answer to a call, as XML; what goes wrong is a fault."""
+    try:
+        name, arguments = parsed(body) if len(body) <= SMALL else await asyncio.to_thread(parsed, body)
+    except ValueError as error:
+        return fault(NOT_XML, str(error))
+    if name not in calls:
+        return fault(NO_METHOD, f"Expected one of {', '.join(calls)}.")
+    call, fewest, most = calls[name]
+    if not fewest <= len(arguments) <= most:
+        return fault(WRONG_ARGUMENTS, f"Expected {fewest} to {most} arguments of {name}, got {len(arguments)}.")
+    try:
+        return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
+    except ReportError as error:
+        return fault(NO_REPORT, str(error))
+    except DengineError as error:
+        return fault(REFUSED, str(error))
+    except Exception:  # ours: the log has it, the caller verifies
+        log.exception("a call failed")
+        return fault(OURS, "The server failed on this call: verify the part.")
+
+
+def fault(code: int, text: str) -> bytes:
+    """A fault of one line, of characters that print."""
+    line = "".join(c if c.isprintable() else " " for c in text)[:LONGEST]
+    return xmlrpc.client.dumps(xmlrpc.client.Fault(code, line), methodresponse=True).encode("utf-8", "replace")

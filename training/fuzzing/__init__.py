@@ -1,0 +1,1 @@
+"""Malformed requests by the kind, for `training/fuzz_requests.py`."""
