@@ -3,6 +3,7 @@
 import asyncio
 import re
 import string
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from dengine.records import Action, Reason, Source
 from dengine.serve.app import create_app
 from dengine.serve.page.acts import ACTS
 from dengine.serve.page.history_view import history_query
+from dengine.serve.page.looking import Looking
+from dengine.serve.page.pulse import Pulse
 from dengine.serve.page.svg import Scale, element
 from dengine.serve.page.words import CATALOGUES, Words, language
 from dengine.serve.service import CellService
@@ -212,3 +215,28 @@ def test_a_choice_of_language_and_appearance_goes_into_a_cookie_and_back_to_the_
     assert "samesite=strict" in answer.headers["set-cookie"].lower()
     assert '<html lang="de" data-theme="dark"' in client.get("/how?theme=dark").text
     assert client.get("/how?theme=pink").status_code == 200
+
+
+def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService, stream: Dataset) -> None:
+    looks: list[int] = []
+
+    def slow(looking: Looking) -> int:
+        looks.append(looking.pulse.number)
+        time.sleep(0.02)
+        return len(looks)
+
+    async def reader() -> None:
+        pulse = Pulse(service)
+        looking = Looking(service, pulse)
+        assert await looking.look("view", slow) == 1
+        pulse.advance()
+        changed = pulse.number
+        assert await looking.look("view", slow) == 1  # what was found before, and whoever watches is told again
+        while pulse.number == changed:
+            await asyncio.sleep(0.01)
+        assert await looking.look("view", slow) == 2
+        looking.look_anew()
+        assert await looking.look("view", slow) == 3  # somebody did something
+
+    asyncio.run(asyncio.wait_for(reader(), 60))
+    assert len(set(looks)) == 3

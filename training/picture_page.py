@@ -21,6 +21,7 @@ FLAGS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
+SECONDS = 17  # until the newest 30 parts, by which parts an hour are counted, came at the speed of the demonstration
 PATIENT = 120_000  # ms until the model answers
 
 
@@ -51,6 +52,7 @@ def photograph(url: str, out: Path, width: int, height: int, lang: str, dark: bo
         page.goto(url)
         page.wait_for_selector("#mode.decides")
         if page.locator("section.decision").count():
+            page.wait_for_timeout(1000 * SECONDS)
             page.wait_for_selector("section.decision.accept")
         page.screenshot(path=out)
         browser.close()

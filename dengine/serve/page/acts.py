@@ -18,8 +18,7 @@ from starlette.responses import JSONResponse, Response
 
 from ...engine import DataEngine
 from ...errors import BusyError, DengineError, ReportError, SettingError
-from ..service import CellService
-from .pulse import Pulse
+from .looking import Looking
 from .templating import HEADERS
 from .words import Words
 
@@ -78,9 +77,9 @@ class RefusedError(Exception):
 class Acts:
     """The acts of one page.  token : what a request of it carries."""
 
-    def __init__(self, service: CellService, pulse: Pulse) -> None:
+    def __init__(self, looking: Looking) -> None:
         self.token = secrets.token_urlsafe(32)
-        self._service, self._pulse = service, pulse
+        self._service, self._looking = looking.service, looking
 
     async def answer(self, name: str, request: Request, w: Words) -> Response:
         """Do what a form asks for, and say what became of it; an unknown act is a 404."""
@@ -93,7 +92,7 @@ class Acts:
         except (DengineError, OSError) as error:
             said = w("act.failed", why=" ".join(str(error).split()))
             return JSONResponse({"ok": False, "said": said}, 503 if isinstance(error, BusyError) else 409, HEADERS)
-        self._pulse.advance()
+        self._looking.look_anew()
         return response
 
     async def _do(self, name: str, form: Form, author: str, w: Words) -> Response:

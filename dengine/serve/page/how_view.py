@@ -11,7 +11,7 @@ from ...store.views import PastRetrain
 from .looking import Looking
 
 NEWEST = 500  # parts that are looked at apart
-PACE = 100  # newest parts, by which parts an hour are counted
+PACE = 30  # newest parts, by which parts an hour are counted
 EVENTS = 12
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable, Hashable
 from typing import Any, TypeVar
 
@@ -13,6 +14,8 @@ from ..service import CellService
 from .pulse import Pulse
 
 MOST = 64  # looks that are kept
+REST = 10.0  # a look that took a second is not taken anew for so many: reading a large store is not to be felt
+LONGEST = 30.0  # seconds of rest
 
 T = TypeVar("T")
 
@@ -27,6 +30,7 @@ class Looking:
         self.service, self.pulse = service, pulse
         self._lock = threading.Lock()
         self._kept: dict[Hashable, tuple[Hashable, Any]] = {}
+        self._rests: dict[Hashable, float] = {}  # until when, by a view
 
     @property
     def store(self) -> Store:
@@ -38,14 +42,24 @@ class Looking:
         """Every setting as it is in force."""
         return self.service.engine.recipe
 
-    async def look(self, view: Hashable, read: Callable[[Looking], T]) -> T:
+    async def look(self, view: Hashable, read: Callable[[Looking], T], longest: float = LONGEST) -> T:
         """What `read` finds, in a worker thread; as it was found before where nothing has changed since.
 
+        longest : seconds that the view may rest after a look that took long, and be as old.
         An engine that remembers in memory is read in its own thread: its store has one thread only.
         """
         if self.store is self.service.engine.store:
-            return await self.service.ask(lambda engine: self._look(view, read))
-        return await asyncio.to_thread(self._look, view, read)
+            return await self.service.ask(lambda engine: self._look(view, read, longest))
+        found = await asyncio.to_thread(self._look, view, read, longest)
+        rest = self._rests.get(view, 0.0) - time.monotonic()
+        if rest > 0.0 and self._kept.get(view, (None,))[0] != self.pulse.number:
+            self.pulse.advance_in(rest)  # what was found is old by now: whoever watches is told when it is looked at anew
+        return found
+
+    def look_anew(self) -> None:
+        """Let the next look be fresh, however long it takes: somebody did something."""
+        self._rests.clear()
+        self.pulse.advance()
 
     def kept(self, what: Hashable, fits: Hashable, read: Callable[[], T]) -> T:
         """What `read` finds, or found when `fits` was the same: for what changes less often than the decisions."""
@@ -59,6 +73,14 @@ class Looking:
         self._kept[what] = (fits, fresh)
         return fresh
 
-    def _look(self, view: Hashable, read: Callable[[Looking], T]) -> T:
+    def _look(self, view: Hashable, read: Callable[[Looking], T], longest: float) -> T:
         with self._lock:
-            return self.kept(view, self.pulse.number, lambda: read(self))
+            begin, known = time.monotonic(), self._kept.get(view)
+            if known is not None and begin < self._rests.get(view, 0.0):
+                found: T = known[1]
+                return found
+            fresh = self.kept(view, self.pulse.number, lambda: read(self))
+            end = time.monotonic()
+            self._rests = {each: until for each, until in self._rests.items() if until > end}
+            self._rests[view] = end + min(longest, REST * (end - begin))
+            return fresh

@@ -24,6 +24,7 @@ class Pulse:
         self._task: asyncio.Task[None] | None = None
         self._turn = asyncio.Event()
         self._over = False
+        self._coming: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
         """Follow the service in the running loop; again does nothing."""
@@ -37,6 +38,11 @@ class Pulse:
         self.number += 1
         turn, self._turn = self._turn, asyncio.Event()
         turn.set()
+
+    def advance_in(self, seconds: float) -> None:
+        """`advance` then, once, whoever else asks for it meanwhile."""
+        if self._coming is None or self._coming.cancelled() or self._coming.when() < asyncio.get_running_loop().time():
+            self._coming = asyncio.get_running_loop().call_later(seconds, self.advance)
 
     async def _follow(self) -> None:
         loop, later = asyncio.get_running_loop(), None

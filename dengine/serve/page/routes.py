@@ -25,6 +25,7 @@ from .templating import STATIC, page
 from .words import CATALOGUES, Words, language
 
 View = Callable[[Request], Awaitable[Response]]
+FRESH = 0.3  # seconds that what happens now may be old, beside the time that it takes to read
 CHECK = 5.0  # seconds that the expensive verification takes, where nothing else is said: the paper's height check
 CHOICES = {"lang": tuple(CATALOGUES), "theme": ("auto", "light", "dark")}
 YEAR = 365 * 24 * 3600
@@ -52,7 +53,7 @@ class LivePage:
     def __init__(self, service: CellService, check_seconds: float) -> None:
         self._pulse = Pulse(service)
         self._looking = Looking(service, self._pulse)
-        self._acts = Acts(service, self._pulse)
+        self._acts = Acts(self._looking)
         self._check_seconds = check_seconds
 
     def routes(self) -> list[BaseRoute]:
@@ -74,7 +75,7 @@ class LivePage:
 
     async def now(self, request: Request) -> Response:
         """What happens now."""
-        view = await self._looking.look("now", now_view)
+        view = await self._looking.look("now", now_view, FRESH)
         return self._page(request, "now", now=view, how=await self._how())
 
     async def how(self, request: Request) -> Response:
