@@ -240,3 +240,15 @@ def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService,
 
     asyncio.run(asyncio.wait_for(reader(), 60))
     assert len(set(looks)) == 3
+
+
+def test_how_near_an_alarm_is_is_shown_where_it_is_watched(make_data, tmp_path: Path) -> None:
+    data, file = make_data(80, samples=60, seed=3), tmp_path / "watched.db"
+    recipe = RECIPE.with_policy(stops="all")
+    service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=30.0)
+    try:
+        cell_runs(service, data, 70)
+        with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
+            assert client.get("/how").text.count("<meter") == 3
+    finally:
+        service.close()
