@@ -23,15 +23,8 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = (
-    "test_docs",
-    "test_notebooks",
-    "test_page",
-    "test_fuzz_requests",
-    "test_golden",
-    "test_training",
-    "test_cli",
-    "test_estimators",
-    "test_reducers",
+    *("test_docs", "test_notebooks", "test_page", "test_fuzz_requests", "test_golden", "test_training", "test_cli"),
+    *("test_estimators", "test_reducers"),
 )
 # The C++ programs are built once, by one worker.
 GROUPS = dict.fromkeys(("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program"), "cpp")
