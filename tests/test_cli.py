@@ -97,6 +97,7 @@ def test_version_is_the_packages() -> None:
 
 
 VERBS = sorted(main.commands)
+ENDLESS = ("demo-cell", "serve")  # they go on until they are told to end, and speak through what they serve
 LESS = {  # so that an example takes seconds; its own options are all read
     "compare": ["--repeats", 1, "--cycles", 150],
     "costs": ["--alphas", 0.5, "--lower-bounds", 0.8, "--cycles", 100, "--n-jobs", 1],
@@ -123,7 +124,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("verb", ENDLESS)
+def test_the_example_of_a_verb_without_an_end_listens_and_ends_when_it_is_told_to(verb: str, tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn")
+    words = [*example_of(verb), "--port", "0"]  # of two, the last counts
+    started = [sys.executable, "-m", *words]
+    with subprocess.Popen(started, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        said = process.stdout.readline()
+        process.terminate()
+        assert process.wait(120) == 0
+    assert "is served at http://127.0.0.1:" in said
+
+
+@pytest.mark.parametrize("verb", [verb for verb in VERBS if verb not in ENDLESS])
 def test_every_help_ends_in_a_command_that_works(
     verb: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,7 +161,7 @@ def test_the_programs_own_example_parses() -> None:
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_speaks_json_and_explains_each_option(verb: str) -> None:
     options = [p for p in main.commands[verb].params if isinstance(p, click.Option)]
-    assert "--json" in {name for option in options for name in option.opts}
+    assert ("--json" in {name for option in options for name in option.opts}) == (verb not in ENDLESS)
     assert not {option.name for option in options if not option.help}
 
 

@@ -69,7 +69,9 @@ class Demo:
 @click.option("--keep", metavar="FILE", help="A new file that remembers everything.  [default: forgotten at the end]")
 @seed_option
 def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: str, keep: str | None, seed: int) -> None:
-    """Show a cell at work: parts are inserted and decided on, and a page shows it live.
+    """Show a cell at work, live on a page.
+
+    Parts are inserted and decided on, and the page shows what became of them.
 
     No robot is needed: recordings are played, or simulated. They go the way that a robot's traces go.
     Only this computer can see the page. Ctrl-C ends it.

@@ -78,7 +78,7 @@ def serve(
     seed: int | None,
     **how: Any,
 ) -> None:
-    """Let robots, controllers and people ask one engine over the network.
+    """Answer robots, controllers and people.
 
     It goes on with its store, or starts a new one, and retrains in a process beside it. SIGTERM and Ctrl-C end it in order:
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
