@@ -470,7 +470,7 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
             assert client.get("/status").json()["shadow"] is True
             for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", port, "already in use")):
                 refused = CliRunner().invoke(main, ["serve", "--store", str(tmp_path / store), "--port", at])
-                assert (refused.exit_code, refused.output.count("\n")) == (1, 1), refused.output
+                assert (refused.exit_code, refused.output.count("\n")) == (1, 1), (refused.output, refused.exc_info)
                 assert text in refused.output
             process.send_signal(signal.SIGTERM)
             assert process.wait(60) == 0
@@ -498,7 +498,7 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
         token.write_text("short", encoding="ascii")
         token.chmod(mode)
         done = CliRunner().invoke(main, [*serve, *words])
-        assert (done.exit_code, done.output.count("\n")) == (1, 1), done.output
+        assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
         assert text in done.output
     assert not (tmp_path / "cell.db").exists()
 
@@ -509,7 +509,7 @@ def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path: Path) 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         done = CliRunner().invoke(main, [*serve, "--opcua", port])
-        assert (done.exit_code, done.output.count("\n")) == (1, 1), done.output
+        assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
         assert port in done.output
     nobody = CliRunner().invoke(main, [*serve, "--robot", f"127.0.0.1:{port}"])
     assert (nobody.exit_code, nobody.output.count("\n")) == (1, 1), nobody.output

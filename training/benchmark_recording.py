@@ -152,11 +152,11 @@ def table(found: pd.DataFrame) -> Table:
 def main() -> None:
     """Parse, run, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--insertions", type=int, default=300)
+    parser.add_argument("--insertions", type=int, default=300, help="that the robot makes")
     parser.add_argument("--speed", type=float, default=1.0, help="against real time; 0: as fast as it is read")
     parser.add_argument("--samples", type=int, default=None, help="of each trace; default: all 1000")
     parser.add_argument("--recipes", default="pca", help="with commas between; each is compared with a replay")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the faults")
     parser.add_argument("--ur-rtde", type=float, default=0.0, metavar="SECONDS", help="measure ur_rtde's recorder too")
     parser.add_argument("--out", type=Path, default=None, help="folder for recording.csv")
     asked = parser.parse_args()

@@ -22,18 +22,25 @@ host_option = click.option("--host", metavar="HOST[:PORT]", help="The robot's ad
 def open_robot(address: str | None, source: DataChoice) -> UrCell:
     """The cell, connected, its program running. SettingError where no host was named; CellError where none answers."""
     from ..cells.ur.cell import UrCell
-    from ..cells.ur.protocol import PORT
     from ..recordings.asked import names_of
 
     if not address:
         raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
-    host, _, port = address.partition(":")
-    if port and not port.isdecimal():
-        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    host, port = host_and_port(address)
     how: dict[str, Any] = {"samples": source.samples or SAMPLES, "rate_hz": source.rate_hz or RATE_HZ}
     how |= {"trigger": source.trigger} if source.trigger else {}
     how |= {"channels": names_of(source.channel)} if source.channel else {}
-    return UrCell(host, port=int(port) if port else PORT, **how).open()
+    return UrCell(host, port=port, **how).open()
+
+
+def host_and_port(address: str) -> tuple[str, int]:
+    """A controller's host, and its port, RTDE's where none is named; SettingError for what is no port."""
+    from ..cells.ur.protocol import PORT
+
+    host, _, port = address.partition(":")
+    if port and not port.isdecimal():
+        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    return host, int(port) if port else PORT
 
 
 def recording_record(cell: Any) -> dict[str, Any] | None:

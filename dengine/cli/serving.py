@@ -12,6 +12,7 @@ import click
 from ..errors import SettingError
 from .naming import cell_options
 from .options import RecipeChoice, example, recipe_options
+from .robot import host_and_port
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -61,7 +62,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 )
 @click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
 @click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
-@click.option("--robot", metavar="HOST", help="Record the force of this Universal Robots controller, for XML-RPC.")
+@click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
 @click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
@@ -98,7 +99,10 @@ def serve(
         return engine
 
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
-    recorder = partial(RtdeRecorder, robot, trigger, samples) if robot else None
+    recorder = None
+    if robot:
+        host, port = host_and_port(robot)
+        recorder = partial(RtdeRecorder, host, trigger, samples, port=port)
     serve_cell(make, store, Serving(interfaces=interfaces, recorder=recorder, **how), click.echo)
 
 

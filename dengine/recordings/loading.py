@@ -100,7 +100,7 @@ def _read(path: Path, asked: Asked) -> Dataset:
     if not path.is_file():
         raise DataError(
             f"Expected a data set among {', '.join(BUNDLED)}, a file (.npz, .csv, .parquet, .h5, .mcap), a store, or a "
-            f"folder of CSV files; {path} is none of these."
+            f"folder of CSV files; {path} is neither."
         )
     suffix = path.suffix.lower()
     if _is_database(path):

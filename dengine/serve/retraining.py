@@ -20,6 +20,7 @@ def retraining_process() -> Iterator[Executor]:
 
     It ends with this process, also when this one is killed.
     """
+    others = set(multiprocessing.active_children())  # are not ours to end
     pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
     pool.submit(_warm)
     try:
