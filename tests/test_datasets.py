@@ -94,7 +94,7 @@ def test_a_truncated_file_is_a_data_error(saved, data: Dataset) -> None:
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(DengineError, match=r"Expected a data set among insertion, a file \(\.npz, .*insertoin is none"):
+    with pytest.raises(DengineError, match=r"Expected a data set among insertion, a file \(\.npz, .*insertoin is neither"):
         load_dataset("insertoin")
 
 

@@ -70,6 +70,15 @@ class Plant:
         arguments = (trace.ravel().tolist(), FLOAT), (channels, COUNT), (request, TEXT), (part, TEXT)
         return await self.call("Decide", *(ua.Variant(*each) for each in arguments))
 
+    async def learn(self, data: Dataset) -> None:
+        """Have a version answer, whichever test came before."""
+        for i in range(len(data)):
+            if self.service.engine.version:
+                return
+            action, id_, *_ = await self.decide(data.X[i], f"learn-{i}")
+            if action == VERIFY:
+                await self.report(id_, bool(data.y[i]))
+
     async def report(self, id_: str, success: bool) -> bool:
         return await self.call("Report", ua.Variant(id_, TEXT), ua.Variant(success))
 
@@ -241,6 +250,7 @@ def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset, run,
         assert await plant.until("Shadow", bool)
         await plant.service.ask(lambda engine: engine.set_shadow(False, "the operator"))
         assert not await plant.until("Shadow", lambda on: not on)
+        await plant.learn(stream)
         monkeypatch.setattr(plant.service.engine._versions.answering, "predict_one", None)
         await plant.decide(-stream.X[0])
         assert await plant.until("Alarm", bool)
@@ -307,7 +317,7 @@ def test_what_is_no_message_ends_the_connection_and_no_other(plant: Plant, run, 
             pass
         writer.close()
         assert b"Traceback" not in said
-        assert await plant.value("ModelVersion") >= 1
+        assert await plant.value("ModelVersion") == plant.service.engine.version
 
     run(stranger())
 

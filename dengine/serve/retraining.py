@@ -27,7 +27,9 @@ def retraining_process() -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():  # a retrain that was worth waiting for, its engine has waited for
+        for process in (
+            set(multiprocessing.active_children()) - others
+        ):  # a retrain that was worth waiting for, its engine has waited for
             process.kill()
             process.join()
 
