@@ -27,9 +27,8 @@ def retraining_process() -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in (
-            set(multiprocessing.active_children()) - others
-        ):  # a retrain that was worth waiting for, its engine has waited for
+        # A retrain that was worth waiting for, its engine has waited for.
+        for process in set(multiprocessing.active_children()) - others:
             process.kill()
             process.join()
 
