@@ -40,6 +40,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         item.add_marker(pytest.mark.xdist_group(GROUPS.get(item.path.stem, item.path.stem)))
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node, ids: list[str]) -> None:
+    """End where the groups are not in force: files would be split, and two workers build the same programs at once."""
+    if node.config.getoption("dist") == "loadgroup" and not all("@" in name for name in ids):
+        pytest.exit("these versions of pytest and pytest-xdist do not keep groups of tests together", returncode=4)
+
+
 def insertion_like(
     n: int = 200, samples: int = 100, channels: int = 1, *, seed: int = 0, failures: float = 0.2, noise: float = 0.5
 ) -> Dataset:
