@@ -214,7 +214,7 @@ def test_no_layer_outlives_its_module() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["engine", "versions", "retraining", "resuming", "deciding", "export.file", "export.torchscript"]
+    "module", ["engine", "versions", "incoming", "retraining", "resuming", "deciding", "export.file", "export.torchscript"]
 )
 def test_what_drives_a_model_asks_its_contract_and_never_its_class(module: str) -> None:
     asked = [

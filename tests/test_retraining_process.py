@@ -94,14 +94,19 @@ def learn(engine: DataEngine, data: Dataset) -> None:
             engine.report(decision.id, bool(y))
 
 
+def wait_for(engine: DataEngine) -> None:
+    while engine.retraining:
+        engine.settle()
+        time.sleep(0.01)
+
+
 def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> None:
     states = []
     with retraining_process() as process, ThreadPoolExecutor(1) as thread:
         for executor in (process, thread):
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
             learn(engine, data)
-            while engine.retraining:
-                engine.settle()
+            wait_for(engine)
             assert engine.version == 1
             states.append(engine._versions.newest.get_state())
     there, here = states
@@ -115,7 +120,6 @@ def test_after_its_process_was_killed_an_engine_retrains_in_line(data: Dataset) 
         engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
         os.kill(pid, signal.SIGKILL)
         learn(engine, data)
-        while engine.retraining:
-            engine.settle()
+        wait_for(engine)
         engine.start_retrain()
     assert engine.version >= 1
