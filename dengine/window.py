@@ -13,6 +13,9 @@ class Window:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
+        self._clear()
+
+    def _clear(self) -> None:
         self.total = 0
         self._traces: NDArray[np.float32] | None = None
         self._labels = np.zeros(0, dtype=np.int8)
@@ -31,6 +34,8 @@ class Window:
         """Take in one labelled trace (C, T); on a full window it takes the oldest one's place."""
         self._grow(trace)
         assert self._traces is not None  # for the type checker: _grow made it
+        if self.total == self.capacity:
+            self._traces = self._traces.copy()  # from now on places are taken again: who has a snapshot keeps the old ones
         slot = self.total % self.capacity
         self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
         self.total += 1
@@ -42,7 +47,7 @@ class Window:
 
     def refill(self, labelled: Labelled) -> None:
         """Hold these, oldest first, in the place of all that was held."""
-        self.total = 0
+        self._clear()
         self.extend(labelled)
 
     def after(self, seq: int) -> int:
@@ -58,7 +63,9 @@ class Window:
     def snapshot(self) -> Labelled:
         """What is held, oldest first. Nobody writes to these arrays afterwards."""
         order = self._order()
-        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces[order]
+        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces
+        # Until the window is full no place is written twice: only then they have to be copied.
+        traces = traces[: len(order)] if self.total <= self.capacity else traces[order]
         return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
 
     def newer(self, seq: int) -> NDArray[np.int64]:
