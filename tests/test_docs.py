@@ -27,8 +27,8 @@ SMALL = "--data small.npz --samples 100"
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
     "dengine replay --data screw_driving.npz": "--cycles 60",
-    "dengine compare --data screw_driving.npz": "--repeats 1 --cycles 60",
-    "dengine compare --data insertion": "--repeats 1 --cycles 80",
+    "dengine compare --data screw_driving.npz": "--repeats 1 --cycles 60 --n-jobs 1",
+    "dengine compare --data insertion": "--repeats 1 --cycles 80 --n-jobs 1",
     "dengine compare --data insertion --reducers conv --paper": "--cycles 50",
     "dengine compare --reducers pca,my_reducers:PeakReducer": "--cycles 80",
     "dengine run --cell replay": "--cycles 80",

@@ -232,15 +232,31 @@ def test_while_an_export_is_replaced_both_sums_are_accepted(model: Path) -> None
 
 
 EXPORTING = """
-import sys
-from dengine import DataEngine, export_torchscript
+import os, sys
 from dengine.export.file import write_checked
 from dengine.outputs import TORCHSCRIPT
 contents = [open(name, "rb").read() for name in sys.argv[2:]]
-print("ready", flush=True)
-for i in range(10**9):  # as an export, without what comes before it is written
-    write_checked(sys.argv[1], contents[i % 2], TORCHSCRIPT)
+for _ in sys.stdin:  # a line asks for a process: thirty would each wait for torch
+    child = os.fork()
+    for i in range(10**9 if child == 0 else 0):  # as an export, without what comes before it is written
+        write_checked(sys.argv[1], contents[i % 2], TORCHSCRIPT)
+    print(child, flush=True)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
+
+
+def kill_one(starter: subprocess.Popen[str], target: Path, seconds: float) -> None:
+    """Let a process export onto `target`, and kill it at some moment."""
+    starter.stdin.write("\n")
+    starter.stdin.flush()
+    child = int(starter.stdout.readline())
+    try:
+        while not target.exists():
+            time.sleep(0.001)
+        time.sleep(seconds)
+    finally:
+        os.kill(child, signal.SIGKILL)
+    assert int(starter.stdout.readline()) == -signal.SIGKILL
 
 
 def test_a_killed_export_leaves_a_file_that_loads(store: Path, tmp_path: Path) -> None:
@@ -253,20 +269,13 @@ def test_a_killed_export_leaves_a_file_that_loads(store: Path, tmp_path: Path) -
     known, found = {version.read_bytes() for version in versions}, set()
     assert len(known) == 2
     rng, both = np.random.default_rng(0), 0
-    for _ in range(30):
-        child = subprocess.Popen([sys.executable, "-c", EXPORTING, target, *versions], stdout=subprocess.PIPE, text=True)
-        try:
-            assert child.stdout.readline() == "ready\n"
-            while not target.exists():
-                time.sleep(0.001)
-            time.sleep(float(rng.uniform(0.0, 0.03)))
-        finally:
-            child.send_signal(signal.SIGKILL)
-            child.wait()
-            child.stdout.close()
-        assert read_metadata(target)["references"] >= 60  # its sum is right
-        found.add(target.read_bytes())
-        both += len(sum_file(target).read_text().splitlines()) == 2
+    command = [sys.executable, "-c", EXPORTING, target, *versions]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as starter:
+        for _ in range(30):
+            kill_one(starter, target, float(rng.uniform(0.0, 0.03)))
+            assert read_metadata(target)["references"] >= 60  # its sum is right
+            found.add(target.read_bytes())
+            both += len(sum_file(target).read_text().splitlines()) == 2
     assert found <= known
     load_exported(target)
     assert both > 0, "no kill came between the two renames: the test shows nothing"
