@@ -58,7 +58,7 @@ class Serving:
     largest: int = Access().largest
     rate: float = Access().rate
     connections: int = 100
-    interfaces: Sequence[str] = INTERFACES
+    interfaces: Sequence[str] = tuple(INTERFACES)
     beside: Sequence[Beside] = field(default=())
     opcua: int | None = None
     opcua_cert: Path | None = None
