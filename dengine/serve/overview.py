@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import dataclass
 
 from ..engine import DataEngine
@@ -40,10 +39,7 @@ class Overview:
 async def overview(service: CellService) -> Overview:
     """How the cell is doing, by its store; no decision waits for it, but where the engine remembers in memory alone."""
     engine = service.engine
-    if service.reading is engine.store:
-        doing = await service.ask(lambda owned: standing(owned.store, owned.recipe))
-    else:
-        doing = await asyncio.to_thread(standing, service.reading, engine.recipe)
+    doing = await service.read(lambda store: standing(store, engine.recipe))
     share = doing.newest.share(doing.newest.verified)
     return Overview(
         decisions=doing.ever.decisions,
