@@ -39,6 +39,16 @@ class Report:
     success: Any
 
 
+async def read_body(request: Request, most: int) -> bytes | None:
+    """A request's body; None where it has more bytes than that, the rest of which are not read."""
+    body = bytearray()
+    async for piece in request.stream():
+        body += piece
+        if len(body) > most:
+            return None
+    return bytes(body)
+
+
 async def trace_request(request: Request) -> TraceRequest:
     """What a request asks to be decided; Refusal where it says nothing that can be."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 from zipfile import ZipFile
 
 from starlette.requests import Request
@@ -18,6 +18,8 @@ from starlette.responses import JSONResponse, Response
 
 from ...engine import DataEngine
 from ...errors import BusyError, DengineError, ReportError, SettingError
+from ..access import is_own_page
+from ..bodies import read_body
 from .looking import Looking
 from .templating import HEADERS
 from .words import Words
@@ -111,11 +113,9 @@ class Acts:
         """The form of a request of this page. RefusedError for any other."""
         if not _same_origin(request):
             raise RefusedError(403, w("act.refused"))
-        body = b""
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > LARGEST:
-                raise RefusedError(413, w("act.refused"))
+        body = await read_body(request, LARGEST)
+        if body is None:
+            raise RefusedError(413, w("act.refused"))
         try:
             fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=20)
         except ValueError as error:  # more fields than that
@@ -127,11 +127,9 @@ class Acts:
 
 
 def _same_origin(request: Request) -> bool:
-    """Whether a browser says that the request came from a page of this very server."""
-    if request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
-        return False
-    origin = request.headers.get("origin")
-    return origin is not None and urlsplit(origin).netloc == request.headers.get("host")
+    """Whether a browser says that the request came from a page of this very server; who does not say it is no page."""
+    origin, fetch_site, host = map(request.headers.get, ("origin", "sec-fetch-site", "host"))
+    return origin is not None and fetch_site != "none" and is_own_page(origin, fetch_site, host)
 
 
 def _author(form: Form, w: Words) -> str:
