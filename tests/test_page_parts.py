@@ -25,6 +25,7 @@ from dengine.serve.page.pulse import Pulse
 from dengine.serve.page.svg import Scale, element
 from dengine.serve.page.words import CATALOGUES, Words, language
 from dengine.serve.service import CellService
+from dengine.store.views import HistoryFilter
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=30, policy=Policy(alpha=0.1, lower_bound=0.9))
 STRANGE = "<script>alert('part')</script>"
@@ -149,6 +150,17 @@ def test_strange_names_stay_text_wherever_they_are_shown(client: TestClient, ser
     assert all("<script>alert" not in text for text in shown)
     assert "&lt;script&gt;alert" in shown[0]
     assert f"corrected from {first.label} to {opposite} by &lt;script&gt;" in shown[5]
+
+
+def test_stops_stand_beside_the_time_that_they_are_not_taken_off(
+    client: TestClient, service: CellService, stream: Dataset
+) -> None:
+    cell_runs(service, stream, 70)
+    (accepted,) = service.reading.decisions(HistoryFilter(action=Action.ACCEPT), 1)
+    asyncio.run(service.report(accepted.id, False))
+    service.reading.flush()
+    for view in ("/", "/how"):
+        assert "s each; system stops, not taken off: 1</p>" in client.get(view).text
 
 
 def test_an_unknown_part_is_told_and_found_nowhere(client: TestClient) -> None:

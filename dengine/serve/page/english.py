@@ -144,6 +144,7 @@ ENGLISH = {
     "how.rate.over": "over the newest {n}",
     "how.saved": "Check time saved",
     "how.saved.by": "{n} checks left out, {seconds} s each",
+    "how.saved.stops": "system stops, not taken off: {stops}",
     "how.novel": "Novel",
     "how.audits": "Audits",
     "how.quarantined": "Bad traces, kept out of training",

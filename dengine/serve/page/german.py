@@ -145,6 +145,7 @@ GERMAN = {
     "how.rate.over": "über die neuesten {n}",
     "how.saved": "Gesparte Prüfzeit",
     "how.saved.by": "{n} Prüfungen entfielen, je {seconds} s",
+    "how.saved.stops": "Anlagenstopps, nicht abgezogen: {stops}",
     "how.novel": "Neuartig",
     "how.audits": "Stichproben",
     "how.quarantined": "Schlechte Kurven, vom Training ausgeschlossen",

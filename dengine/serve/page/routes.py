@@ -118,7 +118,7 @@ class LivePage:
         return EventSourceResponse(self._pulse.events(), headers={"cache-control": "no-store"}, ping=3600)
 
     async def _how(self) -> HowView:
-        return await self._looking.look("how", lambda looking: how_view(looking, self._check_seconds))
+        return await self._looking.look("how", how_view)
 
     async def _part(self, decision_id: str) -> PartView | None:
         return await self._looking.look(("part", decision_id), lambda looking: part_view(looking, decision_id))
