@@ -4,8 +4,7 @@ import asyncio
 import re
 import string
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ pytest.importorskip("httpx", reason="Starlette's test client needs httpx")
 
 from starlette.testclient import TestClient
 
-from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine import Dataset, Policy, Recipe
 from dengine.records import Action, Reason, Source
 from dengine.serve.app import create_app
 from dengine.serve.page.acts import ACTS
@@ -38,11 +37,8 @@ def stream(make_data) -> Dataset:
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[CellService]:
-    file = tmp_path / "cell.db"
-    made = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
-    yield made
-    made.close()
+def service(make_service: Callable[[Recipe], CellService]) -> CellService:
+    return make_service(RECIPE)
 
 
 @pytest.fixture
@@ -254,13 +250,10 @@ def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService,
     assert len(set(looks)) == 3
 
 
-def test_how_near_an_alarm_is_is_shown_where_it_is_watched(make_data, tmp_path: Path) -> None:
-    data, file = make_data(80, samples=60, seed=3), tmp_path / "watched.db"
-    recipe = RECIPE.with_policy(stops="all")
-    service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=30.0)
-    try:
-        cell_runs(service, data, 70)
-        with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
-            assert client.get("/how").text.count("<meter") == 3
-    finally:
-        service.close()
+def test_how_near_an_alarm_is_is_shown_where_it_is_watched(
+    stream: Dataset, make_service: Callable[[Recipe], CellService]
+) -> None:
+    service = make_service(RECIPE.with_policy(stops="all"))
+    cell_runs(service, stream, 70)
+    with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
+        assert client.get("/how").text.count("<meter") == 3
