@@ -489,6 +489,12 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
         assert engine.find("order-0").action == "verify"
 
 
+def test_what_the_verb_does_by_default_is_what_serving_does() -> None:
+    typed = {option.name: option.default for option in main.commands["serve"].params}
+    names = ("host", "port", "deadline", "largest", "rate", "connections")
+    assert {name: typed[name] for name in names} == {name: getattr(Serving(), name) for name in names}
+
+
 def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:
     certificate(tmp_path)
     token, locked = tmp_path / "token", ["--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "locked.pem")]
