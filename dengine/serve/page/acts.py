@@ -21,7 +21,6 @@ from ...errors import BusyError, DengineError, ReportError, SettingError
 from ..access import is_own_page
 from ..bodies import read_body
 from .looking import Looking
-from .templating import HEADERS
 from .words import Words
 
 LARGEST = 8192  # bytes of a form
@@ -90,10 +89,10 @@ class Acts:
             author = _author(form, w)
             response = await (self._export(author, w) if name == "export" else self._do(name, form, author, w))
         except RefusedError as refusal:
-            return JSONResponse({"ok": False, "said": refusal.said}, refusal.status, HEADERS)
+            return JSONResponse({"ok": False, "said": refusal.said}, refusal.status)
         except (DengineError, OSError) as error:
             said = w("act.failed", why=" ".join(str(error).split()))
-            return JSONResponse({"ok": False, "said": said}, 503 if isinstance(error, BusyError) else 409, HEADERS)
+            return JSONResponse({"ok": False, "said": said}, 503 if isinstance(error, BusyError) else 409)
         self._looking.look_anew()
         return response
 
@@ -102,12 +101,12 @@ class Acts:
         if act is None:
             raise RefusedError(404, w("act.refused"))
         changed = await self._service.ask(lambda engine: act(engine, form, author))
-        return JSONResponse({"ok": True, "said": w(f"act.{name}.done" if changed else "act.nothing")}, headers=HEADERS)
+        return JSONResponse({"ok": True, "said": w(f"act.{name}.done" if changed else "act.nothing")})
 
     async def _export(self, author: str, w: Words) -> Response:
         content, version = await self._service.ask(lambda engine: _exported(engine, author))
         name = {"content-disposition": f'attachment; filename="model_{version}.zip"'}
-        return Response(content, media_type="application/zip", headers=HEADERS | name)
+        return Response(content, media_type="application/zip", headers=name)
 
     async def _form(self, request: Request, w: Words) -> Form:
         """The form of a request of this page. RefusedError for any other."""
