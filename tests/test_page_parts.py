@@ -3,8 +3,10 @@
 import asyncio
 import re
 import string
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,8 +16,9 @@ pytest.importorskip("httpx", reason="Starlette's test client needs httpx")
 
 from starlette.testclient import TestClient
 
-from dengine import Dataset, Policy, Recipe
+from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.records import Action, Reason, Source
+from dengine.serve.access import Access
 from dengine.serve.app import create_app
 from dengine.serve.page.acts import ACTS
 from dengine.serve.page.history_view import history_query
@@ -217,6 +220,21 @@ def test_an_act_is_done_once_and_says_where_nothing_changed(client: TestClient, 
     assert [event.author for event in service.reading.events()] == ["Kim"]
 
 
+def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> None:
+    free = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(free.wait, 60)  # what follows waits behind it
+        service = CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), deadline=30.0)
+        try:
+            cell_runs(service, stream, 20)
+            with TestClient(create_app(service), "http://localhost", headers={"origin": "http://localhost"}) as client:
+                assert act(client, "retrain")[1].startswith("The retrain has begun")
+                assert act(client, "retrain")[1].startswith("Nothing changed")
+        finally:
+            free.set()
+            service.close()
+
+
 def test_a_choice_of_language_and_appearance_goes_into_a_cookie_and_back_to_the_view(client: TestClient) -> None:
     answer = client.get("/history?label=bad&lang=de", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/history?label=bad")
@@ -257,3 +275,11 @@ def test_how_near_an_alarm_is_is_shown_where_it_is_watched(
     cell_runs(service, stream, 70)
     with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
         assert client.get("/how").text.count("<meter") == 3
+
+
+def test_what_the_guard_refuses_of_an_act_is_told_in_its_words(service: CellService) -> None:
+    app = create_app(service, Access(largest=100), ("page",))
+    with TestClient(app, "http://localhost", headers={"origin": "http://localhost"}) as client:
+        refused = client.post("/acts/shadow-on", data={"more": "x" * 200})
+    assert (refused.status_code, refused.headers["connection"]) == (413, "close")
+    assert "at most 100 bytes" in refused.json()["detail"]  # which the page's script tells

@@ -186,9 +186,9 @@ dialog.querySelector("form").addEventListener("submit", async (event) => {
 
 async function told(answer, author) {
   const file = answer.headers.get("content-disposition");
-  const said = file ? null : (await answer.json()).said;
+  const { said, detail } = file ? {} : await answer.json();
   if (!answer.ok) {
-    document.getElementById("confirm-failed").textContent = said;
+    document.getElementById("confirm-failed").textContent = said ?? detail; // detail: of the guard before the page
     return;
   }
   localStorage.setItem("dengine_author", author);
