@@ -15,7 +15,7 @@ from starlette.staticfiles import StaticFiles
 from ..service import CellService
 from . import bound_chart, course_chart, map_chart, trace_chart
 from .acts import Acts
-from .history_view import history_query, history_view
+from .history_view import FILTERS, history_query, history_view
 from .how_view import PACE, HowView, how_view, mode_of
 from .looking import Looking
 from .map_view import map_view
@@ -99,7 +99,7 @@ class LivePage:
         """The history."""
         query = history_query(dict(request.query_params))
         view = await self._looking.look(("history", query), lambda looking: history_view(looking, query))
-        return self._page(request, "history", history=view)
+        return self._page(request, "history", history=view, filters=FILTERS)
 
     async def acts(self, request: Request) -> Response:
         """What people may do."""
