@@ -21,7 +21,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError
-from .bodies import read_body
+from .bodies import media_type, read_body
 from .calls import PATIENCE, Recorder, RobotCalls
 from .service import CellService
 
@@ -74,7 +74,7 @@ def routes(
     calls = RobotCalls(service, recorder, patience).table()
 
     async def rpc(request: Request) -> Response:
-        if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in TYPES:
+        if media_type(request) not in TYPES:
             return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
