@@ -28,9 +28,9 @@ from .bodies import report, trace_request
 from .metrics import Metrics
 from .openapi import as_page, document
 from .problems import Refusal
+from .schemas import MOST_OPEN, OPEN
 from .service import Answer, CellService
 
-OPEN, MOST_OPEN = 20, 200  # decisions that a page of `/decisions` holds
 HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
 Endpoint = Callable[[Request], Awaitable[Response]]
 
