@@ -65,7 +65,7 @@ async def trace_request(request: Request) -> TraceRequest:
     return read(request, await request.body())
 
 
-async def report(request: Request) -> Report:
+async def report_request(request: Request) -> Report:
     """What a request reports; Refusal where it reports nothing."""
     kind = media_type(request)
     if kind not in (JSON, MSGPACK):

@@ -21,6 +21,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError
+from .access import RPC
 from .bodies import media_type, read_body
 from .calls import PATIENCE, Recorder, RobotCalls
 from .service import CellService
@@ -83,7 +84,7 @@ def routes(
             return PlainTextResponse(f"Expected at most {most} bytes.\n", 413)
         return Response(await answered(calls, body), media_type="text/xml")
 
-    return [Route("/RPC2", rpc, methods=["POST"])]
+    return [Route(RPC, rpc, methods=["POST"])]
 
 
 async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: bytes) -> bytes:

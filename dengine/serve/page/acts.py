@@ -28,8 +28,7 @@ LARGEST = 8192  # bytes of a form
 LONGEST = 100  # characters of an author
 
 Form = Mapping[str, str]
-# Does it, by author, and returns whether anything changed.
-Act = Callable[[DataEngine, Form, str], bool]
+Act = Callable[[DataEngine, Form, str], bool]  # done with a form, by its author; whether anything changed
 
 
 def _shadow_on(engine: DataEngine, form: Form, author: str) -> bool:
