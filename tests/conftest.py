@@ -113,3 +113,24 @@ def screw_driving() -> Path:
 def proof_repeats() -> int:
     """Repeats of a statistical test: few in `make test`, many in `make proof`."""
     return int(os.environ.get("DENGINE_PROOF_REPEATS", "2"))
+
+
+@pytest.fixture(scope="session")
+def stream() -> Dataset:
+    """Parts that come one after the other; a file that needs fewer, or more, has its own."""
+    return insertion_like(400, samples=60, seed=3)
+
+
+@pytest.fixture
+def make_service(tmp_path: Path, request: pytest.FixtureRequest) -> Callable:
+    """Makes a service over a new store of a recipe; it is closed at the end."""
+    from dengine import DataEngine, Recipe
+    from dengine.serve.service import CellService
+
+    def made(recipe: Recipe) -> CellService:
+        file = tmp_path / "cell.db"
+        service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=30.0)
+        request.addfinalizer(service.close)
+        return service
+
+    return made

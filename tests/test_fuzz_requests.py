@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "training"
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "asyncua")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "jinja2", "sse_starlette", "asyncua")
 
 
 def test_every_malformed_request_is_refused_and_changes_nothing(

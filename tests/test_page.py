@@ -202,6 +202,10 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watc
     page.get_by_role("button", name="It was bad").focus()
     page.keyboard.press("Enter")
     expect(page.get_by_label("Your name")).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("button", name="It was bad")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_label("Your name")).to_be_focused()
     page.keyboard.press("Enter")  # without a name nothing is done
     expect(page.get_by_role("dialog")).to_be_visible()
     page.keyboard.type(AUTHOR)

@@ -3,9 +3,10 @@
 import asyncio
 import re
 import string
+import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from starlette.testclient import TestClient
 
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.records import Action, Reason, Source
+from dengine.serve.access import Access
 from dengine.serve.app import create_app
 from dengine.serve.page.acts import ACTS
 from dengine.serve.page.history_view import history_query
@@ -25,6 +27,7 @@ from dengine.serve.page.pulse import Pulse
 from dengine.serve.page.svg import Scale, element
 from dengine.serve.page.words import CATALOGUES, Words, language
 from dengine.serve.service import CellService
+from dengine.store.views import HistoryFilter
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=30, policy=Policy(alpha=0.1, lower_bound=0.9))
 STRANGE = "<script>alert('part')</script>"
@@ -37,11 +40,8 @@ def stream(make_data) -> Dataset:
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[CellService]:
-    file = tmp_path / "cell.db"
-    made = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
-    yield made
-    made.close()
+def service(make_service: Callable[[Recipe], CellService]) -> CellService:
+    return make_service(RECIPE)
 
 
 @pytest.fixture
@@ -151,6 +151,17 @@ def test_strange_names_stay_text_wherever_they_are_shown(client: TestClient, ser
     assert f"corrected from {first.label} to {opposite} by &lt;script&gt;" in shown[5]
 
 
+def test_stops_stand_beside_the_time_that_they_are_not_taken_off(
+    client: TestClient, service: CellService, stream: Dataset
+) -> None:
+    cell_runs(service, stream, 70)
+    (accepted,) = service.reading.decisions(HistoryFilter(action=Action.ACCEPT), 1)
+    asyncio.run(service.report(accepted.id, False))
+    service.reading.flush()
+    for view in ("/", "/how"):
+        assert "s each; system stops, not taken off: 1</p>" in client.get(view).text
+
+
 def test_an_unknown_part_is_told_and_found_nowhere(client: TestClient) -> None:
     assert client.get("/part?id=nobody").status_code == 404
     assert client.get("/part").status_code == 404
@@ -209,6 +220,21 @@ def test_an_act_is_done_once_and_says_where_nothing_changed(client: TestClient, 
     assert [event.author for event in service.reading.events()] == ["Kim"]
 
 
+def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> None:
+    free = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(free.wait, 60)  # what follows waits behind it
+        service = CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), deadline=30.0)
+        try:
+            cell_runs(service, stream, 20)
+            with TestClient(create_app(service), "http://localhost", headers={"origin": "http://localhost"}) as client:
+                assert act(client, "retrain")[1].startswith("The retrain has begun")
+                assert act(client, "retrain")[1].startswith("Nothing changed")
+        finally:
+            free.set()
+            service.close()
+
+
 def test_a_choice_of_language_and_appearance_goes_into_a_cookie_and_back_to_the_view(client: TestClient) -> None:
     answer = client.get("/history?label=bad&lang=de", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/history?label=bad")
@@ -242,13 +268,18 @@ def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService,
     assert len(set(looks)) == 3
 
 
-def test_how_near_an_alarm_is_is_shown_where_it_is_watched(make_data, tmp_path: Path) -> None:
-    data, file = make_data(80, samples=60, seed=3), tmp_path / "watched.db"
-    recipe = RECIPE.with_policy(stops="all")
-    service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=30.0)
-    try:
-        cell_runs(service, data, 70)
-        with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
-            assert client.get("/how").text.count("<meter") == 3
-    finally:
-        service.close()
+def test_how_near_an_alarm_is_is_shown_where_it_is_watched(
+    stream: Dataset, make_service: Callable[[Recipe], CellService]
+) -> None:
+    service = make_service(RECIPE.with_policy(stops="all"))
+    cell_runs(service, stream, 70)
+    with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
+        assert client.get("/how").text.count("<meter") == 3
+
+
+def test_what_the_guard_refuses_of_an_act_is_told_in_its_words(service: CellService) -> None:
+    app = create_app(service, Access(largest=100), ("page",))
+    with TestClient(app, "http://localhost", headers={"origin": "http://localhost"}) as client:
+        refused = client.post("/acts/shadow-on", data={"more": "x" * 200})
+    assert (refused.status_code, refused.headers["connection"]) == (413, "close")
+    assert "at most 100 bytes" in refused.json()["detail"]  # which the page's script tells

@@ -20,8 +20,8 @@ import pytest
 from click.testing import CliRunner
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
-pytest.importorskip("starlette")
-pytest.importorskip("prometheus_client")
+for name in ("starlette", "prometheus_client", "defusedxml", "jinja2", "sse_starlette"):
+    pytest.importorskip(name)
 httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not installed: pip install httpx")
 msgpack = pytest.importorskip("msgpack")
 jsonschema = pytest.importorskip("jsonschema")
@@ -30,6 +30,7 @@ import uvicorn  # noqa: E402  # not before it is known to be there
 
 from dengine import DataEngine, Dataset, Policy, Recipe  # noqa: E402
 from dengine.cli import main  # noqa: E402
+from dengine.errors import SettingError  # noqa: E402
 from dengine.serve import http as http_routes  # noqa: E402
 from dengine.serve.access import Access  # noqa: E402
 from dengine.serve.app import create_app  # noqa: E402
@@ -116,6 +117,11 @@ def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
 
 
 # What it answers
+
+
+def test_an_interface_that_there_is_not_is_an_error_and_not_a_silence(service: CellService) -> None:
+    with pytest.raises(SettingError, match="among http, xmlrpc, page, got 'xmlrcp'"):
+        create_app(service, interfaces=("http", "xmlrcp"))
 
 
 def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset) -> None:
@@ -482,6 +488,12 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
     assert TOKEN not in out + lines
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.find("order-0").action == "verify"
+
+
+def test_what_the_verb_does_by_default_is_what_serving_does() -> None:
+    typed = {option.name: option.default for option in main.commands["serve"].params}
+    names = ("host", "port", "deadline", "largest", "rate", "connections")
+    assert {name: typed[name] for name in names} == {name: getattr(Serving(), name) for name in names}
 
 
 def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:

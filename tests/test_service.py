@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,11 +20,8 @@ def stream(make_data) -> Dataset:
 
 
 @pytest.fixture
-def service(tmp_path: Path) -> Iterator[CellService]:
-    file = tmp_path / "cell.db"
-    made = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
-    yield made
-    made.close()
+def service(make_service: Callable[[Recipe], CellService]) -> CellService:
+    return make_service(RECIPE)
 
 
 def test_what_is_decided_and_reported_is_what_the_engine_has(service: CellService, stream: Dataset) -> None:

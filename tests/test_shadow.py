@@ -9,23 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, Source
+from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, Source
 from dengine.errors import ReportError, SettingError, TraceError
 from dengine.keeping import Keeper
 from dengine.recent import TakenIds
+from tests.driving import drive
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=POLICY)
-
-
-@pytest.fixture(scope="module")
-def stream(make_data) -> Dataset:
-    return make_data(400, samples=60, seed=3)
-
-
-def drive(engine: DataEngine, data: Dataset, first: int, last: int) -> list:
-    order = np.arange(first, last)
-    return list(engine.run(ReplayCell(data, order), len(order)))
 
 
 # ------------------------------------------------------------------------------------------------ ids of the caller's

@@ -4,26 +4,16 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dengine import Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, wilson_interval
+from dengine import Action, DataEngine, Dataset, Policy, Recipe, wilson_interval
 from dengine.cli import main
 from dengine.standing import standing
+from tests.driving import drive
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=POLICY)
-
-
-@pytest.fixture(scope="module")
-def stream(make_data) -> Dataset:
-    return make_data(400, samples=60, seed=3)
-
-
-def drive(engine: DataEngine, data: Dataset, first: int, last: int) -> list:
-    order = np.arange(first, last)
-    return list(engine.run(ReplayCell(data, order), len(order)))
 
 
 def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(stream: Dataset, tmp_path: Path) -> None:

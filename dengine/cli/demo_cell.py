@@ -7,14 +7,13 @@ from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
 
-from ..errors import OutputError, SettingError
+from ..errors import OutputError
 from .options import example, must_have_mujoco, seed_option
 from .output import show
 from .serving import must_have_serve
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from ..cells.base import Cell
     from ..serve.service import CellService
 
-NEEDED = ("jinja2", "sse_starlette")
 BEFORE = 150  # parts that come at once, so that a model answers before one has read the page
 POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 ENDLESS = 10**9
@@ -76,7 +74,7 @@ def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: st
     No robot is needed: recordings are played, or simulated. They go the way that a robot's traces go.
     Only this computer can see the page. Ctrl-C ends it.
     """
-    must_have_page()
+    must_have_serve()
     if kind == "simulated":
         must_have_mujoco()
     if keep is not None and Path(keep).exists():
@@ -85,13 +83,6 @@ def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: st
         file = keep or str(Path(stack.enter_context(TemporaryDirectory(prefix="dengine-demo-"))) / "demo.db")
         _run(Demo(file, port, speed, before, cycles, kind, seed))
     show(f"Everything is in {keep}." if keep else "It ended, and nothing of it was kept.")
-
-
-def must_have_page() -> None:
-    """SettingError where the server, or its page, cannot run."""
-    must_have_serve()
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        raise SettingError(f'Expected {", ".join(missing)} for the page, not installed: pip install "dengine[serve]".')
 
 
 def _run(demo: Demo) -> None:

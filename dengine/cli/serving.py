@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from ..engine import DataEngine
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml")
-PAGE = ("jinja2", "sse_starlette")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "jinja2", "sse_starlette")
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 
@@ -85,7 +84,7 @@ def serve(
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
     machines reach it only with --host, which wants --token-file, and should have --cert and --key.
     """
-    must_have_serve(*(["asyncua"] if how["opcua"] else []), *(PAGE if page else []))
+    must_have_serve(*(["asyncua"] if how["opcua"] else []))
     from ..cells import RtdeRecorder
     from ..engine import DataEngine
     from ..serve.server import Serving, tell_safe_mode

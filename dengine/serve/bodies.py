@@ -39,9 +39,24 @@ class Report:
     success: Any
 
 
+def media_type(request: Request) -> str:
+    """What a request says that its body is, without parameters; "" where it says nothing."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def read_body(request: Request, most: int) -> bytes | None:
+    """A request's body; None where it has more bytes than that, the rest of which are not read."""
+    body = bytearray()
+    async for piece in request.stream():
+        body += piece
+        if len(body) > most:
+            return None
+    return bytes(body)
+
+
 async def trace_request(request: Request) -> TraceRequest:
     """What a request asks to be decided; Refusal where it says nothing that can be."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = media_type(request)
     read = READERS.get(kind)
     if read is None:
         raise Refusal(
@@ -50,9 +65,9 @@ async def trace_request(request: Request) -> TraceRequest:
     return read(request, await request.body())
 
 
-async def report(request: Request) -> Report:
+async def report_request(request: Request) -> Report:
     """What a request reports; Refusal where it reports nothing."""
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    kind = media_type(request)
     if kind not in (JSON, MSGPACK):
         raise Refusal(415, f"Expected a report as {JSON} or {MSGPACK}, got {shortened(kind)}.")
     table = _table(PARSERS[kind](await request.body()), ("id", "success"), ("id", "success"))

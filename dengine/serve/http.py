@@ -24,13 +24,13 @@ from ..records import Action, Decision
 from ..store.base import Store
 from ..store.records import StoredDecision
 from ..store.views import HistoryFilter, PastDecision
-from .bodies import report, trace_request
+from .bodies import report_request, trace_request
 from .metrics import Metrics
 from .openapi import as_page, document
 from .problems import Refusal
+from .schemas import MOST_OPEN, OPEN
 from .service import Answer, CellService
 
-OPEN, MOST_OPEN = 20, 200  # decisions that a page of `/decisions` holds
 HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
 Endpoint = Callable[[Request], Awaitable[Response]]
 
@@ -69,7 +69,7 @@ class HttpApi:
 
     async def report(self, request: Request) -> Response:
         """Report what became of a decision; 404 for an unknown one, 409 for a label against the first."""
-        said = await report(request)
+        said = await report_request(request)
         success = as_success(said.success)
         try:
             told = await self.service.report(said.id, success)

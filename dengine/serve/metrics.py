@@ -31,7 +31,7 @@ class Metrics:
         self._decide = seconds("decide", "From a trace to its answer, in line too.")
         self._report = seconds("report", "From a label to its being on the disk.")
         self._retrain = seconds("retrain", "From the data to the new version answering.", RETRAIN_SECONDS)
-        registry.register(Standing(service))
+        registry.register(Gauges(service))
         service.observers.append(self.note)
 
     def note(self, news: Answer | Told | RetrainReport) -> None:
@@ -51,7 +51,7 @@ class Metrics:
         return generate_latest(self._registry), CONTENT_TYPE_LATEST
 
 
-class Standing:
+class Gauges:
     """How a service stands, read at the moment it is asked."""
 
     def __init__(self, service: CellService) -> None:

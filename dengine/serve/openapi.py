@@ -9,7 +9,7 @@ from html import escape
 
 from .bodies import JSON, MSGPACK
 from .problems import PROBLEM, RETRY_AFTER
-from .schemas import PROBLEMS, SCHEMAS, Json, body, operation, text
+from .schemas import PROBLEMS, SCHEMAS, Json, body, operation, response, text
 
 LATER = (429, 503)
 TRACES: Json = {
@@ -18,6 +18,7 @@ TRACES: Json = {
 }
 REPORTS: Json = {"a good part": {"value": {"id": "order-7", "success": True}}}
 ID: Json = {"name": "id", "in": "path", "required": True, "schema": text("The decision's id.")}
+DOWN = {"503": response("The engine's thread has ended, or gives no sign.", "Health")}
 UNREAD = (400, 403, 408, 413, 415)
 PATHS: Json = {
     "/decide": {
@@ -52,7 +53,7 @@ PATHS: Json = {
     },
     "/metrics": {"get": operation("What Prometheus reads.", "text/plain", ())},
     "/healthz": {
-        "get": operation("Whether the engine answers; asks for no token.", "Health", ()) | {"security": []},
+        "get": operation("Whether the engine answers; asks for no token.", "Health", (), also=DOWN, security=[]),
     },
     "/openapi.json": {"get": operation("This document.", JSON, ())},
     "/docs": {"get": operation("This document, to read.", "text/html", ())},
@@ -70,23 +71,13 @@ def document(version: str) -> Json:
     }
     schemes = {"bearer": {"type": "http", "scheme": "bearer"}, "basic": {"type": "http", "scheme": "basic"}}
     info = {"title": "dengine serve", "version": version, "description": "A robot cell's data engine."}
-    down = {"description": "The engine's thread has ended, or gives no sign.", **_health()}
-    paths = PATHS | {"/healthz": {"get": _answering(PATHS["/healthz"]["get"], "503", down)}}
     return {
         "openapi": "3.1.0",
         "info": info,
-        "paths": paths,
+        "paths": PATHS,
         "components": {"schemas": SCHEMAS, "responses": responses, "securitySchemes": schemes},
         "security": [{}, {"bearer": []}, {"basic": []}],
     }
-
-
-def _health() -> Json:
-    return {"content": {JSON: {"schema": {"$ref": "#/components/schemas/Health"}}}}
-
-
-def _answering(operation: Json, status: str, response: Json) -> Json:
-    return operation | {"responses": operation["responses"] | {status: response}}
 
 
 def as_page(openapi: Json) -> str:
@@ -111,8 +102,8 @@ def _sections(openapi: Json) -> Iterator[str]:
         yield f'<h3 id="{escape(name)}">{escape(name)}</h3><p>{escape(schema["description"])}</p>'
         yield _list((key, _about(each)) for key, each in schema["properties"].items())
     yield "<h2>Problems</h2>"
-    for status, response in openapi["components"]["responses"].items():
-        yield f'<h3 id="problem-{status}">{status}</h3><p>{escape(response["description"])}</p>'
+    for status, answer in openapi["components"]["responses"].items():
+        yield f'<h3 id="problem-{status}">{status}</h3><p>{escape(answer["description"])}</p>'
 
 
 def _takes(said: Json) -> Iterator[str]:

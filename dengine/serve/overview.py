@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from dataclasses import dataclass
 
 from ..engine import DataEngine
@@ -40,10 +39,7 @@ class Overview:
 async def overview(service: CellService) -> Overview:
     """How the cell is doing, by its store; no decision waits for it, but where the engine remembers in memory alone."""
     engine = service.engine
-    if service.reading is engine.store:
-        doing = await service.ask(lambda owned: standing(owned.store, owned.recipe))
-    else:
-        doing = await asyncio.to_thread(standing, service.reading, engine.recipe)
+    doing = await service.read(lambda store: standing(store, engine.recipe))
     share = doing.newest.share(doing.newest.verified)
     return Overview(
         decisions=doing.ever.decisions,
@@ -63,16 +59,11 @@ async def overview(service: CellService) -> Overview:
 
 def alarm(engine: DataEngine, doing: Standing) -> str:
     """What somebody should look at, the worst first; "" where there is nothing."""
-    accepts = doing.newest.bad_accepts
-    said = (
-        f"The store cannot be written: {engine.store_fault}" if engine.store_fault else "",
-        f"Safe mode: {engine.safe_mode}" if engine.safe_mode else "",
-        f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows." if broken(doing) else "",
-        f"The model failed on {doing.newest.errors} of the newest decisions." if doing.newest.errors else "",
+    newest, accepts = doing.newest, doing.newest.bad_accepts
+    alarms = (
+        (engine.store_fault, f"The store cannot be written: {engine.store_fault}"),
+        (engine.safe_mode, f"Safe mode: {engine.safe_mode}"),
+        (accepts.verdict == "broken", f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."),
+        (newest.errors, f"The model failed on {newest.errors} of the newest decisions."),
     )
-    return next((text for text in said if text), "")
-
-
-def broken(doing: Standing) -> bool:
-    """Whether the newest decisions break the tolerance for sure, as far as one look goes."""
-    return doing.newest.bad_accepts.verdict == "broken"
+    return next((text for wrong, text in alarms if wrong), "")

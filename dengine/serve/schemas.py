@@ -7,6 +7,7 @@ from typing import Any
 from ..records import Action, Reason, Source
 
 Json = dict[str, Any]
+OPEN, MOST_OPEN = 20, 200  # decisions that a page of `/decisions` holds
 
 
 def text(about: str = "", **more: Any) -> Json:
@@ -178,30 +179,40 @@ QUERY: Json = {
     "channels": number("Of a raw body, channel after channel.", "integer", default=1, minimum=1),
     "trace": flag("With the trace."),
     "open": flag("Only verified decisions that wait for a label: what a controller that died goes on with."),
-    "limit": number("How many at most.", "integer", default=20, minimum=1, maximum=200),
+    "limit": number("How many at most.", "integer", default=OPEN, minimum=1, maximum=MOST_OPEN),
 }
 
 
-def operation(summary: str, answer: str, problems: tuple[int, ...], query: tuple[str, ...] = (), **more: Any) -> Json:
-    """What one method on one path does."""
-    said = {"200": _content(f"#/components/schemas/{answer}", "Done.")} if answer in SCHEMAS else {"200": _text(answer)}
+def operation(
+    summary: str,
+    answer: str,
+    problems: tuple[int, ...],
+    query: tuple[str, ...] = (),
+    also: Json | None = None,
+    **more: Any,
+) -> Json:
+    """What one method on one path does.  answer : a schema's name, or a type of text.  also : answers beside problems."""
+    said = {"200": response("Done.", answer)}
     for status in sorted({*problems, *EVERYWHERE}):
         said[str(status)] = {"$ref": f"#/components/responses/{status}"}
+    said |= also or {}
     found = [{"name": name, "in": "query", "required": False, "schema": QUERY[name]} for name in query]
     return {"summary": summary, "parameters": [*found, *more.pop("parameters", [])], "responses": said} | more
 
 
-def _content(schema: str, about: str, kind: str = "application/json") -> Json:
-    return {"description": about, "content": {kind: {"schema": {"$ref": schema}}}}
+def response(about: str, answer: str) -> Json:
+    """What a method answers: by a schema's name as JSON, else a text of that type."""
+    kind, schema = ("application/json", _of(answer)) if answer in SCHEMAS else (answer, text())
+    return {"description": about, "content": {kind: {"schema": schema}}}
 
 
-def _text(kind: str) -> Json:
-    return {"description": "Done.", "content": {kind: {"schema": text()}}}
+def _of(schema: str) -> Json:
+    return {"$ref": f"#/components/schemas/{schema}"}
 
 
 def body(schema: str, kinds: tuple[str, ...], examples: Json, raw: bool = False) -> Json:
     """What a method takes."""
-    same: Json = {"schema": {"$ref": f"#/components/schemas/{schema}"}}
+    same: Json = {"schema": _of(schema)}
     content: Json = {kind: same | ({"examples": examples} if "json" in kind else {}) for kind in kinds}
     if raw:
         content["application/octet-stream"] = {"schema": text("float32, little-endian.", format="binary")}

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -59,8 +59,8 @@ class Serving:
     largest: int = Access().largest
     rate: float = Access().rate
     connections: int = 100
-    interfaces: Sequence[str] = INTERFACES
-    beside: Sequence[Beside] = field(default=())
+    interfaces: Sequence[str] = tuple(INTERFACES)
+    beside: Sequence[Beside] = ()
     opcua: int | None = None
     opcua_cert: Path | None = None
     opcua_key: Path | None = None

@@ -6,7 +6,7 @@
     service.close()
 
 Each interface (HTTP, XML-RPC, OPC UA, the page) turns its own words into these calls, and answers into its own words. What
-only reads asks `CellService.reading`, a second connection, so that no decision waits for it.
+only reads does so by a second connection to the store (`read`, `look`), so that no decision waits for it.
 """
 
 from __future__ import annotations
@@ -149,12 +149,16 @@ class CellService:
         """Do something in the engine's thread, between two decisions; what it raises is raised here."""
         return await asyncio.wrap_future(self._put(lambda engine, late: work(engine)).future)
 
-    async def look(self, work: Callable[[Store], T]) -> T:
-        """Read, in a thread of its own, a store that holds all that was decided so far."""
+    async def read(self, work: Callable[[Store], T]) -> T:
+        """Read the store as the disk has it, in a thread of its own; in the engine's where it remembers in memory."""
         if self.reading is self.engine.store:
             return await self.ask(lambda engine: work(engine.store))
-        await self.ask(lambda engine: engine.flush())
         return await asyncio.to_thread(work, self.reading)
+
+    async def look(self, work: Callable[[Store], T]) -> T:
+        """Read a store that holds all that was decided so far."""
+        await self.ask(lambda engine: engine.flush())
+        return await self.read(work)
 
     @property
     def waiting(self) -> int:

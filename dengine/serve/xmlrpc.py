@@ -16,11 +16,13 @@ from collections.abc import Callable
 from typing import Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError
+from .access import RPC
+from .bodies import media_type, read_body
 from .calls import PATIENCE, Recorder, RobotCalls
 from .service import CellService
 
@@ -73,32 +75,16 @@ def routes(
     calls = RobotCalls(service, recorder, patience).table()
 
     async def rpc(request: Request) -> Response:
-        if request.headers.get("content-type", "").partition(";")[0].strip().lower() not in TYPES:
+        if media_type(request) not in TYPES:
             return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
-        body = await read(request, most)
+        body = await read_body(request, most)
         if body is None:
             return PlainTextResponse(f"Expected at most {most} bytes.\n", 413)
         return Response(await answered(calls, body), media_type="text/xml")
 
-    return [Route("/RPC2", rpc, methods=["POST"])]
-
-
-async def read(request: Request, most: int) -> bytes | None:
-    """A request's body; None where it is longer than that, and what is too long is not read."""
-    length = request.headers.get("content-length", "0")
-    if not length.isascii() or not length.isdigit() or int(length[:12]) > most:
-        return None
-    body = bytearray()
-    try:
-        async for piece in request.stream():
-            body += piece
-            if len(body) > most:
-                return None
-    except ClientDisconnect:
-        log.info("a client hung up within its call")
-    return bytes(body)
+    return [Route(RPC, rpc, methods=["POST"])]
 
 
 async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: bytes) -> bytes:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 from zipfile import ZipFile
 
 from starlette.requests import Request
@@ -18,15 +18,17 @@ from starlette.responses import JSONResponse, Response
 
 from ...engine import DataEngine
 from ...errors import BusyError, DengineError, ReportError, SettingError
+from ..access import is_own_page, is_same
+from ..bodies import read_body
+from ..problems import Refusal
 from .looking import Looking
-from .templating import HEADERS
 from .words import Words
 
 LARGEST = 8192  # bytes of a form
 LONGEST = 100  # characters of an author
 
 Form = Mapping[str, str]
-Act = Callable[[DataEngine, Form, str], bool]
+Act = Callable[[DataEngine, Form, str], bool]  # done with a form, by its author; whether anything changed
 
 
 def _shadow_on(engine: DataEngine, form: Form, author: str) -> bool:
@@ -52,9 +54,10 @@ def _rollback(engine: DataEngine, form: Form, author: str) -> bool:
 
 
 def _retrain(engine: DataEngine, form: Form, author: str) -> bool:
+    under_way = engine.retraining
     engine.store.put_event("retrain", "asked for on the page", author=author)
     engine.start_retrain()
-    return True
+    return not under_way
 
 
 ACTS: dict[str, Act] = {
@@ -64,14 +67,6 @@ ACTS: dict[str, Act] = {
     "rollback": _rollback,
     "retrain": _retrain,
 }
-
-
-class RefusedError(Exception):
-    """An act that is not done.  status : of the answer.  said : why, for whoever asked."""
-
-    def __init__(self, status: int, said: str) -> None:
-        super().__init__(said)
-        self.status, self.said = status, said
 
 
 class Acts:
@@ -87,57 +82,57 @@ class Acts:
             form = await self._form(request, w)
             author = _author(form, w)
             response = await (self._export(author, w) if name == "export" else self._do(name, form, author, w))
-        except RefusedError as refusal:
-            return JSONResponse({"ok": False, "said": refusal.said}, refusal.status, HEADERS)
+        except Refusal as refusal:
+            return _said(refusal.detail, refusal.status, refusal.headers)
         except (DengineError, OSError) as error:
-            said = w("act.failed", why=" ".join(str(error).split()))
-            return JSONResponse({"ok": False, "said": said}, 503 if isinstance(error, BusyError) else 409, HEADERS)
+            why = " ".join(str(error).split())
+            return _said(w("act.failed", why=why), 503 if isinstance(error, BusyError) else 409)
         self._looking.look_anew()
         return response
 
     async def _do(self, name: str, form: Form, author: str, w: Words) -> Response:
         act = ACTS.get(name)
         if act is None:
-            raise RefusedError(404, w("act.refused"))
+            raise Refusal(404, w("act.refused"))
         changed = await self._service.ask(lambda engine: act(engine, form, author))
-        return JSONResponse({"ok": True, "said": w(f"act.{name}.done" if changed else "act.nothing")}, headers=HEADERS)
+        return _said(w(f"act.{name}.done" if changed else "act.nothing"))
 
     async def _export(self, author: str, w: Words) -> Response:
         content, version = await self._service.ask(lambda engine: _exported(engine, author))
         name = {"content-disposition": f'attachment; filename="model_{version}.zip"'}
-        return Response(content, media_type="application/zip", headers=HEADERS | name)
+        return Response(content, media_type="application/zip", headers=name)
 
     async def _form(self, request: Request, w: Words) -> Form:
-        """The form of a request of this page. RefusedError for any other."""
+        """The form of a request of this page. Refusal for any other."""
         if not _same_origin(request):
-            raise RefusedError(403, w("act.refused"))
-        body = b""
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > LARGEST:
-                raise RefusedError(413, w("act.refused"))
+            raise Refusal(403, w("act.refused"))
+        body = await read_body(request, LARGEST)
+        if body is None:
+            raise Refusal(413, w("act.refused"))
         try:
             fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=20)
         except ValueError as error:  # more fields than that
-            raise RefusedError(413, w("act.refused")) from error
+            raise Refusal(413, w("act.refused")) from error
         form = {key: values[-1] for key, values in fields.items()}
-        if not secrets.compare_digest(form.get("token", "").encode(), self.token.encode()):
-            raise RefusedError(403, w("act.refused"))
+        if not is_same(self.token, form.get("token", "")):
+            raise Refusal(403, w("act.refused"))
         return form
 
 
+def _said(text: str, status: int = 200, headers: Mapping[str, str] | None = None) -> Response:
+    return JSONResponse({"said": text}, status, headers)
+
+
 def _same_origin(request: Request) -> bool:
-    """Whether a browser says that the request came from a page of this very server."""
-    if request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
-        return False
-    origin = request.headers.get("origin")
-    return origin is not None and urlsplit(origin).netloc == request.headers.get("host")
+    """Whether a browser says that the request came from a page of this very server; who does not say it is no page."""
+    origin, fetch_site, host = map(request.headers.get, ("origin", "sec-fetch-site", "host"))
+    return origin is not None and fetch_site != "none" and is_own_page(origin, fetch_site, host)
 
 
 def _author(form: Form, w: Words) -> str:
     author = " ".join(form.get("author", "").split())
     if not author or not author.isprintable() or len(author) > LONGEST:
-        raise RefusedError(422, w("act.no-author"))
+        raise Refusal(422, w("act.no-author"))
     return author
 
 

@@ -36,7 +36,13 @@ def course_chart(course: Course, w: Words) -> Markup:
     )
 
 
-def retrain_places(course: Course) -> list[float]:
+def _retrains(course: Course, x: Scale) -> list[Markup]:
+    places = sorted({x.at(place) for place in _retrain_places(course)})
+    bottom = HEIGHT - BOTTOM
+    return [element("path", d=f"M{at - 5} {bottom}l5 -9l5 9Z", class_="retrain") for at in places]
+
+
+def _retrain_places(course: Course) -> list[float]:
     """After how many parts each retrain came, as far as the stretches tell."""
     places = []
     for retrain in course.retrains:
@@ -47,12 +53,6 @@ def retrain_places(course: Course) -> list[float]:
             done += stretch.n
         places.append(float(done))
     return places
-
-
-def _retrains(course: Course, x: Scale) -> list[Markup]:
-    places = sorted({x.at(place) for place in retrain_places(course)})
-    bottom = HEIGHT - BOTTOM
-    return [element("path", d=f"M{at - 5} {bottom}l5 -9l5 9Z", class_="retrain") for at in places]
 
 
 def _grid(x: Scale, y: Scale, w: Words) -> Markup:

@@ -14,6 +14,7 @@ from ...store.views import LABELS, HistoryFilter, Key, PastDecision
 from .looking import Looking
 
 PAGE = 50
+FILTERS = {"action": tuple(Action), "reason": tuple(Reason), "label": tuple(LABELS)}
 
 Name = TypeVar("Name", bound=StrEnum)
 

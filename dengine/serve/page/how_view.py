@@ -20,7 +20,7 @@ class HowView:
     """How it is doing.
 
     course : None before the first decision.  pace : parts an hour, None before the second.
-    retrained : the newest accepted retrain.  saved : seconds of checks that were left out.
+    retrained : the newest accepted retrain.
     """
 
     doing: Standing
@@ -30,7 +30,6 @@ class HowView:
     pace: float | None
     retrained: PastRetrain | None
     events: tuple[Event, ...]
-    saved: float
 
     @property
     def left_out(self) -> int:
@@ -38,8 +37,8 @@ class HowView:
         return self.doing.ever.accepted + self.doing.ever.rejected
 
 
-def how_view(looking: Looking, check_seconds: float) -> HowView:
-    """Read how it is doing; check_seconds : what a check takes."""
+def how_view(looking: Looking) -> HowView:
+    """Read how it is doing."""
     store, recipe, engine = looking.store, looking.recipe, looking.service.engine
     doing = standing(store, recipe, NEWEST)
     went = course(store, recipe, NEWEST) if doing.ever.decisions else None
@@ -52,7 +51,6 @@ def how_view(looking: Looking, check_seconds: float) -> HowView:
         pace=_pace(looking),
         retrained=accepted[-1] if accepted else None,
         events=tuple(store.events(EVENTS)[::-1]),
-        saved=(doing.ever.accepted + doing.ever.rejected) * check_seconds,
     )
 
 
@@ -68,6 +66,6 @@ def mode_of(looking: Looking) -> tuple[str, str]:
     engine = looking.service.engine
     if engine.safe_mode:
         return "safe", engine.safe_mode
-    if engine.policy.audit_rate == 1.0:
+    if engine.shadow:
         return "shadow", ""
     return ("learns" if engine.version == 0 else "decides"), ""

@@ -1,8 +1,7 @@
-"""What the page reads: one look at a time, in a worker thread, and no more often than something changes."""
+"""What the page reads: one look at a time, and no more often than something changes."""
 
 from __future__ import annotations
 
-import asyncio
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -43,14 +42,11 @@ class Looking:
         return self.service.engine.recipe
 
     async def look(self, view: Hashable, read: Callable[[Looking], T], longest: float = LONGEST) -> T:
-        """What `read` finds, in a worker thread; as it was found before where nothing has changed since.
+        """What `read` finds, in another thread; as it was found before where nothing has changed since.
 
         longest : seconds that the view may rest after a look that took long, and be as old.
-        An engine that remembers in memory is read in its own thread: its store has one thread only.
         """
-        if self.store is self.service.engine.store:
-            return await self.service.ask(lambda engine: self._look(view, read, longest))
-        found = await asyncio.to_thread(self._look, view, read, longest)
+        found = await self.service.read(lambda store: self._look(view, read, longest))
         rest = self._rests.get(view, 0.0) - time.monotonic()
         if rest > 0.0 and self._kept.get(view, (None,))[0] != self.pulse.number:
             self.pulse.advance_in(rest)  # what was found is old by now: whoever watches is told when it is looked at anew

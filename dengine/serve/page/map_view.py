@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from ...answering import as_it_stood
 from ...experiments.maps import is_probability
-from ...records import Action
 from ...store.views import HistoryFilter, PastDecision
 from .looking import Looking
 from .map_chart import Mark, PartMap
@@ -34,7 +33,7 @@ def map_view(looking: Looking) -> PartMap | None:
         return None
     newest = _newest(looking, recent[-NEWEST:], version)
     shown = {mark.id for mark in newest}
-    marks = [*(_named(mark, names) for mark in known if mark.id not in shown), *newest]
+    marks = [*(replace(mark, name=names.get(mark.id, mark.name)) for mark in known if mark.id not in shown), *newest]
     radius = recipe.radius if recipe.fraction is None and newest else None
     return PartMap(version, tuple(marks), radius, is_probability(recipe)) if marks else None
 
@@ -61,14 +60,10 @@ def _newest(looking: Looking, recent: list[PastDecision], version: int) -> list[
             continue
         x, y = _plane(np.asarray(stored.embedding).mean(axis=0))
         last = past is recent[-1]
-        found.append(Mark(past.id, part_name(past), x, y, past.label, Action(past.action).value, last))
+        found.append(Mark(past.id, part_name(past), x, y, past.label, past.action.value, last))
     return found
 
 
 def _plane(point: np.ndarray) -> tuple[float, float]:
     """The first two dimensions, (d,) -> x, y; 0 where a reducer has but one."""
     return float(point[0]), float(point[1]) if len(point) > 1 else 0.0
-
-
-def _named(mark: Mark, names: Mapping[str, str]) -> Mark:
-    return Mark(mark.id, names.get(mark.id, mark.name), mark.x, mark.y, mark.label)

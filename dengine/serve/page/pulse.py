@@ -58,7 +58,7 @@ class Pulse:
     async def events(self) -> AsyncIterator[dict[str, str | int]]:
         """What a watcher is told: which process this is, then every change, and in quiet that the line still stands."""
         self.begin()
-        yield {"event": "hello", "data": json.dumps({"boot": self.boot, "number": self.number}), "retry": RETRY}
+        yield {"event": "hello", "data": json.dumps({"boot": self.boot}), "retry": RETRY}
         known = self.number
         while not self._over:
             turn = self._turn

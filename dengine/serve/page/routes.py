@@ -15,7 +15,7 @@ from starlette.staticfiles import StaticFiles
 from ..service import CellService
 from . import bound_chart, course_chart, map_chart, trace_chart
 from .acts import Acts
-from .history_view import HistoryQuery, history_query, history_view
+from .history_view import FILTERS, history_query, history_view
 from .how_view import PACE, HowView, how_view, mode_of
 from .looking import Looking
 from .map_view import map_view
@@ -35,7 +35,6 @@ DRAWING = {
     "bad_chart": bound_chart.bad_chart,
     "map_chart": map_chart.map_chart,
     "course_chart": course_chart.course_chart,
-    "retrain_places": course_chart.retrain_places,
     "part_name": part_name,
     "story": story,
     "why": why,
@@ -93,14 +92,14 @@ class LivePage:
         """One part; 404 for one that is unknown."""
         found = await self._part(request.query_params.get("id", ""))
         if found is None:
-            return self._page(request, "failed", 404, said="")
+            return self._page(request, "failed", 404)
         return self._page(request, "part", part=found)
 
     async def history(self, request: Request) -> Response:
         """The history."""
-        query: HistoryQuery = history_query(dict(request.query_params))
+        query = history_query(dict(request.query_params))
         view = await self._looking.look(("history", query), lambda looking: history_view(looking, query))
-        return self._page(request, "history", history=view)
+        return self._page(request, "history", history=view, filters=FILTERS)
 
     async def acts(self, request: Request) -> Response:
         """What people may do."""
@@ -118,7 +117,7 @@ class LivePage:
         return EventSourceResponse(self._pulse.events(), headers={"cache-control": "no-store"}, ping=3600)
 
     async def _how(self) -> HowView:
-        return await self._looking.look("how", lambda looking: how_view(looking, self._check_seconds))
+        return await self._looking.look("how", how_view)
 
     async def _part(self, decision_id: str) -> PartView | None:
         return await self._looking.look(("part", decision_id), lambda looking: part_view(looking, decision_id))
@@ -136,7 +135,6 @@ class LivePage:
             "path": request.url.path,
             "token": self._acts.token,
             "boot": self._pulse.boot,
-            "number": self._pulse.number,
             "cell": self._looking.store.cell_id,
             "mode": mode,
             "mode_reason": reason,
@@ -147,7 +145,7 @@ class LivePage:
 
 
 def _chosen(view: View) -> View:
-    """A view that first takes a chosen language or appearance, and says what it cannot show."""
+    """A view that first takes a chosen language or appearance."""
 
     @wraps(view)
     async def shown(request: Request) -> Response:

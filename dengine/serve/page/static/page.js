@@ -18,7 +18,8 @@ let waiting = null;
 let looking = false;
 let again = false;
 let spoke = 0;
-const written = new Map(); // what each part was when it was put in
+// What each part was when it was put in: one that is still the same stays, and so does the focus in it.
+const written = new Map([...document.querySelectorAll("[data-part]")].map((part) => [part.id, part.outerHTML]));
 
 function lineIs(state) {
   if (link.dataset.state === state) return;
@@ -164,6 +165,7 @@ document.addEventListener("click", (event) => {
 });
 
 document.getElementById("confirm-cancel").addEventListener("click", () => dialog.close());
+dialog.addEventListener("close", () => document.getElementById(asked.from)?.focus()); // its part may be a new one by now
 
 dialog.querySelector("form").addEventListener("submit", async (event) => {
   event.preventDefault();
@@ -186,9 +188,9 @@ dialog.querySelector("form").addEventListener("submit", async (event) => {
 
 async function told(answer, author) {
   const file = answer.headers.get("content-disposition");
-  const said = file ? null : (await answer.json()).said;
+  const { said, detail } = file ? {} : await answer.json();
   if (!answer.ok) {
-    document.getElementById("confirm-failed").textContent = said;
+    document.getElementById("confirm-failed").textContent = said ?? detail; // detail: of the guard before the page
     return;
   }
   localStorage.setItem("dengine_author", author);
