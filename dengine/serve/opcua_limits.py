@@ -2,8 +2,8 @@
 
 A length that is negative, or greater than what follows it, is refused: in twenty bytes, two thousand million nulls could be
 asked for. Messages are bounded while they arrive and not after; what cannot be read ends its connection; nobody is an
-administrator. Whatever ends a connection is said before, by an ERR message (OPC UA Part 6, 7.1.2.5) of a status code and that
-code's own description; only a CloseSecureChannel has no answer, for the protocol has none.
+administrator. Before a connection is ended, an ERR message (OPC UA Part 6, 7.1.2.5) says why, by a status code and what the
+standard says of that code; only a CloseSecureChannel has no answer, for the protocol has none.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from typing import Any
 from asyncua import ua
 from asyncua.common.utils import Buffer, ServiceError
 from asyncua.crypto.permission_rules import User, UserRole
-from asyncua.crypto.uacrypto import InvalidSignature
 from asyncua.server.binary_server_asyncio import BinaryServer, OPCUAProtocol
 from asyncua.server.internal_server import InternalServer
 from asyncua.server.server import Server
 from asyncua.ua import ua_binary
 from asyncua.ua.status_codes import StatusCodes, get_name_and_doc
 from asyncua.ua.uaerrors import BadDecodingError, UaError, UaStatusCodeError
+from cryptography.exceptions import InvalidSignature
 
 log = logging.getLogger("dengine")
 MOST = 1 << 20  # bytes of a message: 250,000 samples
@@ -48,7 +48,7 @@ def bounded(make: Callable[[Any], Reader]) -> Callable[[Any], Reader]:
         read = make(kind)
 
         def checked(data: Any) -> Any:
-            if isinstance(data, Buffer) and (n := int.from_bytes(data.copy(4).read(4), "little", signed=True)) > len(data):
+            if isinstance(data, Buffer) and int.from_bytes(data.copy(4).read(4), "little", signed=True) > len(data):
                 raise BadDecodingError  # more elements than bytes
             return read(data)
 
@@ -76,7 +76,7 @@ def harden() -> None:
 
 
 class BoundedProtocol(OPCUAProtocol):
-    """A connection that ends, and says why, at the first thing that is no message of a bearable size, or only half of one."""
+    """A connection that ends, and says why, at the first thing that is no message of a bearable size, or half of one."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -196,15 +196,21 @@ class BoundedListener(BinaryServer):
 
 
 class Users:
-    """Who may read and call: everybody on this machine, or who knows the token. Nobody may change the address space."""
+    """Who may read and call: everybody on this machine, or who knows the token. Nobody may change the address space.
 
-    def __init__(self, token: str | None) -> None:
-        self._token = token
+    encrypted : only who shows a certificate, as whoever encrypts does: asyncua lets anyone open a channel without security,
+    so that a client can ask what the endpoints are, and would let a session begin on it.
+    """
+
+    def __init__(self, token: str | None, encrypted: bool = False) -> None:
+        self._token, self._encrypted = token, encrypted
 
     def get_user(
         self, iserver: InternalServer, username: str | None = None, password: Any = None, certificate: Any = None
     ) -> User | None:
         """The user of this name and password; None where there is none."""
+        if self._encrypted and not certificate:
+            return None
         if self._token is None:
             return User(role=UserRole.User, name="anyone")
         given = password if isinstance(password, bytes) else str(password or "").encode("utf-8", "surrogateescape")
@@ -213,11 +219,14 @@ class Users:
 
 
 class BoundedServer(Server):
-    """asyncua's server with these limits. token : the password of the one user; None: anyone on this machine may ask."""
+    """asyncua's server with these limits.
 
-    def __init__(self, token: str | None = None) -> None:
+    token : the password of the one user; None: anyone on this machine may ask.  encrypted : no session without encryption.
+    """
+
+    def __init__(self, token: str | None = None, encrypted: bool = False) -> None:
         harden()
-        super().__init__(user_manager=Users(token))  # type: ignore[arg-type]  # a duck of theirs, as their own ones are
+        super().__init__(user_manager=Users(token, encrypted))  # type: ignore[arg-type]  # a duck of theirs, as their own ones are
         self.set_identity_tokens([ua.AnonymousIdentityToken if token is None else ua.UserNameIdentityToken])
         self.limits.max_message_size, self.limits.max_chunk_count = MOST, MOST // CHUNK + 1
         self.iserver.allow_remote_admin = False
