@@ -33,7 +33,7 @@ CHUNK = 65535  # bytes of a message's part
 CONNECTIONS = 50
 SUBSCRIPTIONS = 100
 GREETING = 10.0  # seconds in which a connection must have become a session, and half a message a whole one
-BUFFER = 8192  # bytes that a client must be able to take at once, by OPC UA: answers are cut into pieces of its size
+BUFFER = 1024  # bytes that a client must be able to take at once: the least that any OPC UA lets it have
 USER = "dengine"
 HEADS = {b"HELF": 8, b"OPNF": 12, b"CLOF": 12, b"MSGF": 12, b"MSGC": 12, b"MSGA": 12}  # what a client sends; a head's bytes
 
