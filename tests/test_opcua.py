@@ -20,6 +20,9 @@ pytest.importorskip("asyncua", reason="OPC UA needs the extra `opcua`")
 Client, ua = (getattr(pytest.importorskip("asyncua"), name) for name in ("Client", "ua"))
 opcua = pytest.importorskip("dengine.serve.opcua")
 limits = pytest.importorskip("dengine.serve.opcua_limits")
+from asyncua.common.connection import SecureConnection, TransportLimits  # noqa: E402  # not before it is known to be there
+from asyncua.crypto.security_policies import SecurityPolicyNone  # noqa: E402
+from asyncua.ua.ua_binary import struct_to_binary  # noqa: E402
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 VERIFY, ACCEPT = 0, 1
@@ -360,30 +363,42 @@ def told(said: bytes) -> tuple[int, str]:
 def test_what_does_not_fit_its_channel_is_told_so(
     plant: Plant, run, monkeypatch: pytest.MonkeyPatch, change: tuple[int, bytes], code: int
 ) -> None:
-    from asyncua.common.connection import SecureConnection, TransportLimits
-    from asyncua.crypto.security_policies import SecurityPolicyNone
-    from asyncua.ua.ua_binary import struct_to_binary
-
     monkeypatch.setattr(limits, "GREETING", 0.2)
-    channel, (at, bytes_) = SecureConnection(SecurityPolicyNone(), TransportLimits()), change
+    at, bytes_ = change
 
     async def stranger() -> None:
-        reader, writer = await asyncio.open_connection("127.0.0.1", plant.server.port)
-        opening = ua.OpenSecureChannelRequest()
-        opening.Parameters.SecurityMode = ua.MessageSecurityMode.None_
-        writer.write(HELLO + channel.message_to_binary(struct_to_binary(opening), ua.MessageType.SecureOpen, 1))
-        async with asyncio.timeout(60):
-            for _ in range(2):  # an acknowledgement, and a channel
-                head = await reader.readexactly(8)
-                rest = await reader.readexactly(int.from_bytes(head[4:], "little") - 8)
-        channel.security_token.ChannelId, channel.security_token.TokenId = int.from_bytes(rest[:4], "little"), 13
-        asked = channel.message_to_binary(struct_to_binary(ua.GetEndpointsRequest()), request_id=2)
-        writer.write(asked[:at] + bytes_ + asked[at + len(bytes_) :])
-        async with asyncio.timeout(60):
+        async with channel(plant.server.port) as (said, reader, writer):
+            asked = said.message_to_binary(struct_to_binary(ua.GetEndpointsRequest()), request_id=2)
+            writer.write(asked[:at] + bytes_ + asked[at + len(bytes_) :])
             assert told(await reader.read())[0] == code
-        writer.close()
 
     run(stranger())
+
+
+def test_a_message_of_too_many_parts_is_told_so(plant: Plant, run) -> None:
+    async def stranger() -> None:
+        async with channel(plant.server.port) as (said, reader, writer):
+            writer.write(said.message_to_binary(bytes(limits.MOST + 1), request_id=2))
+            assert told(await reader.read())[0] == CODES.BadRequestTooLarge
+
+    run(stranger())
+
+
+@asynccontextmanager
+async def channel(port: int) -> AsyncIterator[tuple[Any, asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A channel without security: what makes its messages, and the connection."""
+    made = SecureConnection(SecurityPolicyNone(), TransportLimits())
+    opening = ua.OpenSecureChannelRequest()
+    opening.Parameters.SecurityMode = ua.MessageSecurityMode.None_
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with asyncio.timeout(60):
+        writer.write(HELLO + made.message_to_binary(struct_to_binary(opening), ua.MessageType.SecureOpen, 1))
+        for _ in range(2):  # an acknowledgement, and the channel
+            head = await reader.readexactly(8)
+            rest = await reader.readexactly(int.from_bytes(head[4:], "little") - 8)
+        made.security_token.ChannelId, made.security_token.TokenId = int.from_bytes(rest[:4], "little"), 13
+        yield made, reader, writer
+    writer.close()
 
 
 def test_one_connection_too_many_is_told_so(plant: Plant, run, monkeypatch: pytest.MonkeyPatch) -> None:
