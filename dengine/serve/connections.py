@@ -2,7 +2,7 @@
 
 Whatever ends a connection is answered before: 400 to what is no HTTP, and to half a request whose client says that no more
 comes; 408 to a head that takes too long (a body's time is `guard.Body`'s), and so to a new connection on which nothing was
-sent. Only a connection that waits for a further request ends without a word.
+sent. Only a connection that waits for a further request ends without a word, and whatever is left when the server ends.
 """
 
 from __future__ import annotations
