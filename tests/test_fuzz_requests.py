@@ -52,7 +52,7 @@ def test_a_connection_that_is_closed_without_an_answer_is_found(monkeypatch: pyt
     monkeypatch.syspath_prepend(str(FOLDER))
     from fuzzing import wire
 
-    monkeypatch.setattr(wire, "WAIT", 0.2)
+    monkeypatch.setattr(wire, "PATIENCE", 0.2)
     found = []
     with socket.create_server(("127.0.0.1", 0)) as listening:
         for answer, ends in (
