@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import re
 import signal
 import socket
 import ssl
@@ -47,9 +48,11 @@ Client = Any
 
 
 @contextmanager
-def running(service: CellService, access: Access | None = None, **limits: Any) -> Iterator[Client]:
+def running(
+    service: CellService, access: Access | None = None, interfaces: tuple[str, ...] = ("http",), **limits: Any
+) -> Iterator[Client]:
     """A client of a server in front of this service."""
-    app, begun = create_app(service, access or Access(rate=0.0), ("http",)), threading.Event()
+    app, begun = create_app(service, access or Access(rate=0.0), interfaces), threading.Event()
     options = uvicorn_options(Serving()) | {"http": limited(**{"connections": 100} | limits)}
     with socket.create_server(("127.0.0.1", 0)) as listening:
         server = CellServer(uvicorn.Config(app, **options), service, begun.set)
@@ -405,6 +408,63 @@ def test_sizes_times_and_rates_are_limited(stream: Dataset) -> None:
             pass
         must_be_problem(answer, 429)
         assert answer.headers["retry-after"] == "1"
+
+
+def half(head: str, body: str = "") -> bytes:
+    return f"{head} HTTP/1.1\r\nhost: localhost\r\n{body}".encode("latin-1")
+
+
+NINE = "content-type: {}\r\ncontent-length: 9\r\n\r\n{{"
+CHUNKED = f"content-type: {RAW}\r\ntransfer-encoding: chunked\r\n\r\n"
+WELL = half("GET /healthz", "\r\n")
+HALVES = {  # what is sent; the statuses of what comes
+    "a method": (b"G", [408]),
+    "a line": (b"GET /healthz HT", [408]),
+    "a head": (half("GET /healthz"), [408]),
+    "no HTTP, without an end": (b"\xfe\xff\x80" * 30, [408]),
+    "a trace": (half("POST /decide", NINE.format("application/json")), [408]),
+    "a report": (half("POST /report", NINE.format(MSGPACK)), [408]),
+    "a call": (half("POST /RPC2", NINE.format("text/xml")), [408]),
+    "a piece": (half("POST /decide", f"{CHUNKED}9\r\n1"), [408]),
+    "a piece of no length": (half("POST /decide", f"{CHUNKED}x\r\n"), [400]),
+    "the end of a line": (b"\r\n", [400]),
+    "the next": (WELL + half("GET /healthz"), [200, 408]),
+    "the next, no HTTP": (WELL + b"\0", [200, 400]),
+}
+
+
+@pytest.fixture(scope="module")
+def hasty(service: CellService) -> Iterator[Client]:
+    """A client of a server that gives little time, over every interface."""
+    pytest.importorskip("defusedxml")
+    access = Access(rate=0.0, body_seconds=0.2)
+    with running(service, access, ("http", "xmlrpc", "page"), head_seconds=0.3) as client:
+        yield client
+
+
+@pytest.mark.parametrize("ended", [False, True], ids=["left open", "ended"])
+@pytest.mark.parametrize("name", HALVES)
+def test_half_a_request_is_answered_before_its_connection_is_closed(hasty: Client, name: str, ended: bool) -> None:
+    sent, wanted = HALVES[name]
+    with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
+        raw.sendall(sent)
+        if len(wanted) > 1:
+            assert raw.recv(1, socket.MSG_PEEK)  # the whole one is answered; now there is but the half
+        if ended:  # then no more comes, and nobody waits for it
+            raw.shutdown(socket.SHUT_WR)
+            wanted = [400 if status == 408 else status for status in wanted]
+        said = read_all(raw)
+    assert [int(status) for status in re.findall(rb"HTTP/1\.1 (\d{3}) ", said)] == wanted, said
+    head, _, body = said[said.rindex(b"HTTP/1.1 " + str(wanted[-1]).encode()) :].partition(b"\r\n\r\n")
+    assert b"connection: close" in head
+    assert set(json.loads(body)) == {"type", "title", "status", "detail", "action"}
+
+
+@pytest.mark.parametrize("path", ["/nothing", "/acts/retrain"])
+def test_what_is_refused_by_its_head_is_refused_before_its_body_has_come(hasty: Client, path: str) -> None:
+    with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
+        raw.sendall(half(f"POST {path}", NINE.format(RAW)))
+        assert raw.recv(10) == b"HTTP/1.1 4"
 
 
 def read_all(connection: socket.socket) -> bytes:

@@ -3,11 +3,11 @@
     python training/fuzz_requests.py --n 20000 --seed 1
 
 Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC, OPC UA and bare TCP. Prints a table by kind: tried;
-refused (a 4xx, a fault, a Bad status); closed (the connection ended, for what is no request at all); waiting (half a
-message: the server waits for the rest); taken (what was only spoilt can still be good, and a view of the page takes any
-query). Failed is a 5xx, a redirect or a traceback. Afterwards the decisions from before must be what they were, the same
-traces must be decided on as before, the memory must be as it was after the first fifth, and connections that send nothing
-must have been ended. Exit code 1 if anything is not so.
+refused (a 4xx, a fault, a Bad status, an ERR message); late (half a request: refused once its time was over, by 408 or
+BadTimeout); taken (what was only spoilt can still be good, and a view of the page takes any query); closed (the connection
+ended without an answer); silent (there was no answer, and no end); failed (a 5xx, a redirect, a traceback). None may be
+closed, silent or failed. Afterwards the decisions from before must be what they were, the same traces must be decided on as
+before, and the memory must be as it was after the first fifth. Exit code 1 if anything is not so.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ import json
 import os
 import random
 import re
-import selectors
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -28,12 +26,14 @@ from collections import Counter
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fuzzing.opc import Conversation
 from fuzzing.web import MAKERS, SAMPLES, TOKEN
+from fuzzing.wire import QUIET, WAIT, Call, Halves, exchange, over_http
 
 from dengine import DataEngine, TraceSpec, open_store
 from dengine.checks import toy_traces
@@ -49,13 +49,15 @@ SHARES = {  # of all attempts
     "bytes": 0.10,
     "opcua": 0.12,
 }
-OUTCOMES = ("refused", "closed", "waiting", "taken", "failed")
-SLOW = 20  # connections that send half a head, and nothing more
-WAIT = 30.0  # seconds in which an answer has to come
-QUIET = 0.1  # seconds without an answer to half a request
+HALF = ("head", "bytes", "opcua")  # kinds of which some are half a request
+OUTCOMES = ("refused", "late", "taken", "closed", "silent", "failed")
+WRONG = {
+    "closed": "connections were closed without an answer",
+    "silent": "requests had no answer",
+    "failed": "requests failed",
+}
 GROWTH = 24.0  # MB that the server may have grown by, over the last four fifths
-SHOWN = 5  # failures of a kind that are printed
-
+SHOWN = 5  # of a kind that are wrong, and are printed
 
 os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stalls for longer than a cell would wait
 
@@ -172,118 +174,59 @@ def _posted(body: bytes) -> bytes:
     return head.encode() + body
 
 
-def exchange(port: int, sent: bytes, whole: bool = True) -> tuple[int, bytes]:
-    """Send bytes; the answer's status and text. 0: the connection ended without one; -1: nothing came.
-
-    whole : an answer has to come; else the server may wait for the rest.
-    """
-    with socket.create_connection(("127.0.0.1", port), timeout=WAIT if whole else QUIET) as connection:
-        said = b""
-        try:
-            connection.sendall(sent)
-            while not _complete(said):
-                piece = connection.recv(65536)
-                if not piece:
-                    break
-                said += piece
-        except TimeoutError:
-            return -1, said
-        except ConnectionError:  # it was refused before all was sent
-            pass
-    status = said[9:12]
-    return (int(status) if said.startswith(b"HTTP/1.") and status.isdigit() else 0), said
+def attempt(kind: str, at: Server, conversation: Conversation, rng: random.Random) -> Call:
+    """One malformed request."""
+    if kind == "opcua":
+        return conversation.play(rng)
+    return over_http(at.web, MAKERS[kind](rng).replace(TOKEN.encode(), at.token))
 
 
-def _complete(said: bytes) -> bool:
-    head, end, body = said.partition(b"\r\n\r\n")
-    if not end or b"content-length: " not in head.lower():
-        return False
-    return len(body) >= int(head.lower().partition(b"content-length: ")[2].partition(b"\r\n")[0])
+@dataclass
+class Tally:
+    """Outcomes by kind; what is wrong is printed, the first few of each kind."""
+
+    found: dict[str, Counter[str]]
+
+    def count(self, kind: str, i: int, call: Call) -> None:
+        """Count a call that has its answer, or has none."""
+        outcome = call.close()
+        outcome = "failed" if b"Traceback" in call.said else outcome
+        self.found[kind][outcome] += 1
+        if outcome in WRONG and self.found[kind][outcome] <= SHOWN:
+            print(f"{kind} {i} {outcome}: {call.sent[:300]!r} was answered by {call.said[:600]!r}", file=sys.stderr)
 
 
-def over_web(kind: str, at: Server, rng: random.Random) -> tuple[str, bytes]:
-    """An attempt over HTTP, XML-RPC or TCP."""
-    status, said = exchange(
-        at.web, MAKERS[kind](rng).replace(TOKEN.encode(), at.token), whole=kind != "bytes" and kind != "head"
-    )
-    if 300 <= status < 400 or status >= 500 or b"Traceback" in said:
-        return "failed", said
-    if status in (0, -1):
-        return ("closed" if status == 0 else "waiting"), said
-    if 400 <= status < 500 or b"<fault>" in said:
-        return "refused", said
-    return "taken", said
+def try_all(order: list[str], seed: int, at: Server) -> tuple[dict[str, Counter[str]], float]:
+    """Try requests of these kinds; outcomes by kind, and how the memory has grown, MB, since the first fifth."""
+    conversation, halves, memory = Conversation(at.opc), Halves(), 0.0
+    tally = Tally({kind: Counter() for kind in SHARES})
+    for i, kind in enumerate(order):
+        if i == len(order) // 5:
+            memory = at.memory()
+        call, tell = attempt(kind, at, conversation, random.Random(f"{seed} {i}")), partial(tally.count, kind, i)
+        if call.wait(QUIET if kind in HALF else WAIT):
+            tell(call)
+        else:
+            halves.keep(call, tell)
+    halves.finish()
+    grown = at.memory() - memory
+    print(f"memory: {memory:.1f} MB after {len(order) // 5}, {memory + grown:.1f} MB after {len(order)}", file=sys.stderr)
+    return tally.found, grown
 
 
-def over_opcua(conversation: Conversation, rng: random.Random) -> tuple[str, bytes]:
-    """An attempt over OPC UA."""
-    outcome, said = conversation.play(rng)
-    return ("failed" if b"Traceback" in said else outcome), said
-
-
-def attempt(kind: str, at: Server, conversation: Conversation, rng: random.Random) -> tuple[str, bytes]:
-    """One malformed request; its outcome, and what was answered."""
-    return over_opcua(conversation, rng) if kind == "opcua" else over_web(kind, at, rng)
-
-
-def slow_ones(port: int, n: int) -> list[socket.socket]:
-    """Connections that send half a head, and nothing more."""
-    begun = []
-    for _ in range(n):
-        connection = socket.create_connection(("127.0.0.1", port), timeout=WAIT)
-        connection.sendall(b"POST /decide HTTP/1.1\r\nHost: localhost\r\n")
-        begun.append(connection)
-    return begun
-
-
-def still_open(connections: list[socket.socket]) -> int:
-    """How many of them the server has not ended within WAIT."""
-    end, left = time.monotonic() + WAIT, set(connections)
-    with selectors.DefaultSelector() as selector:
-        for each in connections:
-            selector.register(each, selectors.EVENT_READ)
-        while left and (seconds := end - time.monotonic()) > 0:
-            for key, _ in selector.select(seconds):
-                connection: Any = key.fileobj
-                if not _more(connection):
-                    selector.unregister(connection)
-                    left.discard(connection)
-    for each in connections:
-        each.close()
-    return len(left)
-
-
-def _more(connection: socket.socket) -> bool:
-    try:
-        return bool(connection.recv(65536))
-    except ConnectionError:
-        return False
-
-
-def fuzz(n: int, seed: int, folder: Path, slow: int = SLOW) -> tuple[dict[str, Counter[str]], list[str]]:
-    """Try n requests; outcomes by kind, and what is not as it must be. slow : connections that send half a head."""
+def fuzz(n: int, seed: int, folder: Path) -> tuple[dict[str, Counter[str]], list[str]]:
+    """Try n requests; outcomes by kind, and what is not as it must be."""
     file, wrong = folder / "cell.db", list[str]()
     trained(file)
-    before, order = decisions(file), _order(n, seed)
-    found = {kind: Counter[str]() for kind in SHARES}
+    before = decisions(file)
     with server(file) as at:
-        conversation, probes, begun = Conversation(at.opc), probed(at.web, "before"), slow_ones(at.web, slow)
-        memory = 0.0
-        for i, kind in enumerate(order):
-            if i == n // 5:
-                memory = at.memory()
-            outcome, said = attempt(kind, at, conversation, random.Random(f"{seed} {i}"))
-            found[kind][outcome] += 1
-            if outcome == "failed" and found[kind]["failed"] <= SHOWN:
-                print(f"{kind} {i}: {said[:600]!r}", file=sys.stderr)
-        grown = at.memory() - memory
-        print(f"memory: {memory:.1f} MB after {n // 5}, {memory + grown:.1f} MB after {n}", file=sys.stderr)
+        probes = probed(at.web, "before")
+        found, grown = try_all(_order(n, seed), seed, at)
         status, said = exchange(at.web, b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         wrong += [f"the server is not well: {said!r}"] if status != 200 or b'"ok"' not in said else []
         wrong += ["the same traces are decided on differently"] if probed(at.web, "after") != probes else []
         wrong += [f"the server has grown by {grown:.1f} MB"] if grown > GROWTH else []
-        wrong += [f"{left} slow connections were not ended"] if (left := still_open(begun)) else []
-    return found, wrong + _changed(before, decisions(file), found, at.log)
+    return found, wrong + changed(before, decisions(file), found, at.log)
 
 
 def _order(n: int, seed: int) -> list[str]:
@@ -292,7 +235,7 @@ def _order(n: int, seed: int) -> list[str]:
     return order
 
 
-def _changed(before: dict[str, str], after: dict[str, str], found: dict[str, Counter[str]], log: Path) -> list[str]:
+def changed(before: dict[str, str], after: dict[str, str], found: dict[str, Counter[str]], log: Path) -> list[str]:
     """What became of the decisions that were there, and of those that came."""
     counts, wrong = sum(found.values(), Counter[str]()), list[str]()
     if changed := [id_ for id_, text in before.items() if after.get(id_) != text]:
@@ -300,8 +243,7 @@ def _changed(before: dict[str, str], after: dict[str, str], found: dict[str, Cou
     came = len([id_ for id_ in after if id_ not in before and not id_.startswith("probe-")])
     if came > counts["taken"]:
         wrong.append(f"{came} decisions were recorded, {counts['taken']} requests taken")
-    if counts["failed"]:
-        wrong.append(f"{counts['failed']} requests failed")
+    wrong += [f"{counts[outcome]} {text}" for outcome, text in WRONG.items() if counts[outcome]]
     if "Traceback" in log.read_text(errors="replace"):
         wrong.append(f"there are tracebacks in the log: {log.read_text(errors='replace')[-3000:]}")
     return wrong

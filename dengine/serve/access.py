@@ -101,6 +101,11 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def in_url(host: str) -> str:
+    """A host as an address has it, before its port."""
+    return f"[{host}]" if ":" in host else host
+
+
 def is_called(host: str | None, names: Iterable[str]) -> bool:
     """Whether a request calls the server by a name that is its own: a page that had its own name point here does not."""
     name = host_name(host)

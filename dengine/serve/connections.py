@@ -1,4 +1,9 @@
-"""Connections of uvicorn with limits that it does not set: how many at once, and how long a request's head may take."""
+"""Connections of uvicorn with limits that it does not set: how many at once, and how long a request's head may take.
+
+Whatever ends a connection is answered before: 400 to what is no HTTP, and to half a request whose client says that no more
+comes; 408 to a head that takes too long (a body's time is `guard.Body`'s), and so to a new connection on which nothing was
+sent. Only a connection that waits for a further request ends without a word, and whatever is left when the server ends.
+"""
 
 from __future__ import annotations
 
@@ -52,6 +57,17 @@ class Limited(H11Protocol):
         elif self._head is None and not self.transport.is_closing():
             self._wait_for_head()
 
+    def on_response_complete(self) -> None:
+        """Go on; where half of the next request's head is there already, the rest has to come in time too."""
+        super().on_response_complete()
+        if self._head is None and self._is_begun():
+            self._wait_for_head()
+
+    def eof_received(self) -> None:
+        """Answer half a request, of which no more comes."""
+        if self._is_begun() or (self.conn.our_state is h11.SEND_RESPONSE and self.conn.their_state is h11.SEND_BODY):
+            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Let go."""
         self._stop_waiting()
@@ -59,9 +75,18 @@ class Limited(H11Protocol):
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP, and close."""
-        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-            self.transport.write(_whole(HTTPStatus.BAD_REQUEST, "Expected a request as HTTP/1.1 has it."))
-        self.transport.close()
+        self._end(HTTPStatus.BAD_REQUEST, "Expected a request as HTTP/1.1 has it.")
+
+    def _end(self, status: HTTPStatus, detail: str) -> None:
+        """Answer, if nothing was answered yet, and close."""
+        if not self.transport.is_closing():
+            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+                self.transport.write(_whole(status, detail))
+            self.transport.close()
+
+    def _is_begun(self) -> bool:
+        """Whether there is half a head."""
+        return self.conn.our_state is h11.IDLE and bool(self.conn.trailing_data[0]) and not self.transport.is_closing()
 
     def _wait_for_head(self) -> None:
         self._head = self.loop.call_later(self.head_seconds, self._give_up)
@@ -73,11 +98,7 @@ class Limited(H11Protocol):
 
     def _give_up(self) -> None:
         self._head = None
-        if not self.transport.is_closing():
-            if self.conn.our_state is h11.IDLE:
-                text = f"Expected the request's head within {self.head_seconds:g} s."
-                self.transport.write(_whole(HTTPStatus.REQUEST_TIMEOUT, text))
-            self.transport.close()
+        self._end(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {self.head_seconds:g} s.")
 
 
 def _whole(status: HTTPStatus, detail: str) -> bytes:

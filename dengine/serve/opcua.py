@@ -11,7 +11,6 @@ an alarm are events of the Server object as well.
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -28,6 +27,7 @@ from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError
+from .access import in_url, is_loopback
 from .calls import RobotCalls
 from .opcua_limits import BoundedServer
 from .overview import Overview, overview
@@ -98,12 +98,12 @@ async def opcua_server(
     SettingError for an address other than this machine's without token, cert and key; OSError for a port in use.
     """
     secure = cert is not None and key is not None
-    if not (_is_local(host) or (secure and token)):
+    if not (is_loopback(host) or (secure and token)):
         raise SettingError(f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on 127.0.0.1.")
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it writes tracebacks of whatever strangers send
-    server = BoundedServer(token)
+    server = BoundedServer(token, secure)
     await server.init()
-    server.set_endpoint(f"opc.tcp://{_in_url(host)}:{port}/dengine")
+    server.set_endpoint(f"opc.tcp://{in_url(host)}:{port}/dengine")
     server.set_server_name("dengine")
     await server.set_application_uri("urn:dengine:server")
     policy = ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt if secure else ua.SecurityPolicyType.NoSecurity
@@ -121,17 +121,6 @@ async def opcua_server(
             following.cancel()
             with suppress(asyncio.CancelledError):
                 await following
-
-
-def _is_local(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
 
 
 class AddressSpace:

@@ -23,7 +23,7 @@ import uvicorn
 from ..engine import DataEngine
 from ..errors import SettingError
 from ..records import RetrainReport
-from .access import Access, is_loopback, read_token
+from .access import Access, in_url, is_loopback, read_token
 from .app import INTERFACES, Beside, create_app
 from .calls import Recorder
 from .connections import limited
@@ -78,8 +78,7 @@ class Serving:
 
     def address(self, port: int) -> str:
         """Where it is reached."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"http{'s' if self.cert else ''}://{host}:{port}"
+        return f"http{'s' if self.cert else ''}://{in_url(self.host)}:{port}"
 
 
 def serve(

@@ -14,8 +14,10 @@ from asyncua.common.utils import Buffer
 from asyncua.ua.ua_binary import nodeid_from_binary, nodeid_to_binary, struct_from_binary
 
 from .web import SAMPLES, spoilt
+from .wire import WAIT, Call
 
-QUIET = 0.5  # seconds without an answer, after which the server waits for the rest of a message
+KINDS = (b"MSGC", b"MSGX", b"OPNC", b"HELA", b"ACKF", b"ERRF", b"RHEF", b"\0\0\0\0")  # of messages, but no client's
+OTHERS = (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00", b"HEL", b"MSG")
 VALUES = [  # in the place of a trace
     *(b"\x80" + struct.pack("<i", 2**31 - 1), b"\x8c" + struct.pack("<ii", 2**31 - 1, -4)),
     *(b"\x98" + struct.pack("<i", 2**30), b"\x8a" + struct.pack("<i", -9), b"\xca" + struct.pack("<iii", 0, 1, -5)),
@@ -71,21 +73,27 @@ class Conversation:
         between.close()
         self.messages = [each for each in self.messages if each[:3] != b"CLO"]
 
-    def play(self, rng: random.Random) -> tuple[str, bytes]:
-        """Say it again up to a message that is spoilt; the outcome, and what the server said to that."""
+    def play(self, rng: random.Random) -> Call:
+        """Say it again up to a message that is spoilt; what the server says to that is still to come."""
         at = rng.randrange(len(self.messages))
-        with socket.create_connection(("127.0.0.1", self.port), timeout=20) as server:
-            channel, session = b"", self.token
-            for i, message in enumerate(self.messages[:at]):
-                server.sendall(_adapted(message, channel, self.token, session))
-                answer = _read(server, 20.0)
-                if i == 1:
-                    channel = answer[8:12] + _channel_token(answer)
-                session = _session_token(answer) if i == 2 else session
-            server.sendall(self._spoilt(rng, _adapted(self.messages[at], channel, self.token, session)))
-            return _outcome(_read(server, QUIET))
+        server = socket.create_connection(("127.0.0.1", self.port), timeout=WAIT)
+        channel, session = b"", self.token
+        for i, message in enumerate(self.messages[:at]):
+            good = _call(server, _adapted(message, channel, self.token, session))
+            good.wait(WAIT)
+            if i == 1:
+                channel = good.said[8:12] + _channel_token(good.said)
+            session = _session_token(good.said) if i == 2 else session
+        return _call(server, self._spoilt(rng, _adapted(self.messages[at], channel, self.token, session)))
 
     def _spoilt(self, rng: random.Random, message: bytes) -> bytes:
+        match rng.randrange(12):
+            case 0:
+                return message[: rng.randrange(1, len(message))]
+            case 1:
+                return rng.choice(KINDS) + message[4:]
+            case 2:
+                return rng.choice((*OTHERS, rng.randbytes(rng.choice((1, 10, 3000)))))
         here = message.find(b"\x8a" + struct.pack("<i", SAMPLES - 1))
         if here >= 0 and rng.random() < 0.6:
             message = message[:here] + rng.choice(VALUES) + rng.randbytes(rng.choice((0, 20)))
@@ -103,37 +111,27 @@ async def _message(reader: asyncio.StreamReader) -> bytes:
         return b""
 
 
-def _read(server: socket.socket, seconds: float) -> bytes:
-    """One message; b"" where the connection ended, b"?" where nothing came in time."""
-    server.settimeout(seconds)
-    said = b""
-    try:
-        while len(said) < 8 or len(said) < int.from_bytes(said[4:8], "little"):
-            piece = server.recv(65536)
-            if not piece:
-                return b""
-            said += piece
-    except TimeoutError:
-        return b"?"
-    except ConnectionError:
-        return b""
-    return said
+def _call(server: socket.socket, sent: bytes) -> Call:
+    return Call(server, sent, _is_whole, _judged)
 
 
-def _outcome(answer: bytes) -> tuple[str, bytes]:
-    if answer in (b"", b"?"):
-        return ("closed" if answer == b"" else "waiting"), answer
+def _is_whole(said: bytes) -> bool:
+    return len(said) >= 8 and len(said) >= int.from_bytes(said[4:8], "little")
+
+
+def _judged(answer: bytes) -> str:
+    """The outcome of an answer: refused by the transport, by a service, or by every one of a call's results."""
     if answer[:3] == b"ERR":
-        return "refused", answer
+        return "late" if int.from_bytes(answer[8:12], "little") == ua.StatusCodes.BadTimeout else "refused"
     if answer[:3] != b"MSG":
-        return "taken", answer
+        return "taken"
     kind, header, _ = _parts(answer)
     if not header.ServiceResult.is_good():
-        return "refused", answer
+        return "refused"
     if kind.Identifier == ua.ObjectIds.CallResponse_Encoding_DefaultBinary:
         results = struct_from_binary(ua.CallResponse, _body(answer)).Results
-        return ("taken" if any(each.StatusCode.is_good() for each in results) else "refused"), answer
-    return "taken", answer
+        return "taken" if any(each.StatusCode.is_good() for each in results) else "refused"
+    return "taken"
 
 
 def _body(answer: bytes) -> Buffer:
