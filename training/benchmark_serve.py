@@ -5,9 +5,10 @@
 
 Run it on an idle machine. Every part that is not rejected is reported, so that retrains go on in the background all the
 time. With --kills the client and the server are killed so often each, at random moments; each client writes what it was
-answered to the disk before it goes on. With --deadline others fill the server's line, and a share of its answers is late. At the end all of it is compared: with what is answered then, and with the store.
-Exit code 1 if an acknowledged label was lost, or an id was answered twice differently. --folder is where the stores are: a
-decision under a caller's own id is on the disk before it is answered, so its disk counts.
+answered to the disk before it goes on. With --deadline others fill the server's line, so that many answers are late. At the
+end all of it is compared: with what is answered then, and with the store. Exit code 1 if an acknowledged label was lost, or
+an id was answered twice differently. --folder is where the stores are: a decision under a caller's own id is on the disk
+before it is answered, so its disk counts.
 """
 
 from __future__ import annotations
