@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
@@ -16,11 +17,22 @@ Committing = Callable[[Callable[[], bool]], AbstractContextManager[None]]
 class Asked(Generic[T]):
     """A call on its way: given up before its commit begins, it writes nothing; afterwards it can't be given up any more.
 
+    wait : seconds from now on that its result is waited for; None: as long as it takes.
+    more : seconds beyond them for a commit that is under way by then, for it may succeed.
     lasting : it is made to its end, whether somebody waits for it or not.
+    then : called once its result was taken.
     """
 
-    def __init__(self, work: Callable[[], T], lasting: bool = False) -> None:
-        self._work = work
+    def __init__(
+        self,
+        work: Callable[[], T],
+        wait: float | None = None,
+        more: float = 0.0,
+        lasting: bool = False,
+        then: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._work, self._wait, self._more, self._then = work, wait, more, then
+        self._began = time.monotonic()
         self._future: Future[T] = Future()  # runs from the moment of its commit on; until then it can be cancelled
         if lasting:
             self._future.set_running_or_notify_cancel()
@@ -39,11 +51,19 @@ class Asked(Generic[T]):
             if self._wanted():
                 self._future.set_result(result)
 
-    def result(self, wait: float | None, more: float = 0.0) -> T:
-        """Return what the call returned. StoreError where it takes longer than so many seconds: then it is given up.
+    @property
+    def due(self) -> bool:
+        """Whether its result is there, or is not waited for any longer."""
+        return self._future.done() or (self._wait is not None and time.monotonic() - self._began >= self._wait)
 
-        more : seconds to wait for a commit that is under way by then, for it may succeed.
-        """
+    def result(self) -> T:
+        """Return what the call returned. StoreError where it takes longer than it is waited for: then it is given up."""
+        left = None if self._wait is None else max(0.0, self._began + self._wait - time.monotonic())
+        result = self._result(left, self._more)
+        self._then()
+        return result
+
+    def _result(self, wait: float | None, more: float) -> T:
         try:
             return self._future.result(wait)
         except TimeoutError as error:
@@ -51,8 +71,8 @@ class Asked(Generic[T]):
                 raise
             late = error
         if not self._future.cancel() and more > 0.0:
-            return self.result(more)
-        raise StoreError(f"no answer from the store within {wait:g} s.") from late
+            return self._result(more, 0.0)
+        raise StoreError(f"no answer from the store within {self._wait:g} s.") from late
 
     def _wanted(self) -> bool:
         future = self._future

@@ -265,10 +265,13 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
         """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written."""
         return drive(self, cell, cycles)
 
-    def settle(self) -> RetrainReport | None:
-        """Do what need not wait for a report, a retrain or a slice of training; returns the newest retrain, once."""
+    def settle(self, brief: bool = False) -> RetrainReport | None:
+        """Do what need not wait for a report: a retrain, a new version, a slice of training; the newest retrain, once.
+
+        brief : bring a version that an executor has trained a step further, a few milliseconds, and not to the end.
+        """
         with uninterrupted():
-            self._versions.collect()
+            self._versions.collect(to_the_end=not brief)
             self._versions.work(self.recipe.retrain_every)
             return self._versions.take_news()
 

@@ -50,7 +50,12 @@ class EngineFacts:
     @property
     def retraining(self) -> bool:
         """Whether a retrain is under way in the executor, or waits to be swapped in."""
-        return self._versions.retrainer.busy
+        return self._versions.busy
+
+    @property
+    def swapping(self) -> bool:
+        """Whether a version that an executor has trained is on its way in, a step each time that the engine is asked."""
+        return self._versions.swapping
 
     @property
     def encoder_time(self) -> EncoderTime:

@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -148,9 +149,9 @@ class Keeper:
         self.recent.label(labels)
         return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
 
-    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int | None:
-        """Commit a retrain; returns the version's number, where the store says it. StoreError where it does not take it."""
-        return self._commit(lambda: self.store.put_version(report, last_seq, state), GRACE)
+    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> Asked[int | None]:
+        """Begin to commit a retrain; the result, or a StoreError, is the version's number, where the store says it."""
+        return self._begin_commit(lambda: self.store.put_version(report, last_seq, state), GRACE)
 
     def event(self, kind: str, text: str) -> None:
         """Record what happened, in the journal where the store is away."""
@@ -175,15 +176,17 @@ class Keeper:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
         self.recent.forget(decision_id)
 
-    def ask(self, work: Callable[[], T], more: float = 0.0) -> T:
-        """Call the store with the time limit; StoreError where it is away. more : seconds for a commit under way."""
-        if self._backlog is None:
-            return work()
+    def ask(self, work: Callable[[], T]) -> T:
+        """Call the store with the time limit; StoreError where it is away."""
+        return work() if self._backlog is None else self._put(work).result()
+
+    def _put(self, work: Callable[[], T], more: float = 0.0, then: Callable[[], object] = lambda: None) -> Asked[T]:
+        assert self._backlog is not None  # the callers asked; for the type checker
         if self.fault:
             raise StoreError(f"The store is away: {self.fault} Labels wait in its journal; try this again when it is back.")
         wait = None if self._patient else self._backlog.store.wait
-        self._jobs.put(asked := Asked(work))
-        return asked.result(wait, more)
+        self._jobs.put(asked := Asked(work, wait, more, then=then))
+        return asked
 
     def close(self) -> None:
         """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
@@ -195,10 +198,10 @@ class Keeper:
             return
         self.flush()
         self._closed = True
-        self._jobs.put(closing := Asked(lambda: self._let_store_go(backlog), lasting=True))
+        self._jobs.put(closing := Asked(lambda: self._let_store_go(backlog), CLOSE, lasting=True))
         self._jobs.put(None)
         try:
-            closing.result(CLOSE)
+            closing.result()
             self._thread.join()
         except StoreError as error:
             log.warning("the store was left, its journal %s holds what it lacks: %s", backlog.journal.path, error)
@@ -211,7 +214,7 @@ class Keeper:
         """Commit, or put what is to be committed into the journal; then None. StoreError where both fail."""
         if not self.fault or self._backlog is None:
             try:
-                return self._commit(work)
+                return self._begin_commit(work).result()
             except StoreError as error:
                 if self._backlog is None:
                     raise
@@ -226,13 +229,14 @@ class Keeper:
         self._jobs.put(Asked(lambda: None))  # so that the store is tried now, not at the next beat
         return None
 
-    def _commit(self, work: Callable[[], T], more: float = 0.0) -> T:
-        """Call the store; where that succeeds, all decisions before it are committed as well."""
-        before = [] if self._backlog is None else self._backlog.unsafe
-        result = self.ask(work, more)
-        if self._backlog is not None:
-            self._backlog.committed(before)
-        return result
+    def _begin_commit(self, work: Callable[[], T], more: float = 0.0) -> Asked[T]:
+        """Begin to call the store; where that succeeds, all decisions before it are committed as well."""
+        if self._backlog is None:
+            done = Asked(work)
+            done.run(lambda wanted: nullcontext())
+            return done
+        backlog, before = self._backlog, self._backlog.unsafe
+        return self._put(work, more, lambda: backlog.committed(before))
 
     def _note(self, fault: str) -> None:
         if not self.fault:

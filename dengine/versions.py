@@ -9,10 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from .asking import Asked
 from .current import TELL_ALL, CurrentVersion
 from .decision.policy import Policy
 from .errors import StoreError
 from .fleet import Fleet
+from .incoming import STEP, Incoming
 from .keeping import Keeper
 from .model.base import EngineModel
 from .pending import HUNG
@@ -42,6 +44,7 @@ class ModelVersions(CurrentVersion):
         telling: Telling = TELL_ALL,
     ) -> None:
         super().__init__(template, retrainer, keeper, clock, telling)
+        self._incoming: Incoming | None = None
         if is_shared(keeper.store):
             self.fleet = Fleet(keeper.store, self)
 
@@ -130,7 +133,10 @@ class ModelVersions(CurrentVersion):
         """Train and swap, in line."""
         self.collect(HUNG)
         self._begin()
-        return self._swap(self.retrainer.train(self.newest))
+        self._take(self.retrainer.train(self.newest))
+        self._advance(to_the_end=True)
+        assert self._news is not None  # nothing came in between; for the type checker
+        return self._news
 
     def _begin(self) -> None:
         self.store_waiting()
@@ -159,10 +165,20 @@ class ModelVersions(CurrentVersion):
             return False
         return not self.keeper.fault
 
+    @property
+    def swapping(self) -> bool:
+        """Whether a version that was trained beside the cell is on its way in."""
+        return self._incoming is not None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a retrain is under way beside the cell, or its version on its way in."""
+        return self.retrainer.busy or self.swapping
+
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
         self.collect()
-        if self.retrainer.busy:
+        if self.busy:
             return None
         if self.retrainer.executor is not None:
             self._begin()
@@ -170,50 +186,73 @@ class ModelVersions(CurrentVersion):
                 return None
         return self.retrain()
 
-    def collect(self, wait: float = 0.0) -> None:
-        """Swap in what an executor has finished, within so many seconds."""
+    def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
+        """Bring in what an executor has finished: a step further, or to the end, as where it is waited for."""
         trained = self.retrainer.collect(wait)
         if trained is not None:
-            self._swap(trained)
+            self._take(trained)
+        if self._incoming is not None:
+            self._advance(to_the_end or wait > 0.0)
 
-    def _swap(self, trained: Trained) -> RetrainReport:
-        candidate = trained.candidate
-        report = RetrainReport(self.version, 0.0, len(trained.seq), candidate.n_steps, False, candidate.reason)
+    def _take(self, trained: Trained) -> None:
+        self._incoming = Incoming(trained, self.newest, self.version, self.clock)
+
+    def _advance(self, to_the_end: bool) -> None:
+        """Bring the version on its way in a step further. One that cannot be stored is dropped."""
+        incoming, window = self._incoming, self.retrainer.window
+        to_the_end |= self.fleet is not None  # sisters' versions do not come in between
+        assert incoming is not None  # the caller asked; for the type checker
         try:
-            self.store_waiting()
-            report = self._store(report, trained)
+            if incoming.storing is None:
+                if not incoming.learn(window, np.inf if to_the_end else STEP):
+                    return
+                self.store_waiting()
+                incoming.learn(window)
+                incoming.storing = self._store(incoming)
+            if not to_the_end and not incoming.storing.due:
+                return
+            number = incoming.storing.result()
         except StoreError as error:  # a version that is not stored would be gone with the process
-            return self._not_stored(report, error)
-        self._news = report
-        return report
+            self._incoming = None
+            self._not_stored(incoming.report, error)
+            return
+        try:
+            self.store_waiting()  # what was confirmed since is to be among its references
+        except StoreError as error:
+            log.warning("version %d is stored, and answers once the labels since are: %s", incoming.report.version, error)
+            return
+        incoming.learn(window)
+        self._incoming = None
+        self._swap(incoming, number)
 
-    def _store(self, report: RetrainReport, trained: Trained) -> RetrainReport:
-        model, seq, state = trained.candidate.model, trained.seq, None
+    def _store(self, incoming: Incoming) -> Asked[int | None]:
+        model, state = incoming.model, None
+        incoming.report = replace(incoming.report, seconds=incoming.seconds)  # storing it comes on top
         if model is not None:
-            model.prepare_safely(self.newest)
-            # Labels that came in meanwhile are in the new version.
-            references = References([*seq, *self.retrainer.window.catch_up(model, int(seq[-1]))])
-            origin = Origin(seq, self._corrected_to, int(seq[-1]))
-            report = replace(report, version=self.next_number, accepted=True)
-            state = self._state(model, references, origin)
-        # Until the version could answer; storing it comes on top.
-        report = replace(report, seconds=self.clock() - trained.begin)
-        number = self.keeper.version(report, self.retrainer.window.newest_seq, state)
+            incoming.report = replace(incoming.report, version=self.next_number, accepted=True)
+            state = self._state(model, incoming.references, self._origin_of(incoming))
+        return self.keeper.version(incoming.report, self.retrainer.window.newest_seq, state)
+
+    def _origin_of(self, incoming: Incoming) -> Origin:
+        return Origin(incoming.seq, self._corrected_to, int(incoming.seq[-1]))
+
+    def _swap(self, incoming: Incoming, number: int | None) -> None:
+        report, model = incoming.report, incoming.model
         report = replace(report, version=report.version if number is None else number)  # one without products has no other
         if model is not None:
+            model.untold = model.untold or self.newest.untold
             self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
-            self._references, self._origin = references, origin
+            self._references, self._origin = incoming.references, self._origin_of(incoming)
             if self.fleet is not None:
                 self.fleet.swapped(model)
-        return report
+        self._news = report
 
-    def _not_stored(self, report: RetrainReport, error: StoreError) -> RetrainReport:
+    def _not_stored(self, report: RetrainReport, error: StoreError) -> None:
         """Drop a version with its reason; its labels are as many new ones, so that the next retrain is soon."""
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self.new_labels += report.n_traces
-        self._news = replace(report, reason=f"dropped: not stored: {error}")
-        return self._news
+        self._news = replace(report, version=self.version, accepted=False, reason=f"dropped: not stored: {error}")
 
     def take_news(self) -> RetrainReport | None:
         """The newest retrain, once."""

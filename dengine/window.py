@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .model.base import EngineModel
 from .store.records import Labelled
 
 
@@ -58,10 +57,25 @@ class Window:
 
     def snapshot(self) -> Labelled:
         """What is held, oldest first. Nobody writes to these arrays afterwards."""
-        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
-        order = (np.arange(n) + first) % self.capacity
+        order = self._order()
         traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces[order]
         return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
+
+    def newer(self, seq: int) -> NDArray[np.int64]:
+        """Sequence numbers of the labels after this one, in the order in which they came."""
+        held = self._seq[self._order()]
+        return held[held > seq]
+
+    def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
+        """Trace (C, T), label and hash of a label that is held."""
+        assert self._traces is not None  # the caller knows of the label; for the type checker
+        slot = int(np.flatnonzero(self._seq[: len(self)] == seq)[-1])
+        return self._traces[slot], int(self._labels[slot]), int(self._hashes[slot])
+
+    def _order(self) -> NDArray[np.int64]:
+        """The places of what is held, oldest first."""
+        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
+        return (np.arange(n) + first) % self.capacity
 
     def _grow(self, trace: NDArray[np.float32]) -> None:
         # Doubled as needed: a full window of 10,000 x 1000 samples is 40 MB, and most cells start with none.
@@ -77,14 +91,3 @@ class Window:
         self._hashes, self._seq = (
             np.concatenate([a, np.zeros(size - room, dtype=np.int64)]) for a in (self._hashes, self._seq)
         )
-
-    def catch_up(self, model: EngineModel, last_seq: int) -> list[int]:
-        """Make every label after `last_seq` a reference of a model that was trained without it; returns those that are."""
-        if self.newest_seq <= last_seq:
-            return []
-        data, joined = self.snapshot(), []
-        for i in np.flatnonzero(data.seq > last_seq):
-            hash_ = int(data.hashes[i])
-            if model.add_safely(model.place_safely(data.traces[i], hash_), int(data.labels[i]), hash_):
-                joined.append(int(data.seq[i]))
-        return joined

@@ -558,8 +558,9 @@ def test_the_cell_goes_on_while_a_retrain_runs_and_its_labels_are_in_the_new_ver
         assert all(c.retrain is None for c in during)
         Slow.may_finish.set()
         pool.shutdown(wait=True)
+        report = engine.settle()
         (after,) = play(engine, data, slice(55, 56))
-    assert (after.retrain.version, after.retrain.n_traces, after.retrain.accepted) == (1, 40, True)
+    assert (report.version, report.n_traces, report.accepted) == (1, 40, True)
     assert after.decision.model_version == 1
     assert (after.decision.n_success, after.decision.n_failure) == (40, 15)
 
@@ -577,7 +578,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
     pool = ThreadPoolExecutor(1) if kind == "thread" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     with pool:
         beside = learn(make(recipe, executor=pool))
-    beside.decide(data.X[0])  # swaps in what the pool has finished
+    beside.settle()  # swaps in what the pool has finished
     assert inline.version == beside.version == 1
     assert len(beside.model.index) == 100
     assert [evidence(beside.decide(x)) for x in data.X[100:]] == [evidence(inline.decide(x)) for x in data.X[100:]]

@@ -163,13 +163,13 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     first, second = fleet.engine("a"), fleet.engine("b")
     learn(first, parts, range(15))
     second._versions.fleet._asked = np.inf  # it asks for no news: it is at it
-    swap, reports = second._versions._swap, []
+    take, reports = second._versions._take, []
 
-    def late(trained: Any) -> Any:
+    def late(trained: Any) -> None:
         reports.append(first.retrain())  # meanwhile
-        return swap(trained)
+        take(trained)
 
-    second._versions._swap = late  # type: ignore[method-assign]
+    second._versions._take = late  # type: ignore[method-assign]
     reports.append(second.retrain())
     assert [report.version for report in reports] == [1, 2]
     first.settle()

@@ -237,11 +237,11 @@ class CellService:
                 return self._jobs.get(timeout=patience)
             except queue.Empty:
                 self._settle(engine)
-                patience = IDLE
+                patience = SOON if engine.swapping else IDLE
 
     def _settle(self, engine: DataEngine) -> None:
         try:
-            if (report := engine.settle()) is not None:
+            if (report := engine.settle(brief=True)) is not None:
                 self._heard(report)
                 self._tell()
         except Exception:  # whatever it is, the next request is answered
