@@ -16,7 +16,7 @@ from .references import References
 from .retraining import Trained
 from .window import Window
 
-STEP = 0.002  # seconds of learning at once: some labels
+STEP = 0.001  # seconds of learning at once: some labels
 
 
 class Incoming:

@@ -191,7 +191,7 @@ class ModelVersions(CurrentVersion):
         trained = self.retrainer.collect(wait)
         if trained is not None:
             self._take(trained)
-        if self._incoming is not None:
+        if self._incoming is not None and (trained is None or to_the_end or wait > 0.0):  # to take it was a step
             self._advance(to_the_end or wait > 0.0)
 
     def _take(self, trained: Trained) -> None:

@@ -77,7 +77,7 @@ def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(data: Datase
     trained_beside(engine, pool, data)
     before = Slow.now
     decisions = [engine.decide(x) for x in data.X[100:109]]
-    assert [d.model_version for d in decisions] == [0] * 7 + [1] * 2  # sixteen labels, two a step
+    assert [d.model_version for d in decisions] == [0] * 8 + [1]  # it is taken; then sixteen labels, two a step
     assert (decisions[-1].n_success, decisions[-1].n_failure) == (40, 16)
     assert Slow.now - before == pytest.approx(16 * STEP / 2)
     assert not engine.swapping

@@ -50,6 +50,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "lateness": 8,
     "keeping": 8,
     "pending": 8,
+    "incoming": 8,
     "facts": 8,
     "versions": 8,
     "current": 8,

@@ -4,41 +4,102 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import queue
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager, suppress
-from multiprocessing.connection import wait
+from multiprocessing.connection import Connection, wait
+from typing import Any, TypeVar
+
+from .parcels import receive, send
 
 NICE = 10  # decisions first, where cores are scarce
+ENDED = "The retraining process has ended."
+
+T = TypeVar("T")
 
 
-@contextmanager
-def retraining_process() -> Iterator[Executor]:
+class RetrainingProcess(Executor):
     """An executor of one process, started anew and not forked: this one has threads, and a fork would have their locks.
 
     It ends with this process, also when this one is killed.
     """
-    others = set(multiprocessing.active_children())  # are not ours to end
-    pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
-    pool.submit(_warm)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        # A retrain that was worth waiting for, its engine has waited for.
-        for process in set(multiprocessing.active_children()) - others:
-            process.kill()
-            process.join()
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, other = context.Pipe()
+        self._process = context.Process(target=_work, args=(other,), name="dengine-retraining", daemon=True)
+        self._process.start()
+        other.close()
+        self._jobs: queue.SimpleQueue[tuple[Future[Any], Any] | None] = queue.SimpleQueue()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="dengine-retraining", daemon=True)
+        self._thread.start()
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Call a function there, after what was submitted before; BrokenExecutor where the process has ended."""
+        if self._ended:
+            raise BrokenExecutor(ENDED)
+        future: Future[T] = Future()
+        self._jobs.put((future, (fn, args, kwargs)))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the process, whatever it is at: a retrain that was worth waiting for, its engine has waited for."""
+        self._ended = True
+        self._jobs.put(None)
+        self._process.kill()
+        self._process.join()
+        self._thread.join()  # it finds the other end closed
+        self._connection.close()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            future, call = job
+            if future.set_running_or_notify_cancel():
+                self._answer(future, call)
+
+    def _answer(self, future: Future[Any], call: Any) -> None:
+        try:
+            send(self._connection, call)
+            result, error = receive(self._connection)
+        except (EOFError, OSError):
+            self._ended = True
+            future.set_exception(BrokenExecutor(ENDED))
+        except Exception as failure:  # it cannot be pickled
+            future.set_exception(failure)
+        else:
+            future.set_result(result) if error is None else future.set_exception(error)
 
 
-def _begin() -> None:
+@contextmanager
+def retraining_process() -> Iterator[Executor]:
+    """A `RetrainingProcess`, ready for its first retrain soon."""
+    with RetrainingProcess() as process:
+        process.submit(_warm)
+        yield process
+
+
+# In that process
+
+
+def _work(connection: Connection) -> None:
     for name in ("SIGINT", "SIGTERM"):  # sent to the whole group; its parent says when it is time to end
         signal.signal(getattr(signal, name), signal.SIG_IGN)
     with suppress(AttributeError, OSError):  # there is none on Windows
         os.nice(NICE)
     threading.Thread(target=_end_with_parent, name="dengine-parent", daemon=True).start()
+    while True:
+        try:
+            fn, args, kwargs = receive(connection)
+        except EOFError:
+            return
+        try:
+            send(connection, (fn(*args, **kwargs), None))
+        except Exception as error:  # raised where it was asked for
+            send(connection, (None, RuntimeError(f"{type(error).__name__}: {error}")))
 
 
 def _end_with_parent() -> None:

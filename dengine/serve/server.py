@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import signal
 import socket
@@ -107,7 +108,8 @@ def serve(
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
             server = CellServer(config, service, lambda: say(f"{line}{'' if access.token else ', to this machine alone'}."))
-            _run(server, listening, app.state)
+            with nothing_old_collected():
+                _run(server, listening, app.state)
         finally:
             service.close()
 
@@ -178,6 +180,17 @@ def quick_switches() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before)
+
+
+@contextmanager
+def nothing_old_collected() -> Iterator[None]:
+    """Have Python's collector leave alone what is there now, the imported libraries: to look at all of it takes long."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 @contextmanager
