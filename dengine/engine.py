@@ -222,7 +222,7 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
         return as_decision(known)
 
     def _put(self, item: DecidedTrace) -> StoredDecision:
-        known = self._keeper.decided(item)
+        known = self._record(item)
         self._feedback.decided(known)
         return known
 

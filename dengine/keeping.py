@@ -27,7 +27,7 @@ from .records import RetrainReport
 from .store.base import Store
 from .store.journal import RESERVE
 from .store.journal_records import LateEvent, LateLabel, Record
-from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
+from .store.records import DecidedTrace, NewLabel, StoredDecision
 
 log = logging.getLogger("dengine")
 GRACE = 2.0  # seconds in which a store may be slow before its cell verifies everything
@@ -108,15 +108,12 @@ class Keeper:
 
     # What the engine asks
 
-    def decided(self, item: DecidedTrace) -> StoredDecision:
-        """Take a decision and its trace without waiting; returns what its id has now: of two threads the first's."""
+    def decided(self, item: DecidedTrace) -> None:
+        """Take a decision and its trace without waiting."""
         self.check()
-        known = stored_decision(item)
-        if (first := self.recent.add(known)) is not known:
-            return first
         if (backlog := self._backlog) is None:
             self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
-            return known
+            return
         self._look_at_the_beat()
         fault = self.fault
         try:
@@ -129,7 +126,6 @@ class Keeper:
             if fault:
                 self._note(fault)
                 self._spill(backlog)
-        return known
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""

@@ -13,7 +13,7 @@ from .deciding import as_part, decided_before, unasked
 from .errors import StoreError
 from .labels import as_id
 from .records import Decision, Reason
-from .store.records import StoredDecision
+from .store.records import DecidedTrace, StoredDecision, stored_decision
 
 log = logging.getLogger("dengine")
 
@@ -37,9 +37,17 @@ class LateDecisions(TraceAgreement):
                 return unasked(id_, number, self.version, Reason.LATE)
             reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
-            known = self._keeper.decided(self._maker.unasked(x, number, self.version, reason, id_))
+            known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
         self._keeper.secure()
         return decided_before(known, trace, self.trace)
+
+    def _record(self, item: DecidedTrace) -> StoredDecision:
+        """Record a decision; returns what its id has now: of two threads the first's."""
+        known = stored_decision(item)
+        first = self._keeper.recent.add(known)
+        if first is known:
+            self._keeper.decided(item)
+        return first
 
     def _known(self, decision_id: str) -> StoredDecision | None:
         try:
