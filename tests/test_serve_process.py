@@ -207,7 +207,7 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
         robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
         with server(tmp_path, "--reducer", "pca", *robot_at) as process:
             robot = process.robot()
-            for i in range(3):
+            for i in range(2):
                 answer = inserted(robot, program, parts.X[i])
                 assert (answer["action"], answer["reason"]) == (0, "no_model")
                 assert robot.decide_recorded(answer["id"]) == answer  # asked again
@@ -220,10 +220,10 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
             assert (unknown["action"], unknown["id"], unknown["reason"]) == (0, "", "not_recorded")
             assert robot.report(unknown["id"], True) is False
             with FakeController(program, port=fake.port):
-                answer = inserted(robot, program, parts.X[3])
+                answer = inserted(robot, program, parts.X[2])
                 known = process.ask(f"/decisions/{answer['id']}?trace=true")
-                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[3])
-                assert process.ask("/status")["store"]["decisions"] >= 4
+                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[2])
+                assert process.ask("/status")["store"]["decisions"] >= 3
             assert process.end() == 0
     assert "no recording of" in process.said
     assert "Traceback" not in process.said
