@@ -67,6 +67,14 @@ class DecisionMaker:
         named = decision if decision_id is None else replace(decision, id=decision_id)
         return DecidedTrace(named, x, hash_, bool(fault), 0.0, part)
 
+    def unasked(
+        self, x: NDArray[np.float32], part: str | None, version: int, reason: Reason, decision_id: str
+    ) -> DecidedTrace:
+        """(C, T) that is verified whatever the model says, for this reason or for what is wrong with it; in any thread."""
+        fault, content = self._gate(torch.from_numpy(x))
+        decision = unasked(decision_id, part, version, REASONS[fault] if fault else reason)
+        return DecidedTrace(decision, x, own_hash(content, part), bool(fault), 0.0, part)
+
     def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> DecidedTrace:
         """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
         fault, content = self._gate(torch.from_numpy(x))
@@ -122,9 +130,9 @@ def as_decision(known: StoredDecision) -> Decision:
     return Decision(**{field.name: getattr(known, field.name) for field in fields(Decision)})
 
 
-def late_decision(decision_id: str, part: str | int | None, version: int) -> Decision:
-    """What is answered to whoever waits no more, before the engine has recorded it."""
-    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, Reason.LATE, False, 1.0, as_part(part))
+def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
+    """To verify, for this reason, whatever the model says."""
+    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, reason, False, 1.0, part)
     return Decision(decision_id, Action.VERIFY, Action.VERIFY, *said)
 
 

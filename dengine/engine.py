@@ -19,10 +19,9 @@ from typing import Any, Self
 import torch
 from numpy.typing import ArrayLike
 
-from .agreeing import TraceAgreement
 from .cells.base import Cell
 from .corrections import Corrections
-from .deciding import DecisionMaker, as_part, decided_before
+from .deciding import DecisionMaker, as_decision, as_part, decided_before
 from .decision.policy import Policy
 from .errors import StoreError
 from .feedback import Feedback, unknown_stop
@@ -30,6 +29,7 @@ from .fleet import agreed, as_sisters
 from .interrupts import uninterrupted
 from .keeping import CLOSE, Keeper
 from .labels import as_id, as_success
+from .lateness import LateDecisions
 from .loop import drive
 from .model.base import EngineModel, Model
 from .recipe import Recipe
@@ -39,7 +39,7 @@ from .retraining import Clock, EncoderTime, Limits, Retrainer
 from .reviewing import EngineReview
 from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
 from .store.base import Store, opening
-from .store.records import DecidedTrace, StoredDecision, stored_decision
+from .store.records import DecidedTrace, StoredDecision
 from .versions import ModelVersions
 from .window import Window
 
@@ -49,7 +49,7 @@ OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
-class DataEngine(TraceAgreement, EngineReview, Corrections):
+class DataEngine(LateDecisions, EngineReview, Corrections):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -214,24 +214,17 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
             unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
-            item = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
+            known = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
             if wait:
                 self._keeper.flush()
             elif id_ is not None:
                 self._keeper.secure()
-        return item.decision
+        return as_decision(known)
 
-    def _known(self, decision_id: str) -> StoredDecision | None:
-        try:
-            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
-        except StoreError as error:  # the store is away: what was decided lately is known all the same
-            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
-            return None
-
-    def _put(self, item: DecidedTrace) -> DecidedTrace:
-        self._keeper.decided(item)
-        self._feedback.decided(item)
-        return item
+    def _put(self, item: DecidedTrace) -> StoredDecision:
+        known = self._record(item)
+        self._feedback.decided(known)
+        return known
 
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None = None, part: str | int | None = None
@@ -256,7 +249,7 @@ class DataEngine(TraceAgreement, EngineReview, Corrections):
         if trace is None or success:
             raise unknown_stop(decision_id)
         item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
-        return stored_decision(self._put(item))
+        return self._put(item)
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""

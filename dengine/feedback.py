@@ -15,7 +15,7 @@ from .deciding import source_of
 from .errors import ReportError, StoreError
 from .keeping import Keeper
 from .records import Action, Source
-from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
+from .store.records import NewLabel, StoredDecision
 from .versions import ModelVersions, Point
 
 log = logging.getLogger("dengine")
@@ -88,10 +88,10 @@ class Feedback:
                 log.exception("confirmed parts could not be stored")
         self.announce()
 
-    def decided(self, item: DecidedTrace) -> None:
+    def decided(self, known: StoredDecision) -> None:
         """A part was decided on."""
-        if item.decision.action is Action.ACCEPT:
-            self._went_on[item.decision.id] = stored_decision(item)
+        if known.action is Action.ACCEPT:
+            self._went_on[known.id] = known
 
     def report(self, known: StoredDecision, success: bool) -> None:
         """Take in a report; it is stored before anything else changes."""

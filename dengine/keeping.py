@@ -25,8 +25,9 @@ from .errors import StoreError
 from .recent import RecentDecisions
 from .records import RetrainReport
 from .store.base import Store
+from .store.journal import RESERVE
 from .store.journal_records import LateEvent, LateLabel, Record
-from .store.records import DecidedTrace, NewLabel, StoredDecision, stored_decision
+from .store.records import DecidedTrace, NewLabel, StoredDecision
 
 log = logging.getLogger("dengine")
 GRACE = 2.0  # seconds in which a store may be slow before its cell verifies everything
@@ -110,9 +111,7 @@ class Keeper:
     def decided(self, item: DecidedTrace) -> None:
         """Take a decision and its trace without waiting."""
         self.check()
-        self.recent.add(stored_decision(item))
-        backlog = self._backlog
-        if backlog is None:
+        if (backlog := self._backlog) is None:
             self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
             return
         self._look_at_the_beat()
@@ -126,15 +125,16 @@ class Keeper:
             backlog.add(replace(item, time=time.time()))
             if fault:
                 self._note(fault)
-        if fault:
-            self._spill(backlog)
+                self._spill(backlog)
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
         if self._backlog is None:
             return self.store.get_decision(decision_id)
-        known = self.recent.find(decision_id) or self._backlog.find(decision_id)
-        return known or self.ask(lambda: self.store.get_decision(decision_id))
+        known = self.recent.find(decision_id)
+        if known is None and ((known := self._backlog.find(decision_id)) is None or not (known.source or self.fault)):
+            known = self.ask(lambda: self.store.get_decision(decision_id)) or known  # its label may be there alone
+        return known
 
     def labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
         """Commit labels; returns their numbers, 0 for those that wait in the journal. ReportError as `Store.put_labels`."""
@@ -263,7 +263,7 @@ class Keeper:
             if job is None:
                 return
             job.run(backlog.store.committing)
-            if self.fault:
+            if self.fault or backlog.journal.end > RESERVE:  # a cell that never pauses would fill the disk
                 self._beat(backlog)
 
     def _beat(self, backlog: Backlog) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -47,14 +48,19 @@ class RecentDecisions:
     def __init__(self) -> None:
         self._known: OrderedDict[str, StoredDecision] = OrderedDict()
         self._taken: TakenIds | None = None
+        self._adding = threading.Lock()
 
-    def add(self, known: StoredDecision) -> None:
-        """One more; the oldest goes where there are too many."""
-        self._known[known.id] = known
-        if self._taken is not None:
-            self._taken.add(known.id)
-        if len(self._known) > MOST:
-            self._known.popitem(last=False)
+    def add(self, known: StoredDecision) -> StoredDecision:
+        """One more, in any thread; the oldest goes where there are too many. Returns the one that has its id: the first."""
+        with self._adding:
+            if (first := self._known.get(known.id)) is not None:
+                return first
+            self._known[known.id] = known
+            if self._taken is not None:
+                self._taken.add(known.id)
+            if len(self._known) > MOST:
+                self._known.popitem(last=False)
+        return known
 
     def know(self, ids: Iterable[str]) -> None:
         """Learn which ids are taken by now."""

@@ -180,7 +180,7 @@ class Retrainer:
         try:
             candidate = pending.result(wait)
         except Exception as error:  # recorded, and the old version goes on answering
-            log.exception("a retrain in the executor failed")
+            log.error("a retrain in the executor failed: %s", error, exc_info=not pending.gave_up)
             candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
             self.executor = None if pending.gave_up else self.executor
         self.encoder_time.spend(candidate.encoder_steps, candidate.encoder_seconds)

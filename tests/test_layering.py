@@ -47,6 +47,7 @@ LAYER = {  # by module, or by package for all that is in it; the longest name th
     "backlog": 8,
     "recent": 8,
     "agreeing": 8,
+    "lateness": 8,
     "keeping": 8,
     "pending": 8,
     "incoming": 8,

@@ -1,5 +1,6 @@
 """The live page in a real browser, over a demonstration as `dengine demo-cell` runs it."""
 
+import asyncio
 import os
 import re
 import shutil
@@ -7,15 +8,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 
-from dengine import Action, DataEngine, load_exported
+from dengine import Action, DataEngine, Dataset, Policy, load_exported
 from dengine.recipe import Recipe
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
@@ -312,9 +314,89 @@ def served(service: CellService, port: int = 0) -> Iterator[int]:
         server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
-        yield listening.getsockname()[1]
-        server.should_exit = True
-        thread.join()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+def stopped_until_safe(service: CellService, data: Dataset) -> str:
+    """Parts, until accepted ones that are said to have stopped the line bring on the safe mode; the id of the last."""
+
+    async def cell() -> str:
+        for i in range(len(data)):
+            decision = (await service.decide(data.X[i], f"part-{i}")).decision
+            if decision.action is Action.REJECT:
+                continue
+            accepted = decision.action is Action.ACCEPT
+            broken = accepted and i >= 120  # the line's own sensor
+            await service.report(decision.id, bool(data.y[i]) and not broken)
+            if accepted and service.engine.safe_mode:
+                return decision.id
+        raise AssertionError("no safe mode")
+
+    with ThreadPoolExecutor(1) as thread:  # in this one Playwright's own loop runs
+        return thread.submit(asyncio.run, cell()).result()
+
+
+def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wrong_is_put_right(
+    browser: Browser, tmp_path: Path, make_data: Callable[..., Dataset]
+) -> None:
+    recipe = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9, stops="all"))
+    file, data = tmp_path / "cell.db", make_data(400, samples=60, seed=3)
+    service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=60.0)
+    context = browser.new_context(viewport={"width": 390, "height": 844}, locale="en-GB")
+    context.set_default_timeout(PATIENT)
+    page = context.new_page()
+    with closing(service), served(service) as port:
+        demo = DemoCell(f"http://127.0.0.1:{port}", file)
+        opened(page, demo)
+        last = stopped_until_safe(service, data)  # while somebody looks on
+        expect(page.locator("#mode")).to_contain_text("Safe mode", timeout=PATIENT)
+        expect(page.locator("#banner")).to_contain_text("(accepted parts failed more often than the tolerance)")
+        for view in VIEWS:
+            opened(page, demo, f"{view}?lang=de")
+            expect(page.locator("#mode")).to_contain_text("Sicherer Betrieb")
+            expect(page.locator("#banner")).to_contain_text("Jedes Teil wird geprüft")
+            expect(page.locator("#banner")).to_contain_text("(angenommene Teile waren häufiger schlecht")
+            assert page.evaluate("document.documentElement.scrollWidth") <= 390, view
+            found = Axe().run(page)
+            assert found.violations_count == 0, f"{view}: {found.generate_report()}"
+        opened(page, demo, f"part?id={last}&lang=en")
+        confirmed(page, "It was good", "Kim")
+        expect(page.locator("#banner")).to_be_empty(timeout=PATIENT)
+        expect(page.locator("#mode")).to_contain_text("Decides")
+        context.close()
+    with demo.store() as store:
+        told = [(event.kind, event.author, event.text) for event in store.events(3)]
+    assert [each[:2] for each in told] == [("safe mode", ""), ("correct", "Kim"), ("safe mode", "")]
+    assert told[0][2] == "accepted parts failed more often than the tolerance"
+    assert last in told[1][2]
+    assert told[2][2] == "ended: what was told anew keeps the tolerance"
+
+
+def test_a_cell_of_simulated_physics_is_shown_too(browser: Browser, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="the simulated cell needs the extra `sim`")
+    options = ["--cell", "simulated", "--port", "0", "--speed", "2", "--before", "4", "--keep", str(tmp_path / "cell.db")]
+    process, url = started([sys.executable, "-m", "dengine", "demo-cell", *options], tmp_path)
+    demo, context, complaints = DemoCell(url, tmp_path / "cell.db"), browser.new_context(locale="en-GB"), list[str]()
+    context.set_default_timeout(PATIENT)
+    page = context.new_page()
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    opened(page, demo)
+    expect(page.locator("#decision")).to_have_text("Verify", timeout=PATIENT)
+    expect(page.locator(".trace-card svg.chart")).to_have_attribute("aria-label", re.compile(r"Force over 2\.0 s"))
+    was = page.locator(".decision .about").inner_text()
+    expect(page.locator(".decision .about")).not_to_have_text(was, timeout=PATIENT)
+    context.close()
+    ended(process)
+    assert (process.returncode, complaints) == (0, [])
+    assert "Traceback" not in (tmp_path / "demo.log").read_text()
+    with demo.store() as store:
+        newest = store.decisions(HistoryFilter(), 1)[0]
+        assert store.get_decision(newest.id).trace.shape == (1, 1000)
+        assert store.status()["labels"] >= 4  # what physics said of them
 
 
 def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser) -> None:

@@ -1,8 +1,10 @@
 """The line in front of an engine: who asks, who waits, who is told what."""
 
 import asyncio
+import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -81,6 +83,70 @@ def test_who_waits_too_long_is_told_to_verify_and_so_it_is_recorded(service: Cel
 
     asyncio.run(cell())
     assert service.late == 2
+
+
+def test_a_late_answer_is_on_the_disk_when_it_leaves(service: CellService, stream: Dataset, tmp_path: Path) -> None:
+    bad = stream.X[2].copy()
+    bad[7] = float("nan")
+
+    async def cell() -> None:
+        await service.decide(stream.X[0], "order-0")
+        service.deadline = 0.05
+        with held(service):
+            late = await service.decide(stream.X[1], "order-1", part="P1")
+            broken = await service.decide(bad, "order-2")
+            with pytest.raises(TraceError, match="got another"):
+                await service.decide(stream.X[2], "order-0")  # in time or late, an answer is to one trace
+            with pytest.raises(TraceError, match="60"):
+                await service.decide(stream.X[0][:10], "order-3")
+            assert (late.late, broken.decision.reason) == (True, Reason.NOT_FINITE)
+            (tmp_path / "killed").mkdir()  # as a process that is killed now leaves it
+            for file in tmp_path.glob("cell.db*"):
+                shutil.copy(file, tmp_path / "killed")
+        with DataEngine.open(tmp_path / "killed" / "cell.db") as again:
+            assert again.decide(stream.X[1], "P1", decision_id="order-1") == late.decision
+            assert again.decide(bad, decision_id="order-2") == broken.decision
+            again.report("order-1", True)
+        service.deadline = 30.0
+        assert (await service.decide(stream.X[1], "order-1")).decision == late.decision
+        assert (await service.find("order-2")).quarantined
+
+    asyncio.run(cell())
+    assert service.reading.status()["decisions"] == 3
+    assert service.late == 2
+
+
+@contextmanager
+def held(service: CellService) -> Iterator[None]:
+    """The engine's thread, busy with something else."""
+    begun, free = threading.Event(), threading.Event()
+    service._put(lambda engine, late: (begun.set(), free.wait(60)))
+    assert begun.wait(60)
+    try:
+        yield
+    finally:
+        free.set()
+
+
+@pytest.mark.parametrize("where", ["file", "memory"])
+def test_of_two_threads_that_decide_on_one_id_the_first_counts(
+    where: str, tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with DataEngine.open_or_create(tmp_path / "cell.db" if where == "file" else None, recipe=RECIPE) as engine:
+        engine.decide(stream.X[0])
+        decide, late = engine._maker.decide, []
+
+        def and_late(*words):
+            item = decide(*words)  # what the engine's thread thinks of it, while somebody's patience ends
+            late.append(engine.decide_late(stream.X[1], decision_id="order-1"))
+            return item
+
+        monkeypatch.setattr(engine._maker, "decide", and_late)
+        decided = engine.decide(stream.X[1], decision_id="order-1", late=where == "memory")
+        assert decided.reason is Reason.LATE
+        assert [decided] == late
+        assert engine.find("order-1").reason is Reason.LATE
+        engine.report("order-1", True)
 
 
 def test_a_full_line_takes_no_more_and_records_nothing_of_it(stream: Dataset) -> None:

@@ -36,6 +36,33 @@ def test_a_new_id_is_not_looked_up_once_the_taken_ones_are_known(tmp_path: Path,
         assert engine.decide(stream.X[0], decision_id="order-0") == first
 
 
+def test_a_label_is_known_however_many_decisions_came_since(
+    tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dengine.recent.MOST", 3)
+    monkeypatch.setattr("dengine.keeping.BEAT", 3600.0)  # a cell that never pauses: the journal keeps what the store has
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        for i in range(5):
+            engine.decide(stream.X[i], decision_id=f"order-{i}")
+            engine.report(f"order-{i}", True)
+        assert engine._keeper._backlog.find("order-0").success is None  # the label went to the store alone
+        assert engine.find("order-0").success is True
+
+
+def test_the_journal_of_a_cell_that_never_pauses_does_not_grow_for_ever(
+    tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dengine.keeping.BEAT", 3600.0)
+    monkeypatch.setattr("dengine.keeping.RESERVE", 20_000)
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        journal, most = engine._keeper._backlog.journal, 0
+        for i in range(200):
+            engine.decide(stream.X[i], decision_id=f"order-{i}")
+            engine.report(f"order-{i}", True)
+            most = max(most, journal.end)
+    assert 10_000 < most < 50_000
+
+
 def test_taken_ids_are_never_taken_for_new_ones() -> None:
     taken = TakenIds(f"order-{i}" for i in range(20_000))
     assert all(taken.may_hold(f"order-{i}") for i in range(20_000))

@@ -1,12 +1,14 @@
 """`dengine serve` over loopback: how long a decision takes beside `engine.decide`, and what kills take back.
 
     python training/benchmark_serve.py --n 10000 --kills 50
+    python training/benchmark_serve.py --n 0 --kills 50 --deadline 0.01
 
 Run it on an idle machine. Every part that is not rejected is reported, so that retrains go on in the background all the
 time. With --kills the client and the server are killed so often each, at random moments; each client writes what it was
-answered to the disk before it goes on. At the end all of it is compared: with what is answered then, and with the store.
-Exit code 1 if an acknowledged label was lost, or an id was answered twice differently. --folder is where the stores are: a
-decision under a caller's own id is on the disk before it is answered, so its disk counts.
+answered to the disk before it goes on. With --deadline others fill the server's line, so that many answers are late. At the
+end all of it is compared: with what is answered then, and with the store. Exit code 1 if an acknowledged label was lost, or
+an id was answered twice differently. --folder is where the stores are: a decision under a caller's own id is on the disk
+before it is answered, so its disk counts.
 """
 
 from __future__ import annotations
@@ -75,6 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=10_000, help="decisions by each way of asking; 0: none")
     parser.add_argument("--kills", type=int, default=0, help="of the client, and as many of the server")
+    parser.add_argument("--deadline", type=float, help="seconds, of the server under kills, whose line others fill then")
     parser.add_argument("--data", default="insertion", help="whose traces are sent")
     parser.add_argument("--samples", type=int, help="of each trace; all by default")
     parser.add_argument("--recipe", default="conv", help="of the served engine")
@@ -92,7 +95,7 @@ def main() -> None:
         if args.kills:
             (folder / "kills").mkdir()
             with progress("kills", 2 * args.kills, not sys.stderr.isatty()) as advance:
-                kept = kill(args.kills, folder / "kills", args.seed, advance)
+                kept = kill(args.kills, folder / "kills", args.seed, advance, args.deadline)
             well = tell(kept, console)
             found["kills"] = asdict(kept)
     if args.out is not None:

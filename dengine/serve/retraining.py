@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
@@ -31,7 +32,8 @@ class RetrainingProcess(Executor):
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_work, args=(other,), name="dengine-retraining", daemon=True)
-        self._process.start()
+        with _unheard():
+            self._process.start()
         other.close()
         self._jobs: queue.SimpleQueue[tuple[Future[Any], Any] | None] = queue.SimpleQueue()
         self._ended = False
@@ -75,6 +77,17 @@ class RetrainingProcess(Executor):
 
 
 @contextmanager
+def _unheard() -> Iterator[None]:
+    """What is started here never hears the signals to the whole group, nor while it begins: its parent ends it in time."""
+    resource_tracker.ensure_running()  # whose own start would let them through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
 def retraining_process() -> Iterator[Executor]:
     """A `RetrainingProcess`, ready for its first retrain soon."""
     with RetrainingProcess() as process:
@@ -86,8 +99,6 @@ def retraining_process() -> Iterator[Executor]:
 
 
 def _work(connection: Connection) -> None:
-    for name in ("SIGINT", "SIGTERM"):  # sent to the whole group; its parent says when it is time to end
-        signal.signal(getattr(signal, name), signal.SIG_IGN)
     with suppress(AttributeError, OSError):  # there is none on Windows
         os.nice(NICE)
     threading.Thread(target=_end_with_parent, name="dengine-parent", daemon=True).start()

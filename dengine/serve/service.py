@@ -26,7 +26,6 @@ from typing import Any, TypeVar
 
 from numpy.typing import ArrayLike
 
-from ..deciding import as_decision, late_decision
 from ..engine import DataEngine
 from ..errors import BusyError
 from ..labels import as_id, as_success
@@ -124,10 +123,9 @@ class CellService:
         await asyncio.wait([answer], timeout=self.deadline)
         if answer.done() or not job.give_up():
             return self._heard(Answer(await answer, time.monotonic() - begin))
-        self.late += 1
         answer.add_done_callback(_note_failure)
-        known = await asyncio.to_thread(self.engine.find, id_)  # asked again, the answer is what it was
-        decision = late_decision(id_, part, self.engine.version) if known is None else as_decision(known)
+        decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
+        self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
     async def report(self, decision_id: str, success: bool) -> Told:

@@ -7,6 +7,7 @@ import os
 import random
 import subprocess
 import sys
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ from .process import Connection, Server
 PATIENCE = 120.0  # seconds that a client asks again while the server is away
 LONGEST = 1.5  # seconds between two kills
 SAME = ("id", "action", "predicted", "reason", "lower", "upper", "n_success", "n_failure", "model_version", "part")
-TRACES = 500  # different ones
+CROWD = 8  # who asks beside the client, where answers are to be late
 
 
 def trace(number: int) -> tuple[np.ndarray, bool]:
@@ -87,6 +88,19 @@ def cycle(number: int, notes: Notes, connection: Connection) -> None:
         notes.put(told=answer["id"], success=good)
 
 
+def crowd(port: int) -> None:
+    """Ask without a pause and without an id, so that whoever else asks waits in line; until killed."""
+    traces = [trace(number)[0] for number in range(50)]
+
+    def ask() -> None:
+        connection = Connection(port, PATIENCE)
+        while True:
+            connection.decide(random.choice(traces))
+
+    for _ in range(CROWD):
+        threading.Thread(target=ask).start()
+
+
 @dataclass
 class Kept:
     """What was found when all was over."""
@@ -101,16 +115,21 @@ class Kept:
     versions: int = 0
 
 
-def kill(times: int, folder: Path, seed: int, progress: Any) -> Kept:
-    """Kill the client so often, and the server so often, in an order by chance; then compare everything."""
+def kill(times: int, folder: Path, seed: int, progress: Any, deadline: float | None = None) -> Kept:
+    """Kill the client so often, and the server so often, in an order by chance; then compare everything.
+
+    deadline : seconds, of the server, with a crowd in its line, so that many answers are late; None: its own, and no crowd.
+    """
     rng, kept = random.Random(seed), Kept()
     victims = ["client"] * times + ["server"] * times
     rng.shuffle(victims)
-    server = Server(folder, "--reducer", "pca", "--no-page", "--alpha", "0.1", "--lower-bound", "0.9")
+    words = [] if deadline is None else ["--deadline", str(deadline)]
+    server = Server(folder, "--reducer", "pca", "--no-page", "--alpha", "0.1", "--lower-bound", "0.9", *words)
     server.start()
-    file, robot = folder / "client.jsonl", None
+    file, robot, others = folder / "client.jsonl", None, None
     try:
-        robot = begin(server.port, file)
+        others = None if deadline is None else begin(f"crowd({server.port})")
+        robot = begin_client(server.port, file)
         for victim in victims:
             wait_for_more(file)
             time.sleep(rng.uniform(0.0, LONGEST))
@@ -121,17 +140,14 @@ def kill(times: int, folder: Path, seed: int, progress: Any) -> Kept:
             else:
                 robot.kill()
                 robot.wait()
-                robot = begin(server.port, file)
+                robot = begin_client(server.port, file)
             kept.kills[victim] += 1
             progress(1)
         wait_for_more(file)
-        robot.kill()
-        robot.wait()
+        end(robot, others)
         compare(kept, file, Connection(server.port, PATIENCE))
     finally:
-        if robot is not None:
-            robot.kill()
-            robot.wait()
+        end(robot, others)
         server.end()
     with DataEngine.open(folder / "cell.db") as engine:  # it opens, with all that waited in the journal
         kept.versions = engine.version
@@ -139,11 +155,23 @@ def kill(times: int, folder: Path, seed: int, progress: Any) -> Kept:
     return kept
 
 
-def begin(port: int, file: Path) -> subprocess.Popen[bytes]:
+def begin_client(port: int, file: Path) -> subprocess.Popen[bytes]:
     """A client process."""
-    code = f"from serving.kills import client; from pathlib import Path; client({port}, Path({str(file)!r}))"
+    return begin(f"client({port}, Path({str(file)!r}))")
+
+
+def begin(call: str) -> subprocess.Popen[bytes]:
+    """A process that does this."""
+    code = f"from serving.kills import *; from pathlib import Path; {call}"
     path = os.pathsep.join([str(Path(__file__).resolve().parents[1]), *filter(None, sys.path)])
     return subprocess.Popen([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path})
+
+
+def end(*processes: subprocess.Popen[bytes] | None) -> None:
+    """SIGKILL to all that were begun."""
+    for each in filter(None, processes):
+        each.kill()
+        each.wait()
 
 
 def wait_for_more(file: Path) -> None:

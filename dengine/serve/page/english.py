@@ -29,6 +29,10 @@ ENGLISH = {
     "mode.short.learns": "Learning",
     "mode.short.shadow": "Verifying all",
     "mode.short.safe": "Safe mode",
+    # Why a safe mode began, by the place in SAFE_MODE
+    "safe.1": "accepted parts failed more often than the tolerance",
+    "safe.2": "rejected parts were good more often than the tolerance",
+    "safe.3": "too many traces were novel",
     # Decisions
     "action.accept": "Accept",
     "action.reject": "Reject",

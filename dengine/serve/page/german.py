@@ -29,6 +29,10 @@ GERMAN = {
     "mode.short.learns": "Lernt",
     "mode.short.shadow": "Prüft alles",
     "mode.short.safe": "Sicherer Betrieb",
+    # Why a safe mode began, by the place in SAFE_MODE
+    "safe.1": "angenommene Teile waren häufiger schlecht, als die Toleranz erlaubt",
+    "safe.2": "abgewiesene Teile waren häufiger gut, als die Toleranz erlaubt",
+    "safe.3": "zu viele Kurven waren neuartig",
     # Decisions
     "action.accept": "Annehmen",
     "action.reject": "Abweisen",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...decision.policy import Policy
+from ...decision.rule import SAFE_MODE
 from ...standing import Course, Standing, Watch, course, standing, watch
 from ...store.records import Event
 from ...store.views import PastRetrain
@@ -62,10 +63,10 @@ def _pace(looking: Looking) -> float | None:
 
 
 def mode_of(looking: Looking) -> tuple[str, str]:
-    """How decisions are made now, decides, learns, shadow or safe, and the reason of a safe mode."""
+    """How decisions are made now, decides, learns, shadow or safe, and the message of why a safe mode began."""
     engine = looking.service.engine
-    if engine.safe_mode:
-        return "safe", engine.safe_mode
+    if why := engine.safe_mode:
+        return "safe", f"safe.{SAFE_MODE.index(why)}"
     if engine.shadow:
         return "shadow", ""
     return ("learns" if engine.version == 0 else "decides"), ""
