@@ -39,14 +39,17 @@ class Incoming:
 
     def learn(self, window: Window, seconds: float = np.inf) -> bool:
         """Make labels that came during its training references, no longer than that; whether it has all."""
-        if self.model is None:
+        missing = [] if self.model is None else self._missing(window)
+        if not missing:
             return True
         begin = self._clock()
-        missing = [seq for seq in window.newer(int(self.seq[-1])).tolist() if seq not in self._seen]
         while missing and self._clock() - begin < seconds:
             self._learn_one(missing.pop(0), window)
         self.seconds += self._clock() - begin
         return not missing
+
+    def _missing(self, window: Window) -> list[int]:
+        return [seq for seq in window.newer(int(self.seq[-1])).tolist() if seq not in self._seen]
 
     def _learn_one(self, seq: int, window: Window) -> None:
         assert self.model is not None  # the caller asked; for the type checker

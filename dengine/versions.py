@@ -188,11 +188,12 @@ class ModelVersions(CurrentVersion):
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Bring in what an executor has finished: a step further, or to the end, as where it is waited for."""
+        to_the_end |= wait > 0.0 or self.fleet is not None  # sisters' versions and corrections do not come in between
         trained = self.retrainer.collect(wait)
         if trained is not None:
             self._take(trained)
-        if self._incoming is not None and (trained is None or to_the_end or wait > 0.0):  # to take it was a step
-            self._advance(to_the_end or wait > 0.0)
+        if self._incoming is not None and (to_the_end or trained is None):  # to take it was a step
+            self._advance(to_the_end)
 
     def _take(self, trained: Trained) -> None:
         self._incoming = Incoming(trained, self.newest, self.version, self.clock)
@@ -200,7 +201,6 @@ class ModelVersions(CurrentVersion):
     def _advance(self, to_the_end: bool) -> None:
         """Bring the version on its way in a step further. One that cannot be stored is dropped."""
         incoming, window = self._incoming, self.retrainer.window
-        to_the_end |= self.fleet is not None  # sisters' versions do not come in between
         assert incoming is not None  # the caller asked; for the type checker
         try:
             if incoming.storing is None:

@@ -176,6 +176,7 @@ def test_a_request_that_is_asked_again_has_the_same_answer(plant: Plant, stream:
             await plant.decide(stream.X[1], "again")
         assert "got another" in await plant.value("LastRefused")
         assert await plant.report("unheard of", True) is False
+        assert await plant.report("", True) is False  # as the id of a decision that was not recorded
 
     run(plc())
 
@@ -197,7 +198,7 @@ def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
         ("Decide", (ua.Variant([1.0] * 10, FLOAT), one, none, none), bad),
         ("Decide", (trace, one, ua.Variant("a\nb", TEXT), none), bad),
         ("Decide", (trace, one, none, ua.Variant("x" * 500, TEXT)), bad),
-        ("Report", (none, ua.Variant(True)), bad),
+        ("Report", (ua.Variant("a\nb", TEXT), ua.Variant(True)), bad),
         ("Report", (ua.Variant("order-1", TEXT), ua.Variant(1, ua.VariantType.Int32)), bad),
         ("Report", (ua.Variant("order-1", TEXT),), few),
     ]
