@@ -52,7 +52,7 @@ class Window:
 
     def after(self, seq: int) -> int:
         """How many labels after this one are held."""
-        return int((self._seq[: len(self)] > seq).sum())
+        return len(self.newer(seq))
 
     def draw(self, n: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Traces (m, C, T) and hashes (m,) of `n` at most, drawn blind to labels, others at each new label."""

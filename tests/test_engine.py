@@ -29,6 +29,7 @@ from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import audited, content_hash
 from dengine.model.module import CompiledPredictor
 from dengine.store import MemoryStore, SqlStore
+from tests.driving import Counting
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
 AUDITING = RECIPE.with_policy(audit_rate=0.3)
@@ -521,32 +522,14 @@ def test_a_wrong_setting_raises_when_the_engine_is_made_not_at_its_first_retrain
 # ------------------------------------------------------------------------------------------------------- executors
 
 
-class Slow:
-    """A model whose training waits for leave."""
+class Slow(Counting):
+    """Its training waits for leave."""
 
     may_finish = Event()
 
-    def __init__(self) -> None:
-        self.fitted, self.added = 0, 0
-
-    def __deepcopy__(self, memo):
-        return Slow()
-
     def fit(self, X, y):
         assert Slow.may_finish.wait(30)
-        self.fitted = len(y)
-
-    def add(self, x, y):
-        self.added += 1
-
-    def count(self, X):
-        return np.full(len(X), self.fitted), np.full(len(X), self.added)
-
-    def predict_interval(self, X):
-        return np.zeros(len(X)), np.ones(len(X))
-
-    def decide(self, X):
-        return np.full(len(X), Action.VERIFY, dtype=object)
+        super().fit(X, y)
 
 
 def test_the_cell_goes_on_while_a_retrain_runs_and_its_labels_are_in_the_new_version(data: Dataset) -> None:

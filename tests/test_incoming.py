@@ -11,37 +11,19 @@ import pytest
 
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.incoming import STEP
-from dengine.records import Action
+from tests.driving import Counting
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
 
 
-class Slow:
-    """A model that needs half a step for each label, by a clock of its own."""
+class Slow(Counting):
+    """Needs half a step for each label, by a clock of its own."""
 
     now = 0.0
 
-    def __init__(self) -> None:
-        self.added = 0
-
-    def __deepcopy__(self, memo):
-        return Slow()
-
-    def fit(self, X, y):
-        self.fitted = len(y)
-
     def add(self, x, y):
-        self.added += 1
+        super().add(x, y)
         Slow.now += STEP / 2
-
-    def count(self, X):
-        return np.full(len(X), self.fitted), np.full(len(X), self.added)
-
-    def predict_interval(self, X):
-        return np.zeros(len(X)), np.ones(len(X))
-
-    def decide(self, X):
-        return np.full(len(X), Action.VERIFY, dtype=object)
 
 
 def learn(engine: DataEngine, data: Dataset, part: slice) -> None:
