@@ -24,10 +24,11 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = (
     *("test_docs", "test_notebooks", "test_page", "test_fuzz_requests", "test_golden", "test_training", "test_cli"),
-    *("test_estimators", "test_reducers"),
+    *("test_golden_default", "test_estimators", "test_reducers"),
 )
 # The C++ programs are built once, by one worker.
-GROUPS = dict.fromkeys(("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program"), "cpp")
+PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden_default")
+GROUPS = dict.fromkeys(PROGRAMS, "cpp")
 # Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
 GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers", "test_plane"), "umap")
 
