@@ -1,6 +1,6 @@
 # Start a throw-away PostgreSQL server on loopback; sourced, never run:
 #
-#     . .ci/postgres.sh && python -m pytest tests/test_store.py tests/test_store_postgres.py
+#     . .ci/postgres.sh && python -m pytest tests/contract/test_store.py tests/slow/test_store_postgres.py
 #
 # Exports its SQLAlchemy URL in DENGINE_TEST_POSTGRES. Installs PostgreSQL by apt-get where it is missing and this is
 # root. The server stops, and its directory goes, when the sourcing shell exits or calls `dengine_postgres_stop`.

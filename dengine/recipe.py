@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 
 from .decision.policy import Neighbourhood, Policy
-from .errors import SettingError
-from .values import is_number, is_whole
-from .wording import listed, shortened
+from .errors import SettingError, listed, shortened
+from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class

@@ -1,13 +1,44 @@
-"""Frozen records that travel between the layers. They carry values and no behaviour."""
+"""Records as JSON has them.
+
+What a setting's value is, whatever type it came as: True is no number, and 10**400 is no float.
+
+Frozen records that travel between the layers. They carry values and no behaviour.
+
+What a report may say: the id of a decision, and success or failure. Anything else is refused before it is stored.
+
+A label that is guessed is worse than none: `bool("NG")` is True, and -1 is what some controllers call true.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, is_dataclass
 from enum import StrEnum
+from importlib import import_module
+from numbers import Integral, Real
+from typing import Any
 
-from .errors import SettingError
-from .values import is_number, is_whole
-from .wording import shortened
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import DataError, ReportError, SettingError, shortened, without_password
+
+
+def is_whole(value: Any, least: int, most: int) -> bool:
+    """Whether it is an integer, Python's or NumPy's, from `least` to `most`."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) <= most
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a real number that a float can hold, an infinity or a NaN among them: no range holds the latter."""
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    try:
+        float(value)
+    except OverflowError:
+        return False
+    return True
 
 
 class Action(StrEnum):
@@ -182,3 +213,87 @@ class Cycle:
     decide_seconds: float
     retrain: RetrainReport | None
     safe_mode: str = ""
+
+
+LONGEST = 200  # characters of an id, or of a part's number
+
+
+def as_success(value: Any, of: str = "") -> bool:
+    """A label as True or False. ReportError for anything but a bool, or a number that is exactly 1 or 0.
+
+    value : bool, int, float, a NumPy scalar, or an array of no dimensions.  of : what it is the label of, for the error.
+    """
+    plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
+        return bool(plain)
+    raise ReportError(
+        f"Expected a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'} got "
+        f"{shortened(value)}; nothing was stored: turn it into one of these first, as in success=(answer == 'OK')."
+    )
+
+
+def as_labels(y: ArrayLike) -> NDArray[np.int64]:
+    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
+    labels = np.asarray(y)
+    if not np.isin(labels, (0, 1)).all():
+        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
+    return labels.astype(np.int64)
+
+
+def as_outcome(value: Any, of: str = "") -> Outcome:
+    """What a cell's `proceed` returned, as an `Outcome`; ReportError for anything else, which would pass for silence."""
+    try:
+        return Outcome(value)
+    except (ValueError, TypeError) as error:
+        raise ReportError(
+            f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}; return "
+            "Outcome.UNKNOWN from proceed() where nothing is known."
+        ) from error
+
+
+def is_name(value: Any) -> bool:
+    """Whether a store can keep it as an id, or a part's number: text that prints, of 1 to LONGEST characters."""
+    return isinstance(value, str) and 1 <= len(value) <= LONGEST and value.isprintable()
+
+
+def as_id(value: Any) -> str:
+    """A decision's id; ReportError for what is none."""
+    if not is_name(value):
+        raise ReportError(
+            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
+            "report the `Decision.id` that `decide` returned."
+        )
+    return str(value)
+
+
+def plain(value: Any) -> Any:
+    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None, no passwords."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if isinstance(value, str):
+        return without_password(value)
+    if isinstance(value, bool | int) or value is None:
+        return value
+    if hasattr(value, "item"):  # a NumPy scalar
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return without_password(str(value))
+
+
+def find_class(where: str) -> type:
+    """The class that `module:Class` names; SettingError where there is none."""
+    module, _, name = where.partition(":")
+    try:
+        found = getattr(import_module(module), name)
+    except Exception as error:  # whatever a module of the user's raises while it is imported
+        raise SettingError(
+            f"Expected module:Class of something that can be imported here, got {shortened(where)}: {error}."
+        ) from error
+    if not isinstance(found, type):
+        raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
+    return found

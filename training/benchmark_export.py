@@ -28,10 +28,10 @@ from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
 from dengine.cli.output import duration, size
+from dengine.datasets.importing import import_labelled, train_until_done
 from dengine.errors import ExportError
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx, load_onnx
-from dengine.importing import import_labelled, train_until_done
 from dengine.records import Action
 from dengine.store import MemoryStore
 from dengine.traces import as_traces

@@ -23,9 +23,9 @@ import numpy as np
 import pandas as pd
 
 from dengine import Dataset, Policy, Replay, load_dataset
-from dengine.experiments.cost_curve import ALPHAS, LOWER_BOUNDS, cost_a_part, cost_tasks, curve_of
+from dengine.experiments.costs import ALPHAS, LOWER_BOUNDS, cost_a_part, cost_tasks, curve_of
 from dengine.experiments.grid import play_tasks
-from dengine.experiments.rates import Costs
+from dengine.experiments.metrics import Costs
 
 
 def disjoint(data: Dataset, parts: int, seed: int = 0) -> list[Dataset]:

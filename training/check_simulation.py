@@ -16,8 +16,8 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.model_selection import StratifiedKFold, cross_val_predict
 from sklearn.neighbors import KNeighborsClassifier
 
+from dengine.cells.simulation.conditions import RATE_HZ
 from dengine.cells.simulation.generate import simulate
-from dengine.cells.simulation.parameters import RATE_HZ
 from dengine.cells.simulation.world import TIME_STEP_S
 from dengine.datasets import Dataset, load_dataset
 

@@ -26,12 +26,10 @@ from rich.console import Console
 
 from dengine import Dataset, Recipe, Replay, load_dataset
 from dengine.experiments.contenders import Contender
-from dengine.experiments.figures import save
-from dengine.experiments.grid import play_tasks
-from dengine.experiments.kept import Task
-from dengine.experiments.look import GREEN, LIMIT
+from dengine.experiments.figures import GREEN, LIMIT, save
+from dengine.experiments.grid import Task, play_tasks
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
-from dengine.reducers.vicreg import AUGMENTATIONS
+from dengine.reducers.training import AUGMENTATIONS
 
 CYCLES = 1503
 

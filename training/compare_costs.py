@@ -21,8 +21,7 @@ from joblib import Parallel, delayed
 
 from dengine import Dataset, Policy, Recipe, load_dataset, replay
 from dengine.reducers import ConvReducer
-from dengine.reducers.embedding import FeatureEmbedding
-from dengine.reducers.logistic import CrossFittedScores
+from dengine.reducers.heads import CrossFittedScores, FeatureEmbedding
 
 
 class DishonestScores(CrossFittedScores):

@@ -27,11 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import Policy, Recipe
-from dengine.cells.simulation.parameters import CellParameters
-from dengine.cells.simulation.scenarios import first_change
-from dengine.experiments.live import RunLog
-from dengine.experiments.look import LIMIT, RECIPES, SMALL, draw_verified, plain, save
-from dengine.experiments.replay import replay
+from dengine.cells.simulation.conditions import CellParameters, first_change
+from dengine.experiments.figures import LIMIT, RECIPES, SMALL, draw_verified, plain, save
+from dengine.experiments.replay import RunLog, replay
 from dengine.experiments.tables import write_csv
 
 WINDOW = 100  # cycles

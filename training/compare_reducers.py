@@ -27,9 +27,8 @@ import numpy as np
 
 from dengine import Replay, load_dataset
 from dengine.experiments.contenders import Contender, contenders
-from dengine.experiments.grid import iterate_replays
-from dengine.experiments.kept import Task
-from dengine.experiments.rates import pooled_error
+from dengine.experiments.grid import Task, iterate_replays
+from dengine.experiments.metrics import pooled_error
 from dengine.experiments.rivals import RIVALS
 from dengine.experiments.tables import frame_of, pool, write_csv
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from dengine import DataEngine, Recipe, export_torchscript, load_dataset
 from dengine.cli.output import size
+from dengine.datasets.importing import import_labelled, train_until_done
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx
-from dengine.importing import import_labelled, train_until_done
 from dengine.store import MemoryStore
 
 FORMATS = {"torchscript": export_torchscript, "onnx": export_onnx}

@@ -36,8 +36,8 @@ from fuzzing.web import MAKERS, SAMPLES, TOKEN
 from fuzzing.wire import QUIET, WAIT, Call, Halves, exchange, over_http
 
 from dengine import DataEngine, TraceSpec, open_store
-from dengine.checks import toy_traces
 from dengine.store.views import HistoryFilter
+from dengine.testing import toy_traces
 
 SHARES = {  # of all attempts
     "json": 0.22,

@@ -20,10 +20,9 @@ import numpy as np
 from check_simulation import forest, halve_step, predict_folds, report_hardness, report_shortcuts, report_step
 from numpy.typing import NDArray
 
+from dengine.cells.simulation.cell import CAUSES
+from dengine.cells.simulation.conditions import RATE_HZ, SCENARIOS, CellParameters
 from dengine.cells.simulation.generate import SimulatedTraces, save_traces, simulate, simulate_balanced
-from dengine.cells.simulation.insertion import CAUSES
-from dengine.cells.simulation.parameters import RATE_HZ, CellParameters
-from dengine.cells.simulation.scenarios import SCENARIOS
 from dengine.datasets import Dataset, load_dataset
 
 SUCCESSES, FAILURES = 803, 700  # as in the paper

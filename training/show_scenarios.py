@@ -19,10 +19,9 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import DataEngine, Recipe, SimulatedCell
-from dengine.cells.simulation.parameters import RATE_HZ
-from dengine.cells.simulation.scenarios import SCENARIOS, first_change
-from dengine.experiments.live import RunLog, watch
-from dengine.experiments.look import BAD, GOOD, LIMIT, SMALL, draw_errors, draw_verified, plain, save
+from dengine.cells.simulation.conditions import RATE_HZ, SCENARIOS, first_change
+from dengine.experiments.figures import BAD, GOOD, LIMIT, SMALL, draw_errors, draw_verified, plain, save
+from dengine.experiments.replay import RunLog, watch
 
 WINDOW = 100  # cycles
 CHANGES = {"wear": "wear begins to grow", "variant": "the new variant comes", "bias_jump": "the offset jumps"}

@@ -33,15 +33,15 @@ from dengine import Dataset, ModelPrediction, Recipe, Replay, export_torchscript
 from dengine.cli.output import duration
 from dengine.datasets import make_dataset
 from dengine.errors import SettingError
+from dengine.experiments.figures import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, TRUTH_MARKS, legend_above, plain, save
 from dengine.experiments.grid import run_replays
-from dengine.experiments.look import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, TRUTH_MARKS, legend_above, plain, save
-from dengine.experiments.rates import pooled_error
+from dengine.experiments.metrics import pooled_error
 from dengine.folds import content_hash, fold_of, own_hash
 from dengine.reducers.base import StopRule, own_places
 from dengine.reducers.conv import HELD_OUT, ConvReducer
 from dengine.reducers.encoder import principal_axes, weights_of
 from dengine.reducers.scored import in_chunks
-from dengine.reducers.vicreg import EncoderTraining
+from dengine.reducers.training import EncoderTraining
 from dengine.traces import as_traces
 
 RUN = 30  # steps between two looks at the loss
@@ -54,9 +54,8 @@ Floats = NDArray[np.float32]
 
 def simulated(n: int) -> Dataset:
     """The first n insertions of each scenario of the simulated cell."""
+    from dengine.cells.simulation.conditions import RATE_HZ, SCENARIOS
     from dengine.cells.simulation.generate import simulate
-    from dengine.cells.simulation.parameters import RATE_HZ
-    from dengine.cells.simulation.scenarios import SCENARIOS
 
     each = [simulate(n, CELL_SEED, name) for name in SCENARIOS]
     X, y, cause = (np.concatenate([getattr(one, name) for one in each]) for name in ("X", "y", "cause"))

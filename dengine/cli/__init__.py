@@ -14,25 +14,20 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import DengineError
-from ..wording import without_password
-from .cells import cells
-from .correcting import correct, forget, retrain, rollback, set_policy, shadow
-from .costing import costs
-from .data import data
-from .demo_cell import demo_cell
-from .explaining import explain
+from ..errors import DengineError, without_password
+from .correct import correct, forget, retrain, rollback, set_policy, shadow
+from .costs import costs
+from .data import data, simulate
 from .export import export, export_cpp, import_labels, make_key
-from .history import history
-from .interrupting import end_interrupted
-from .keeping import dump, verify
+from .history import explain, history
 from .options import example
-from .replaying import compare, replay
-from .running import run
-from .serving import serve
-from .simulating import simulate
-from .status import status
-from .training import train
+from .output import end_interrupted
+from .replay import compare, replay
+from .run import demo_cell, run
+from .serve import serve
+from .status import cells, status
+from .store import dump, verify
+from .train import train
 
 
 class Verbs(click.Group):

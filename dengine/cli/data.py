@@ -1,15 +1,31 @@
-"""`dengine data`: what a data set is, before anything is learned from it."""
+"""`dengine simulate`: traces of the simulated cell, into a file.
+
+`dengine data`: what a data set is, before anything is learned from it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import DataChoice, OutFolder, example, json_option, out_option, reading_options
-from .output import duration, show, write_json
+from .options import (
+    DataChoice,
+    OutFolder,
+    example,
+    force_option,
+    json_option,
+    must_have_mujoco,
+    n_jobs_option,
+    out_option,
+    reading_options,
+    scenario_option,
+    seed_option,
+)
+from .output import duration, progress, show, write_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -43,8 +59,8 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     found = survey(dataset)
     files = []
     if out is not None:
-        from ..experiments.look import save
-        from ..experiments.survey_picture import data_picture
+        from ..experiments.figures import save
+        from ..experiments.pictures import data_picture
 
         files = [save(data_picture(dataset, found.name), out.path / "data.png", force=out.force)]
     if as_json:
@@ -90,7 +106,7 @@ def _rate(found: Survey) -> str:
 
 
 def _state(found: Survey) -> Iterator[tuple[str, str]]:
-    from ..model.repeats import SUSPICIOUS
+    from ..model.neighbours import SUSPICIOUS
 
     yield "labels", f"{found.good} good, {found.bad} bad: {100 * found.good / found.traces:.1f} % good"
     if found.parts is not None:
@@ -129,3 +145,35 @@ def _faults(found: Survey) -> list[Any]:
     n = len(found.faults)
     rest = [f"and {n - MOST} more."] if n > MOST else []
     return [f"Left out, {n}:", *(f"- {fault}" for fault in found.faults[:MOST]), *rest]
+
+
+@click.command(epilog=example("dengine simulate --n 50 --out traces.npz --seed 0"))
+@click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate, of 2 s each.")
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help="The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels.",
+)
+@scenario_option
+@seed_option
+@n_jobs_option(-1, "Processes; -1: one a core.")
+@force_option
+@json_option
+def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool, as_json: bool) -> None:
+    """Simulate insertions and write their forces and labels."""
+    from ..files import TRACES, check_output
+
+    must_have_mujoco()
+    check_output(out, TRACES, force)  # before minutes of physics
+    from ..cells.simulation.generate import save_traces
+    from ..cells.simulation.generate import simulate as simulate_traces
+
+    with progress(f"simulating {scenario}", n, as_json) as advance:
+        traces = simulate_traces(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
+    path = save_traces(out, traces, force)
+    good = int(traces.y.sum())
+    if as_json:
+        write_json({"verb": "simulate", "simulated": True, "scenario": scenario, "n": n, "successes": good, "file": path})
+        return
+    show(f"Simulated {n} insertions ({scenario}): {good} successes, {n - good} failures.", f"Wrote {path}")

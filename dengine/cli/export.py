@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from .naming import cell_options
-from .options import example, force_option, json_option
+from .options import cell_options, example, force_option, json_option
 from .output import imported_line, show, size, write_json
 
 
@@ -41,7 +40,7 @@ def export(store: str, out: Path, form: str, key: Path | None, force: bool, as_j
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`.
     """
-    from ..engine import DataEngine
+    from ..engine.engine import DataEngine
     from ..export import export_onnx, export_torchscript
 
     write = {"torchscript": export_torchscript, "onnx": export_onnx}[form]
@@ -73,7 +72,7 @@ def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> 
     JOURNAL is the CSV file that the program wrote, of this version or an
     earlier one. Each line counts once, however often it is imported.
     """
-    from ..importing import import_journal
+    from ..datasets.importing import import_journal
 
     report = import_journal(store, journal, any_model=any_model)
     if as_json:

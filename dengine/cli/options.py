@@ -1,4 +1,9 @@
-"""Options that several verbs share."""
+"""Options that several verbs share.
+
+Options that take several values, with commas between.
+
+Which cell of a store a verb means, and what that cell makes.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,47 @@ if TYPE_CHECKING:
     from ..datasets import Dataset
     from ..recipe import Recipe
 
+
+class Listed(click.ParamType[Any]):
+    """Values with commas between, as a tuple; each is what another type says."""
+
+    name = "list"
+
+    def __init__(self, of: click.ParamType[Any]) -> None:
+        self.of = of
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+        """'0.5,0.1' -> (0.5, 0.1); a wrong one among them is a usage error."""
+        if isinstance(value, tuple):
+            return value
+        parts = [part.strip() for part in str(value).split(",") if part.strip()]
+        if not parts:
+            self.fail("expected at least one value, with commas between.", param, ctx)
+        return tuple(self.of.convert(part, param, ctx) for part in parts)
+
+
 Command = Callable[..., Any]
+
+
+def cell_options(*names: str, product: bool = False) -> Callable[[Command], Command]:
+    """`--cell`, or other names of it, and where asked for `--product`; the verb's `store` then says whose rows it means."""
+
+    def with_options(command: Command) -> Command:
+        @wraps(command)
+        def named(store: str | None, cell_id: str | None, product: str | None = None, **others: Any) -> Any:
+            from ..store.peers import address
+
+            if store is None and (cell_id or product):
+                raise click.UsageError("A cell and its product are known to a store: name it, --store FILE|URL.")
+            return command(store=None if store is None else address(store, cell_id, product), **others)
+
+        if product:
+            about = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
+            named = click.option("--product", metavar="NAME", help=about)(named)
+        whose = "Whose rows of the store, where it holds several cells; see `dengine cells`.  [default: cell]"
+        return click.option(*(names or ("--cell", "--cell-id")), "cell_id", metavar="NAME", help=whose)(named)
+
+    return with_options
 
 
 @dataclass(frozen=True)

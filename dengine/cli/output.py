@@ -1,28 +1,33 @@
-"""What a verb shows: one JSON document, or tables on stdout and a progress bar on stderr."""
+"""Ctrl-C: what was done so far is kept, and the verb says what that is.
+
+What a verb shows: one JSON document, or tables on stdout and a progress bar on stderr.
+"""
 
 from __future__ import annotations
 
 import json
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from ..documents import plain
-from ..errors import DengineError
-from ..wording import without_password
+from ..errors import DengineError, without_password
+from ..records import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ..datasets.importing import ImportReport
     from ..decision.certificate import Certificate
-    from ..importing import ImportReport
 
 WIDE = 80  # columns where no terminal says otherwise; every table fits them
 
@@ -143,3 +148,43 @@ def progress(label: str, total: int, quiet: bool, left: Callable[[], str] | None
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda step: bar.advance(task, step)
+
+
+INTERRUPTED = 130  # as shells have it: 128 + SIGINT
+
+Asked = Callable[[], bool]
+
+
+class EndAskedError(Exception):
+    """Raised between two steps to leave a loop that belongs to somebody else."""
+
+
+@contextmanager
+def interruptible() -> Iterator[Asked]:
+    """Let Ctrl-C ask for an end, which the loop inside grants between two steps; a second one ends at once.
+
+    Gives a function that says whether it was asked.
+    """
+    if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread alone
+        yield lambda: False
+        return
+    asked = False
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def end_interrupted(*lines: str) -> NoReturn:
+    """Say on stderr what was kept, and end with exit code 130."""
+    for line in lines:
+        click.echo(without_password(line), err=True)
+    click.get_current_context().exit(INTERRUPTED)

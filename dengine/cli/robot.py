@@ -22,7 +22,7 @@ host_option = click.option("--host", metavar="HOST[:PORT]", help="The robot's ad
 def open_robot(address: str | None, source: DataChoice) -> UrCell:
     """The cell, connected, its program running. SettingError where no host was named; CellError where none answers."""
     from ..cells.ur.cell import UrCell
-    from ..recordings.asked import names_of
+    from ..datasets.dataset import names_of
 
     if not address:
         raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")

@@ -1,26 +1,215 @@
-"""`dengine status`: what a store holds, and what can be said of the parts that went on without a check."""
+"""`dengine status`: what a store holds, and what can be said of the parts that went on without a check.
+
+How an engine is doing, as `dengine status` shows it: a table of two spans, JSON, a picture.
+
+The same screen again and again, until Ctrl-C.
+
+`dengine cells`: who shares a database.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..wording import without_password
-from .doing import Doing, doing_record, doing_table, drawn
-from .naming import cell_options
-from .options import example, json_option, out_file_option
-from .output import certificate_record, duration, show, when, write_json
-from .watching import redraw
+from ..errors import without_password
+from .options import cell_options, example, json_option, out_file_option
+from .output import Asked, certificate_record, console, duration, interruptible, show, when, write_json
 
 if TYPE_CHECKING:
     from ..decision.certificate import Certificate
+    from ..history.status import BadAccepts, Span, Standing, Watch, WouldHave
     from ..recipe import Recipe
     from ..records import RetrainReport
     from ..store.base import Event, Evidence, Store
+    from ..store.peers import CellSummary
+
+WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
+
+
+@dataclass(frozen=True)
+class Doing:
+    """What is shown.  watch : the safe mode's detectors, None without them.  alpha : of the interval.  last : asked for."""
+
+    standing: Standing
+    watch: Watch | None
+    alpha: float
+    last: int
+
+
+def doing_record(doing: Doing) -> dict[str, Any]:
+    """As JSON has it."""
+    spans = {name: _span_record(getattr(doing.standing, name)) for name in ("newest", "ever")}
+    detectors = None if doing.watch is None else asdict(doing.watch)
+    return {"doing": spans | {"last": doing.last, "alpha": doing.alpha, "watch": detectors}} | {
+        "waiting": asdict(doing.standing.waiting)
+    }
+
+
+def _span_record(span: Span) -> dict[str, Any]:
+    shares = {f"{name}_share": span.share(getattr(span, name)) for name in ("verified", "novel")}
+    judged = ("bad_accepts", "would_accept", "would_reject")
+    verdicts = {name: asdict(said := getattr(span, name)) | {"verdict": said.verdict} for name in judged}
+    return asdict(span) | shares | verdicts
+
+
+def doing_table(doing: Doing, store: str) -> Any:
+    """A column each for the newest decisions and for all, and what is on its way."""
+    from rich.table import Table
+
+    newest, ever = doing.standing.newest, doing.standing.ever
+    table = Table(title=f"{without_password(store)}: how it is doing", title_justify="left")
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(f"last {newest.decisions:,}", overflow="fold")
+    table.add_column("since birth", overflow="fold")
+    for row in zip(_rows(newest, doing.alpha), _rows(ever, doing.alpha), strict=True):
+        (name, new), (_, old) = row
+        table.add_row(name, new, old)
+    table.add_section()
+    for name, text in _whole(doing):
+        table.add_row(name, text, "")
+    return table
+
+
+def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
+    yield "from", when(span.first)
+    yield "verified", _of(span.verified, span)
+    yield "accepted", _of(span.accepted, span)
+    yield "of them bad", _bad(span.bad_accepts, alpha) if span.accepted else "none was accepted"
+    yield "rejected", _of(span.rejected, span)
+    yield "audits", _of(span.audits, span)
+    yield "would accept", _would(span.would_accept, "bad")
+    yield "would reject", _would(span.would_reject, "good")
+    yield "novel", _of(span.novel, span)
+    yield "safe mode", _of(span.safe_mode, span)
+    yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
+    dropped = sum(span.dropped.values())
+    yield "retrains", f"{span.retrains:,}, {dropped:,} dropped"
+    yield "dropped for", "\n".join(f"{n}: {reason.removeprefix('dropped: ')}" for reason, n in span.dropped.items()) or "-"
+
+
+def _of(some: int, span: Span) -> str:
+    share = span.share(some)
+    return f"{some:,}" + ("" if share is None else f" ({100 * share:.1f} %)")
+
+
+def _bad(bad: BadAccepts, alpha: float) -> str:
+    """Known bad accepts, with what they say of all."""
+    if not bad.by:
+        return f"{bad.stops:,} known; of the others nothing is"
+    lead = f"{bad.bad:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
+    stops = f", beside {bad.stops:,} stops" if bad.by == "audits" and bad.stops else ""
+    between = f"{100 * bad.lower:.1f} to {100 * bad.upper:.1f} % at alpha {alpha:g}"
+    return f"{lead}{stops}: {between}, {WORDS[bad.verdict]} {100 * bad.tolerance:g} %"
+
+
+def _would(said: WouldHave, wrong: str) -> str:
+    """What checks said of parts that the model was certain of."""
+    if not said.n:
+        return "none was checked"
+    between = f"{100 * said.lower:.1f} to {100 * said.upper:.1f} % at 95 %"
+    held = f"{WORDS[said.verdict]} {100 * said.tolerance:g} %"
+    return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {between}, {held}"
+
+
+def _whole(doing: Doing) -> Iterator[tuple[str, str]]:
+    """What is of now, and of no span."""
+    waiting = doing.standing.waiting
+    yield "labels waiting", f"{waiting.new_labels:,} new, a retrain is due at {waiting.retrain_every:,}"
+    yield "never reported", f"{waiting.verified:,} verified, {waiting.accepted:,} accepted"
+    if doing.watch is not None:
+        of = (("accepts", doing.watch.accepts), ("rejects", doing.watch.rejects), ("novelty", doing.watch.novelty))
+        yield "way to an alarm", ", ".join(f"{name} {100 * share:.0f} %" for name, share in of)
+
+
+def drawn(store: Store, recipe: Recipe, last: int, out: Path) -> Path:
+    """Draw the picture of a store into a file."""
+    from ..experiments.figures import save
+    from ..experiments.pictures import status_picture
+    from ..history.status import course
+
+    return save(status_picture(course(store, recipe, last), f"{store.cell_id}: {recipe.name}"), out)
+
+
+STEP = 0.05  # seconds between two looks for Ctrl-C
+
+
+def redraw(read: Callable[[], Sequence[Any]], seconds: float) -> None:
+    """Show what `read` gives, and again every so many seconds; Ctrl-C is how it ends, so that is no failure.
+
+    On a terminal the screen is drawn anew; elsewhere each look follows the one before.
+    """
+    with interruptible() as asked:
+        if not sys.stdout.isatty():
+            while not asked():
+                show(*read())
+                _wait(seconds, asked)
+            return
+        from rich.console import Group
+        from rich.live import Live
+
+        with Live(Group(*read()), console=console(), screen=True, auto_refresh=False) as live:
+            while not asked():
+                live.update(Group(*read()), refresh=True)
+                _wait(seconds, asked)
+    show(*read())  # the last look stays when the screen is given back
+
+
+def _wait(seconds: float, asked: Asked) -> None:
+    end = time.monotonic() + seconds
+    while not asked() and (left := end - time.monotonic()) > 0:
+        time.sleep(min(STEP, left))
+
+
+@click.command(epilog=example("dengine cells engine.db"))
+@click.argument("store", metavar="STORE")
+@json_option
+def cells(store: str, as_json: bool) -> None:
+    """List the cells of a store, and what each has done.
+
+    STORE is a file or URL, as given to `dengine train` or `dengine run`. Cells of one product share labels and versions;
+    a cell without a product shares nothing. Other verbs name one of them by --cell.
+    """
+    from ..store.base import must_be_there
+    from ..store.peers import list_cells, without_password
+
+    must_be_there(store)
+    found, name = list_cells(store), without_password(store)
+    if as_json:
+        write_json({"verb": "cells", "store": name, "cells": found})
+        return
+    show(_table(name, found))
+
+
+def _table(store: str, found: list[CellSummary]) -> Any:
+    from rich.table import Table
+
+    table = Table(title=store, title_justify="left")
+    for name in ("cell", "product"):
+        table.add_column(name, overflow="fold")
+    for name in ("decisions", "labels", "version"):
+        table.add_column(name, justify="right")
+    table.add_column("last seen (UTC)", no_wrap=True)
+    owned = any(cell.owner for cell in found)
+    if owned:
+        table.add_column("owner", overflow="fold")
+    for cell in found:
+        counts = (f"{cell.decisions:,}", f"{cell.labels:,}", "-" if cell.version is None else str(cell.version))
+        owner = [cell.owner or "-"] if owned else []
+        table.add_row(cell.cell_id, cell.product or "-", *counts, _when(cell.last_seen), *owner)
+    return table
+
+
+def _when(seconds: float | None) -> str:
+    return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
 
 RECENT = 200  # labels
 GUARANTEES = {
@@ -75,7 +264,7 @@ def _screen(store: str, last: int, out: Path | None) -> list[Any]:
 
 def _tables(store: str, held: Held) -> list[Any]:
     groups = (_settings_rows(held), _count_rows(held), _promise_rows(held), _retrain_rows(held.retrains), _event_rows(held))
-    return [doing_table(held.doing, store), _table("What it is", [row for rows in groups for row in rows])]
+    return [doing_table(held.doing, store), _table_of_status("What it is", [row for rows in groups for row in rows])]
 
 
 @dataclass(frozen=True)
@@ -127,8 +316,8 @@ def _read(store: str, last: int, out: Path | None) -> Held:
 
 def _held(store: Store, settings: dict[str, str], last: int) -> Held:
     from ..decision.certificate import certificate_of
+    from ..history.status import standing, watch
     from ..recipe import Recipe
-    from ..standing import standing, watch
 
     recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
     newest = _newest(store, counts["labels"])
@@ -148,8 +337,8 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
 
 def _newest(store: Store, labels: int) -> Evidence:
     """What became of the decisions with the newest labels, RECENT at most."""
+    from ..store.base import is_shared
     from ..store.records import Evidence
-    from ..store.shared import is_shared
 
     known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
     return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
@@ -179,7 +368,7 @@ def _share(some: int, of: int) -> float | None:
     return some / of if of else None
 
 
-def _table(store: str, rows: list[tuple[str, str]]) -> Any:
+def _table_of_status(store: str, rows: list[tuple[str, str]]) -> Any:
     from rich.table import Table
 
     table = Table(title=without_password(store), show_header=False, title_justify="left")
@@ -221,7 +410,7 @@ def _neighbours(recipe: Recipe) -> str:
 
 
 def _contract(settings: dict[str, str]) -> str:
-    from ..settings import trace_in
+    from ..engine.settings import trace_in
 
     spec = trace_in(settings)
     if spec is None:

@@ -15,15 +15,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import SettingError
-from .betting import log_evidence
+from .rule import log_evidence
 
 if TYPE_CHECKING:
-    from .policy import Policy
+    from .policy import Policy, Stops
 
-Stops = Literal["all", "some"]
 CONFIRMED_SHARE = 0.1  # of alpha, where audits and confirmations both speak: the former see less and need more
 RARE = 0.02  # the audit rate that is assumed where none is set
 ENDLESS = 10**8  # more audits than that are none

@@ -12,8 +12,8 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ..records import ACTIONS
-from .neighbors import Counts, RadiusIndex
 from .policy import Neighbourhood, Policy
+from .references import Counts, RadiusIndex
 from .rule import DecisionRule, RadiusNeighbours
 
 CAPACITY = 10_000

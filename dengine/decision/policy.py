@@ -5,27 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .._lazy import find_class
-from ..errors import SettingError
-from ..records import ACTIONS, Action
-from ..values import is_number
-from ..wording import shortened
-from .bounds import INTERVALS, Bounds, normal_quantile
-from .certificate import Stops
+from ..errors import SettingError, shortened
+from ..records import ACTIONS, Action, find_class, is_number
+from .intervals import INTERVALS, Bounds, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
 
+Stops = Literal["all", "some"]
 RULES = {  # by guarantee, and by what is known of stops
-    "local": {"some": "dengine.decision.rule:DecisionRule", "all": "dengine.decision.guarantee:WatchedRule"},
-    "pooled": dict.fromkeys(("some", "all"), "dengine.decision.guarantee:PooledRule"),
+    "local": {"some": "dengine.decision.rule:DecisionRule", "all": "dengine.decision.rule:WatchedRule"},
+    "pooled": dict.fromkeys(("some", "all"), "dengine.decision.rule:PooledRule"),
 }
-CURVE = "dengine.experiments.cost_curve"
+CURVE = "dengine.experiments.costs"
 
 
 @dataclass(frozen=True, slots=True)

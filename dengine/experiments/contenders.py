@@ -15,10 +15,10 @@ from pathlib import Path
 from pickle import PicklingError
 from typing import Any
 
-from ..engine import DataEngine
+from ..engine.engine import DataEngine
+from ..engine.settings import flat
 from ..errors import SettingError
 from ..recipe import PLAIN, RECIPES, Recipe, described
-from ..settings import flat
 from .rivals import RIVALS, make_rival
 
 TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table

@@ -1,4 +1,21 @@
-"""What replays cost: how long the rest will take, and what more cores would do.
+"""Which alpha and LB pay: what a part costs under each, in replays of the user's own recordings.
+
+    curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
+    print(curve.sentence)
+    curve.policy, curve.to_frame()
+
+Costs are in one unit of the user's, and a part's mean cost is check x verified + escape x accepted and bad + false_reject x
+rejected and good, over all parts of a replay, its beginning included, where everything is verified. Verifying everything
+costs `check` a part; it is always among the candidates.
+
+What the choice does to its own figures: the cheapest of many candidates is partly the luckiest. So it is chosen on one half
+of the shuffles, with half an error added to each count of them, and reported on the other. That takes the luck of the order
+out, and not that of the recordings: every shuffle plays the same parts. Their luck is what the interval is for, whose unit
+is a part and not a decision; it holds for a policy that was named before, and is a little too narrow for one that was
+picked among many. Nor does it know that other recordings may let more or less be decided. Parts that were recorded later,
+and played no role in the choice, are the only clean test; what choices were worth on such is among what was measured.
+
+What replays cost: how long the rest will take, and what more cores would do.
 
 forecast = Forecast(["conv", "umap", "conv", "umap"], workers=2)
 forecast.done("conv", 5.1)
@@ -9,8 +26,22 @@ makespan(costs, workers=1000)
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..decision.policy import Policy
+from ..errors import SettingError
+from .grid import Folder, OnDone, Task, grid_tasks, play_tasks
+from .metrics import Costs, ErrorRate, pooled_error
+from .replay import Replay
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class Forecast:
@@ -48,3 +79,231 @@ def makespan(costs: Iterable[float], workers: int) -> float:
     for cost in sorted(costs, reverse=True):
         heapq.heapreplace(busy_until, busy_until[0] + cost)
     return max(busy_until)
+
+
+ALPHAS = (0.5, 0.1, 0.05)
+LOWER_BOUNDS = (0.8, 0.9, 0.95, 0.98, 0.99)
+REPEATS = 10  # shuffles, half of them to choose by
+LEVEL = 0.05  # of the intervals
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyCost:
+    """What a part costs under one policy; all but `chosen_by` over the shuffles that report.
+
+    chosen_by : expected cost a part over the shuffles that choose: every share of wrong decisions with half an error added.
+    cost : mean cost a part.  sd : standard deviation of the shuffles' means; NaN of one.
+    lower, upper : the cost with both shares of wrong decisions at the ends of their intervals, together 95 %.
+    late : mean cost a part over the last third of each shuffle, once something was learned.
+    verified, accepted, rejected : shares of all parts.  bad : bad parts among the accepted.  good : good ones among the
+    rejected. Both with an interval that is honest of shuffles, see `rates.pooled_error`.
+    """
+
+    policy: Policy
+    chosen_by: float
+    cost: float
+    sd: float
+    lower: float
+    upper: float
+    late: float
+    verified: float
+    accepted: float
+    rejected: float
+    bad: ErrorRate
+    good: ErrorRate
+
+    @property
+    def certain(self) -> float:
+        """Share of the parts that were decided without a check."""
+        return self.accepted + self.rejected
+
+
+@dataclass(frozen=True, slots=True)
+class CostCurve:
+    """What a part costs under each policy that was tried, in recordings of `dataset`.
+
+    rows : by alpha, from the largest, then LB.  recipe : its name.  cycles : of each shuffle.
+    choosing, reporting : how many shuffles did what.
+    """
+
+    costs: Costs
+    rows: tuple[PolicyCost, ...]
+    dataset: str
+    recipe: str
+    cycles: int
+    choosing: int
+    reporting: int
+
+    @property
+    def baseline(self) -> float:
+        """A part's cost where everything is verified."""
+        return self.costs.check
+
+    @property
+    def cheapest(self) -> PolicyCost:
+        """The policy that was cheapest in the shuffles that choose, of those that decided anything; of equal ones the
+        strictest.
+        """
+        decided = [row for row in self.rows if row.certain] or self.rows
+        return min(decided, key=lambda row: (row.chosen_by, -row.policy.lower_bound, row.policy.alpha))
+
+    @property
+    def verdict(self) -> str:
+        """Of the cheapest policy: "pays", where its whole interval is below verifying everything; "may pay", where its
+        mean is; "does not pay".
+        """
+        row = self.cheapest
+        if max(row.chosen_by, row.cost) >= self.baseline:
+            return "does not pay"
+        return "pays" if row.upper < self.baseline else "may pay"
+
+    @property
+    def policy(self) -> Policy | None:
+        """The policy that pays, or may; None where none does: verify everything."""
+        return None if self.verdict == "does not pay" else self.cheapest.policy
+
+    @property
+    def sentence(self) -> str:
+        """The result, for people."""
+        row, every = self.cheapest, f"verifying everything costs {self.baseline:g} a part"
+        who = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
+        between = f"with the errors at the ends of their 95 % intervals {row.lower:.3g} to {row.upper:.3g}"
+        if not any(each.certain for each in self.rows):
+            return f"Nothing pays yet: {every}, and under each policy that was tried everything was verified. Record more."
+        if self.policy is None:
+            seen = f"is expected to cost {row.chosen_by:.3g} and cost {row.cost:.3g} in other shuffles, {between}"
+            return f"Nothing pays: {every}; the cheapest policy, {who}, {seen}. Go on verifying, or record more."
+        may = MAY.format(bad=_percent(row.bad.upper), worst=_percent(self.costs.worst_accept))
+        return f"{who} {self.verdict}: {row.cost:.3g} a part, {between}; {every}.{may if self.verdict == 'may pay' else ''}"
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row a policy; shares from 0 to 1, costs in the user's unit."""
+        import pandas as pd
+
+        return pd.DataFrame([_record(row) | {"chosen": row.policy == self.policy} for row in self.rows])
+
+
+MAY = (
+    " Not certainly: of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}. More recordings "
+    "narrow that; in production audits and stops do."
+)
+PLAIN = ("chosen_by", "cost", "sd", "lower", "upper", "late", "verified", "accepted", "rejected")
+
+
+def _record(row: PolicyCost) -> dict[str, Any]:
+    told = {"alpha": row.policy.alpha, "lower_bound": row.policy.lower_bound}
+    wrong = {
+        f"{side}_{each.name}": getattr(rate, each.name)
+        for side, rate in (("bad", row.bad), ("good", row.good))
+        for each in fields(rate)
+    }
+    return told | {name: getattr(row, name) for name in PLAIN} | wrong
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def cost_curve(
+    dataset: Any,
+    *,
+    check: float,
+    escape: float,
+    false_reject: float,
+    recipe: Any = "conv",
+    alphas: Sequence[float] = ALPHAS,
+    lower_bounds: Sequence[float] = LOWER_BOUNDS,
+    repeats: int = REPEATS,
+    seed: int = 0,
+    cycles: int | None = None,
+    n_jobs: int = 1,
+    keep: Folder | None = None,
+    on_done: OnDone = None,
+) -> CostCurve:
+    """Replay recordings under every alpha and lower bound, and say what a part cost.
+
+    dataset : anything `load_dataset` takes, such as a folder of recordings.
+    check, escape, false_reject : as in `Costs`, in one unit.
+    recipe : anything `Recipe.load` takes; of its policy alpha and lower_bound are replaced, the rest is kept.
+    repeats : shuffles of each policy, 2 or more: the first half of them chooses, the other reports.  seed : of the first.
+    cycles : parts of each shuffle; None: all.  n_jobs, keep, on_done : as in `run_grid`.
+    SettingError for a cost, a policy or a number of repeats that is none.
+    """
+    costs = Costs(check, escape, false_reject)
+    tasks = cost_tasks(recipe, alphas, lower_bounds, range(seed, seed + repeats), cycles)
+    return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done), costs)
+
+
+def cost_tasks(
+    recipe: Any, alphas: Sequence[float], lower_bounds: Sequence[float], seeds: range, cycles: int | None = None
+) -> list[Task]:
+    """The replays that a curve is made of. SettingError where they would be too few, before one is played."""
+    if len(seeds) < 2:
+        raise SettingError(f"Expected 2 or more repeats, got {len(seeds)}: one half chooses, the other one reports.")
+    return grid_tasks([recipe], alphas, lower_bounds, seeds=seeds, cycles=cycles)
+
+
+def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
+    """The curve of finished replays, of one recipe; those of shuffles that not every policy has played are left out.
+
+    SettingError where fewer than two shuffles are complete.
+    """
+    policies = list(dict.fromkeys(each.recipe.policy for each in replays))
+    of = {(each.recipe.policy, each.seed): each for each in replays}
+    seeds = [seed for seed in sorted({each.seed for each in replays}) if all((one, seed) in of for one in policies)]
+    if len(seeds) < 2:
+        raise SettingError(f"Expected 2 or more shuffles that every policy has played, got {len(seeds)}.")
+    half = len(seeds) // 2
+    rows = [
+        _row(policy, [of[policy, seed] for seed in seeds[:half]], [of[policy, seed] for seed in seeds[half:]], costs)
+        for policy in sorted(policies, key=lambda each: (-each.alpha, each.lower_bound))
+    ]
+    one = replays[0]
+    return CostCurve(costs, tuple(rows), one.dataset, one.name, len(one), half, len(seeds) - half)
+
+
+def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs) -> PolicyCost:
+    means = [cost_a_part(each, costs) for each in reporting]
+    shares = {
+        name: float(np.mean([getattr(each, name) for each in reporting])) for name in ("verified", "accepted", "rejected")
+    }
+    # Each at half the level: together they hold at LEVEL.
+    bad, good = (pooled_error(reporting, side, LEVEL / 2) for side in ("accepted", "rejected"))
+    ends = {
+        end: costs.check * shares["verified"]
+        + costs.escape * shares["accepted"] * getattr(bad, end)
+        + costs.false_reject * shares["rejected"] * getattr(good, end)
+        for end in ("lower", "upper")
+    }
+    return PolicyCost(
+        policy=policy,
+        chosen_by=_expected(choosing, costs),
+        cost=float(np.mean(means)),
+        sd=float(np.std(means, ddof=1)) if len(means) > 1 else math.nan,
+        late=float(np.mean([cost_a_part(each, costs, slice(2 * len(each) // 3, None)) for each in reporting])),
+        bad=bad,
+        good=good,
+        **shares,
+        **ends,
+    )
+
+
+def _expected(replays: Sequence[Replay], costs: Costs) -> float:
+    """Cost a part with each share of wrong decisions at its Jeffreys mean, (wrong + 1/2) / (decided + 1) in one shuffle.
+
+    No error among 25 accepted parts is not no error ever: by the plain mean the few would look free, whatever one costs.
+    """
+    names = ("accepted", "false_positive", "rejected", "false_negative")
+    counts = [each.stretch(slice(None)) for each in replays]
+    accepted, bad, rejected, good = (float(np.mean([each[name] for each in counts])) for name in names)
+    wrong = (accepted * (bad + 0.5) / (accepted + 1.0), rejected * (good + 0.5) / (rejected + 1.0))
+    return costs.check - costs.saved(accepted + rejected, *wrong) / len(replays[0])
+
+
+def cost_a_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
+    """Mean cost a part over some cycles of a replay."""
+    counts = replay.stretch(part)
+    certain = counts["accepted"] + counts["rejected"]
+    n = counts["verified"] + certain
+    saved = costs.saved(certain, counts["false_positive"], counts["false_negative"])
+    return float(costs.check - saved / n)

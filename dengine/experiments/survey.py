@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, own_hash
-from ..model.repeats import NEWEST, near_repeats
+from ..model.neighbours import NEWEST, near_repeats
 from ..traces import as_traces
 
 TENTHS = 10

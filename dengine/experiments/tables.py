@@ -15,9 +15,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..outputs import table_of, write_output
+from ..files import table_of, write_output
 from ..records import RetrainReport
-from .rates import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
+from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
 from .replay import Replay
 
 if TYPE_CHECKING:

@@ -27,17 +27,26 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from ..decision.neighbors import FARTHEST
+from ..decision.references import FARTHEST
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
+from ..files import ONNX
 from ..model.base import Exportable
-from ..model.module import NOVEL
-from ..outputs import ONNX
+from ..model.compiled import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
-from .file import METADATA, check_target, checked_bytes, checked_schema, decision_module, describe, source_of, write_export
-from .module import FIELDS
-from .signing import KeyFile
+from .bundle import (
+    METADATA,
+    KeyFile,
+    check_target,
+    checked_bytes,
+    checked_schema,
+    decision_module,
+    describe,
+    source_of,
+    write_export,
+)
+from .decision import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision, golden_trace
 
 NEEDED = ("onnx", "onnxruntime", "onnxscript")

@@ -5,6 +5,13 @@
 
 An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files. Load only what you
 made, or what was signed with a key of yours.
+
+The C and C++ sources that run an exported file: a library with a C interface, and a program.
+
+    dengine export-cpp --out cell_cpp
+    cmake -S cell_cpp -B build/cpp -DCMAKE_PREFIX_PATH="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
+
+They depend on no model, so they come by a verb of their own and not with each export.
 """
 
 from __future__ import annotations
@@ -13,6 +20,7 @@ import copy
 import io
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,17 +29,45 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from ..deciding import as_part
+from .. import __version__
 from ..decision.rule import SAFE_MODE, script
+from ..engine.decide import as_part
 from ..errors import ExportError
+from ..files import TORCHSCRIPT
 from ..folds import part_hash
-from ..labels import as_success
-from ..outputs import TORCHSCRIPT
-from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
+from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
 from ..traces import as_trace, as_traces
-from .file import METADATA, check_target, checked_bytes, decision_module, describe, metadata_of, source_of, write_export
-from .module import METHODS
-from .signing import KeyFile
+from .bundle import (
+    METADATA,
+    KeyFile,
+    check_target,
+    checked_bytes,
+    decision_module,
+    describe,
+    metadata_of,
+    source_of,
+    write_export,
+)
+from .decision import METHODS
+
+SOURCES = Path(__file__).parent / "cpp"
+
+
+def export_sources(folder: str | os.PathLike[str]) -> Path:
+    """Write the sources into a new or an empty folder, and return it.
+
+    ExportError where the folder holds anything, or cannot be written.
+    """
+    target = Path(folder)
+    try:
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            raise ExportError(f"Expected a new or an empty folder for the sources, {target} holds something; name another.")
+        shutil.copytree(SOURCES, target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+        (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
+    except OSError as error:
+        raise ExportError(f"Cannot write {target}: {error}; choose a folder that is writable.") from error
+    return target
+
 
 WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order

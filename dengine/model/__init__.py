@@ -1,32 +1,5 @@
 """What the engine drives: the contracts, our own prediction by reducer and radius neighbours, and a rival's adapter."""
 
-from __future__ import annotations
+import lazy_loader
 
-from typing import TYPE_CHECKING
-
-from .._lazy import lazy_names
-
-if TYPE_CHECKING:
-    from .base import EngineModel, Model, Prediction
-    from .prediction import ModelPrediction
-    from .rival import RivalAdapter
-
-_WHERE = {
-    "base": (
-        "EngineModel",
-        "Model",
-        "Prediction",
-    ),
-    "prediction": ("ModelPrediction",),
-    "rival": ("RivalAdapter",),
-}
-
-__all__ = [
-    "EngineModel",
-    "Model",
-    "ModelPrediction",
-    "Prediction",
-    "RivalAdapter",
-]
-
-__getattr__, __dir__ = lazy_names(__name__, _WHERE)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

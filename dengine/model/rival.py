@@ -8,10 +8,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import SettingError
+from ..errors import SettingError, shortened
 from ..records import Action, Reason
 from ..reducers.base import Floats, Ints, StopRule
-from ..wording import shortened
 from .base import EngineModel, Model, Prediction, checked
 
 

@@ -7,13 +7,12 @@ from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING, Any
 
+import lazy_loader
 import numpy as np
 
-from .._lazy import find_class, lazy_names
-from ..errors import SettingError
+from ..errors import SettingError, shortened
 from ..recipe import Recipe
-from ..values import is_number, is_whole
-from ..wording import shortened
+from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
     from .base import Reducer
@@ -25,13 +24,13 @@ if TYPE_CHECKING:
     from .umap import UmapReducer
 
 _WHERE = {
-    "base": ("Reducer",),
-    "conv": ("ConvReducer",),
-    "cross_fitting": ("CrossFitted",),
-    "pca": ("PcaReducer",),
-    "plane": ("PlaneReducer",),
-    "rocket": ("RocketReducer",),
-    "umap": ("UmapReducer",),
+    "base": ["Reducer"],
+    "conv": ["ConvReducer"],
+    "cross_fitting": ["CrossFitted"],
+    "pca": ["PcaReducer"],
+    "plane": ["PlaneReducer"],
+    "rocket": ["RocketReducer"],
+    "umap": ["UmapReducer"],
 }
 _CLASSES = {
     "conv": "dengine.reducers.conv:ConvReducer",
@@ -107,4 +106,4 @@ def reducer_of(recipe: Recipe, seed: int) -> Any:
 
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _CLASSES}
 
-__getattr__, __dir__ = lazy_names(__name__, _WHERE)
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs=_WHERE)

@@ -1,6 +1,6 @@
 """What a reducer is: trace -> embedding, and everything that the model asks of one.
 
-A reducer of one's own is a subclass with `fit` and `transform`; the rest has defaults. `dengine.checks.check_reducer` runs
+A reducer of one's own is a subclass with `fit` and `transform`; the rest has defaults. `dengine.testing.check_reducer` runs
 the contract on it. Any scikit-learn transformer works as well, wrapped by `cross_fitting.as_reducer`.
 
 Embeddings have K spaces: a label may be counted for a query only in a space that never saw that label, so fold k's

@@ -30,10 +30,9 @@ from torch import Tensor
 from ..errors import SettingError
 from .base import Floats, Ints, StopRule, seed_of
 from .encoder import ConvEncoder, averaging, start_from
-from .features import ConvFeatures, Features
-from .kept_features import KeptFeatures, keys_of
+from .features import ConvFeatures, Features, KeptFeatures, keys_of
 from .scored import FeatureReducer, in_chunks
-from .vicreg import AUGMENTATIONS, EncoderTraining
+from .training import AUGMENTATIONS, EncoderTraining
 
 MOST_REGIONS = 16
 AT_ONCE = 60_000  # places of traces that a retrain looks at anew, so that it ends in time however many references there are

@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..archives import read_archive
 from ..errors import SettingError
+from ..files import read_archive
 from .features import CLIP, Carry, Features
 
 TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s

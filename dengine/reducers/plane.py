@@ -26,9 +26,8 @@ from torch import Tensor, nn
 from ..errors import SettingError
 from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
 from .encoder import ConvEncoder, averaging
-from .features import Carry
+from .features import Carry, KeptFeatures
 from .fuzzy_graph import cross_entropy, fuzzy_graph
-from .kept_features import KeptFeatures
 from .scored import in_chunks
 
 SIZES = (28, 5, 3, 64)  # kernels, dilations, regions and width of the encoder, as in `ConvReducer`

@@ -17,10 +17,8 @@ from torch import Tensor, nn
 from ..errors import SettingError
 from ..folds import content_fold
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, own_places, seed_of
-from .embedding import FeatureEmbedding
-from .features import Features
-from .kept_features import KeptFeatures
-from .logistic import CrossFittedScores
+from .features import Features, KeptFeatures
+from .heads import CrossFittedScores, FeatureEmbedding
 
 MIN_TRACES = 20  # that an engine's first model is trained on
 FIRST_STEPS = 3  # of the heads, however late: without any, a first model would hold all parts for alike

@@ -15,7 +15,7 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from .problems import PROBLEM, problem
+from .api import PROBLEM, problem
 
 HEAD_SECONDS = 10.0  # from a connection, or from the first byte after an answer, to the end of the request's head
 FULL = "Expected fewer connections at once (dengine serve --connections); verify the part, and try again."

@@ -3,32 +3,39 @@
     curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' -H 'Content-Type: application/json' localhost:8000/decide
 
 What each answers is in `openapi`, which the tests hold to these routes.
+
+The web application in front of one engine: the interfaces' routes behind one guard.
+
+    app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db"))
+
+Each interface is a module of this package that gives its routes; `INTERFACES` names them.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from typing import Any
 
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from .. import __version__
-from ..documents import plain
-from ..errors import ReportError, TraceError
-from ..labels import as_success
-from ..records import Action, Decision
+from ..errors import ReportError, SettingError, TraceError, shortened
+from ..records import Action, Decision, as_success, plain
 from ..store.base import Store
 from ..store.records import StoredDecision
 from ..store.views import HistoryFilter, PastDecision
-from .bodies import report_request, trace_request
+from . import http, page, xmlrpc
+from .api import HANDLERS, MOST_OPEN, OPEN, Refusal, as_page, document, report_request, trace_request
+from .auth import Access, Guard
 from .metrics import Metrics
-from .openapi import as_page, document
-from .problems import Refusal
-from .schemas import MOST_OPEN, OPEN
+from .robot_calls import Recorder
 from .service import Answer, CellService
 
 HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
@@ -221,3 +228,47 @@ def _limit(request: Request) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) < 5 and 1 <= int(text) <= MOST_OPEN):
         raise Refusal(422, f"Expected limit to be a whole number from 1 to {MOST_OPEN}.")
     return int(text)
+
+
+INTERFACES: Mapping[str, Callable[[CellService, Recorder | None], Sequence[BaseRoute]]] = {
+    "http": lambda service, recorder: http.routes(service),
+    "xmlrpc": xmlrpc.routes,
+    "page": lambda service, recorder: page.routes(service),
+}
+Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
+
+
+def create_app(
+    service: CellService,
+    access: Access | None = None,
+    interfaces: Sequence[str] = tuple(INTERFACES),
+    beside: Sequence[Beside] = (),
+    recorder: Recorder | None = None,
+) -> Starlette:
+    """The application; whoever made the service closes it, once the application has ended.
+
+    access : who may ask, and how much; None: whoever is on this machine.
+    interfaces : those that answer, of `INTERFACES`; their routes are tried in this order.
+    beside : what runs in the same loop as long as the application does, an OPC UA server for one.
+    recorder : of what a robot's program asks to decide on by `decide_recorded`; whoever made it closes it.
+    SettingError for an interface that there is not.
+    """
+    if unknown := [name for name in interfaces if name not in INTERFACES]:
+        raise SettingError(f"Expected interfaces among {', '.join(INTERFACES)}, got {shortened(unknown[0])}.")
+    routes = [route for name in interfaces for route in INTERFACES[name](service, recorder)]
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        async with AsyncExitStack() as stack:
+            try:
+                for begin in beside:
+                    await stack.enter_async_context(begin(service))
+            except Exception as error:
+                app.state.failure = error  # uvicorn says only that it did not start
+                raise
+            yield
+
+    guard = Middleware(Guard, access=access or Access())
+    app = Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app.router.redirect_slashes = False  # a robot does not follow; and where to, a request's Host would say
+    return app

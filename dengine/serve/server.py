@@ -1,35 +1,80 @@
-"""One process in front of one cell: the port, TLS, the engine, the signals, and how it all ends in order."""
+"""One process in front of one cell: the port, TLS, the engine, the signals, and how it all ends in order.
+
+Log lines that a machine reads as well: time, level, logger, and the message as JSON has a text.
+
+    2026-11-22T18:51:05.120Z level=warning logger=dengine message="labels wait in the journal beside the store: ..."
+
+Nothing in a message ends its line, and no password is in it.
+"""
 
 from __future__ import annotations
 
 import gc
+import json
 import logging
 import signal
 import socket
 import ssl
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import uvicorn
 
-from ..engine import DataEngine
-from ..errors import SettingError
+from ..engine.engine import DataEngine
+from ..errors import SettingError, without_password
 from ..records import RetrainReport
-from .access import Access, in_url, is_loopback, read_token
-from .app import INTERFACES, Beside, create_app
-from .calls import Recorder
+from .auth import Access, in_url, is_loopback, read_token
 from .connections import limited
-from .logs import log_lines_to
+from .http import INTERFACES, Beside, create_app
 from .retraining import retraining_process
+from .robot_calls import Recorder
 from .service import DEADLINE, Answer, CellService, Told
+
+
+class Lines(logging.Formatter):
+    """A record as one line."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Time, level, logger, message; and what was raised."""
+        time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        line = f"{time} level={record.levelname.lower()} logger={record.name} message={_said(record.getMessage())}"
+        raised = f" raised={_said(self.formatException(record.exc_info))}" if record.exc_info else ""
+        return line + raised
+
+
+def _said(text: str) -> str:
+    return json.dumps(without_password(text))
+
+
+@contextmanager
+def log_lines_to(stream: TextIO) -> Iterator[None]:
+    """Have every logger write such lines; uvicorn none, for what it refuses is answered, and what fails is told here."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(Lines())
+    root, ours, theirs = (logging.getLogger(name) for name in ("", "dengine", "uvicorn"))
+    handlers, levels = root.handlers[:], [logger.level for logger in (root, ours, theirs)]
+    root.handlers[:] = [handler]
+    _set_levels((root, ours, theirs), (logging.WARNING, logging.INFO, logging.CRITICAL))
+    try:
+        yield
+    finally:
+        root.handlers[:] = handlers
+        _set_levels((root, ours, theirs), levels)
+
+
+def _set_levels(loggers: Iterable[logging.Logger], levels: Iterable[int]) -> None:
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
+
 
 log = logging.getLogger("dengine")
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time

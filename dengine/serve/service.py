@@ -7,6 +7,8 @@
 
 Each interface (HTTP, XML-RPC, OPC UA, the page) turns its own words into these calls, and answers into its own words. What
 only reads does so by a second connection to the store (`read`, `look`), so that no decision waits for it.
+
+Work for the engine's thread, and whether anybody waits for it.
 """
 
 from __future__ import annotations
@@ -22,25 +24,60 @@ from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from numpy.typing import ArrayLike
 
-from ..engine import DataEngine
+from ..engine.engine import DataEngine
 from ..errors import BusyError
-from ..labels import as_id, as_success
-from ..records import Decision, Reason, RetrainReport
+from ..records import Decision, Reason, RetrainReport, as_id, as_success
 from ..store.base import Store, open_store
 from ..store.records import StoredDecision
-from .jobs import CLOSING, Job
+
+T = TypeVar("T")
+CLOSING = "The server is closing: verify the part, and ask again when it is back."
+
+
+class Job(Generic[T]):
+    """Work for the engine's thread. late : nobody waits for its answer any more, and it has not begun."""
+
+    def __init__(self, work: Callable[[DataEngine, bool], T]) -> None:
+        self.future: Future[T] = Future()
+        self._work = work
+        self._lock = threading.Lock()
+        self._begun = self._late = False
+
+    def give_up(self) -> bool:
+        """Wait no more; False where it has begun, and will be there at once."""
+        with self._lock:
+            self._late = self._late or not self._begun
+            return self._late
+
+    def run(self, engine: DataEngine) -> None:
+        """Do it, in the engine's thread; also where whoever asked has gone meanwhile."""
+        with self._lock:
+            self._begun = True
+            wanted = self.future.set_running_or_notify_cancel()
+        try:
+            result = self._work(engine, self._late or not wanted)
+        except BaseException as error:  # whoever asked is told
+            if wanted:
+                self.future.set_exception(error)
+            return
+        if wanted:
+            self.future.set_result(result)
+
+    def refuse(self) -> None:
+        """Do it no more: the engine is closed."""
+        if self.future.set_running_or_notify_cancel():
+            self.future.set_exception(BusyError(CLOSING))
+
 
 log = logging.getLogger("dengine")
 DEADLINE = 0.5  # seconds in line, after which who asked verifies
 MOST = 32  # requests in line
 SOON = 0.002  # seconds after an answer, in which a report or another part often comes
 IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)

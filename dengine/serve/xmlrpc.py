@@ -21,9 +21,9 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
 from ..errors import DengineError, ReportError
-from .access import RPC
-from .bodies import media_type, read_body
-from .calls import PATIENCE, Recorder, RobotCalls
+from .api import media_type, read_body
+from .auth import RPC
+from .robot_calls import PATIENCE, Recorder, RobotCalls
 from .service import CellService
 
 log = logging.getLogger("dengine")

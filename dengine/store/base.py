@@ -1,4 +1,6 @@
-"""Where an engine remembers: the `Store` protocol, and `open_store`, which opens what a user names.
+"""The contract of a store whose cell shares what it learns with the other cells of its product.
+
+Where an engine remembers: the `Store` protocol, and `open_store`, which opens what a user names.
 
     store = open_store("engine.db")      # SqlStore; `open_store(None)` is a MemoryStore, which forgets
 
@@ -11,16 +13,15 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
-from .fleet import CellAddress
-from .kept_versions import StoredVersion
 from .memory import MemoryStore
+from .peers import CellAddress, News
 from .records import (
     AddedPoints,
     Change,
@@ -32,6 +33,7 @@ from .records import (
     NewLabel,
     Outcomes,
     StoredDecision,
+    StoredVersion,
 )
 from .views import StoreViews
 
@@ -207,8 +209,8 @@ def open_store(
     if isinstance(store, str | os.PathLike):
         if must_exist:
             must_be_there(store)
+        from .peers import must_have_cell
         from .sql import SqlStore  # SQLAlchemy is imported where it is used
-        from .sql_fleet import must_have_cell
 
         cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
         if must_exist:
@@ -240,3 +242,27 @@ def opening(
         if opened is not store:
             opened.close()
         raise
+
+
+class SharedStore(Store, Protocol):
+    """A `Store` of a cell that has a product.
+
+    Labels as traces to train on, and versions, are then those of all the product's cells: `labelled`, `last_version`,
+    `retrains`, and the numbers that `put_labels` and `put_version` give. What became of decisions stays the cell's own.
+    """
+
+    product: str | None
+
+    def news_since(self, seq: int, limit: int) -> News:
+        """Return labels of the product after `seq`, at most `limit`, and the number of its newest version."""
+
+    def own_labelled(self) -> Labelled:
+        """Return this cell's own labelled traces, all of them, oldest first."""
+
+    def sisters_settings(self) -> dict[str, dict[str, str]]:
+        """Return the settings of the product's other cells, by cell."""
+
+
+def is_shared(store: Store) -> TypeGuard[SharedStore]:
+    """Whether a store's cell has a product."""
+    return getattr(store, "product", None) is not None

@@ -23,8 +23,8 @@ import numpy as np
 import sqlalchemy as sa
 
 from ..errors import SettingError, StoreError
-from .sql_snapshot import CHUNK, TABLES, chosen_cells, snapshot
-from .sql_tables import DECISION, LABEL, TRACE, VERSION
+from .schema import DECISION, LABEL, TRACE, VERSION
+from .verification import CHUNK, TABLES, chosen_cells, snapshot
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -20,15 +20,21 @@ from typing import Any
 import numpy as np
 
 from dengine import Action, DataEngine, export_torchscript, load_exported
+from dengine.datasets.importing import import_journal, import_labelled
 from dengine.errors import DengineError
-from dengine.importing import import_journal, import_labelled
 
 from .harness import PROBE, RECIPE, Outcome, Place, missing, stream
 
 # The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
 HERE = str(Path(__file__).resolve().parents[1])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (HERE, os.environ.get("PYTHONPATH"))))
-LOADED = ("faults.kills", "dengine.store.sql", "dengine.importing", "dengine.export.torchscript", "dengine.reducers.pca")
+LOADED = (
+    "faults.kills",
+    "dengine.store.sql",
+    "dengine.datasets.importing",
+    "dengine.export.torchscript",
+    "dengine.reducers.pca",
+)
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload([*LOADED, "sklearn.decomposition", "pandas"])
 IN_ONE = 20  # kills of one store, so that opening it takes no longer than the kill

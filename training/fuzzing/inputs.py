@@ -12,9 +12,9 @@ import numpy as np
 from click.testing import CliRunner
 
 from dengine import Action, DataEngine, DengineError, Recipe, TraceSpec, load_dataset, open_store
-from dengine.checks import toy_traces
 from dengine.cli import main as command_line
-from dengine.importing import import_journal, import_labelled
+from dengine.datasets.importing import import_journal, import_labelled
+from dengine.testing import toy_traces
 
 from .oddities import ODD, SAMPLES, TOML, WORDS, odd_trace, spoilt
 

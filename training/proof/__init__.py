@@ -1,1 +1,1 @@
-"""What `training/prove.py` measures, a part a module; `tests/statistical` runs the same functions, small."""
+"""What `training/prove.py` measures, a part a module; `tests/slow/statistical` runs the same functions, small."""

@@ -1,12 +1,130 @@
-"""One cycle's draw: the physical conditions under which one part is inserted."""
+"""What changes while the simulated cell runs: a scenario turns a cycle's number into that cycle's parameters.
+
+What varies from one simulated insertion to the next, each quantity with its unit.
+
+One cycle's draw: the physical conditions under which one part is inserted.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from .parameters import CellParameters, Range
+from ...errors import SettingError
+
+Range = tuple[float, float]  # (low, high) of a uniform draw
+
+SAMPLES = 1000
+RATE_HZ = 500.0
+CHANNELS = {"z": 1, "all": 6}  # z-force alone, or force x, y, z in newtons and torque x, y, z in newton metres
+
+
+@dataclass(frozen=True, slots=True)
+class CellParameters:
+    """Every setting of the simulated cell. A `Range` is drawn uniformly each cycle, a `_sd` normally around zero.
+
+    **Times of the line** (seconds)
+    cycle_s, verify_s, stop_s : one pick and insertion; one height check; one system stop, operator included.
+    **What the cell notices** (probabilities)
+    silent_share : a failed part that was passed on and does not stop the system.
+    confirm_share : a good part that was passed on and is confirmed as good later in the line.
+    **Height check** (millimetres)
+    height_tolerance_mm : a part whose top is this close to its nominal height is a success.
+    **Grasp**
+    offset_sd_mm, tilt_sd_deg, yaw_sd_deg : where the part sits in the gripper, laterally and in rotation.
+    protrusion_sd_mm : how far it sticks out, about the nominal.
+    grip_n : pull at which the part slips in the gripper; weak_grip_n : the same, for a poor grasp.
+    **Part and fixture**
+    part_mass_kg, length_sd_mm : of a right part.
+    clearance_mm : hole width less part width. chamfer_mm : width of the hole's 45 degree chamfer.
+    friction : Coulomb coefficient between part and fixture.
+    extra_length_mm, extra_width_mm : how a wrong part differs, before the sign is drawn.
+    debris_mm : thickness of what lies on the fixture's floor.
+    **Robot**
+    gap_mm : from part to rim when the recording starts. delay_s : from then until the robot moves.
+    speed_mm_s, force_limit_n, overtravel_mm : of the push; overtravel is how far below the seat it aims.
+    lateral_n_mm, axial_n_mm, angular_nm_rad : springs of the wrist.
+    **Faults** (probability that a cycle is drawn with this fault; what comes of it is up to the physics)
+    missed_grasp, weak_grip, debris, wrong_part.
+    **Sensor**
+    noise_n, ripple_n, ripple_hz : white noise and gear ripple. bias_n, drift_n : offset, and its change over a trace.
+    step_n : quantisation. dropped_share : samples lost, the last one is held. bandwidth_hz : low-pass filter.
+    torque_scale_m : torque channels carry the same faults, scaled by this lever.
+    bias_offset_n : a constant on top of every bias; zero but in the `bias_jump` scenario.
+    """
+
+    cycle_s: float = 47.0
+    verify_s: float = 5.0
+    stop_s: float = 120.0
+
+    silent_share: float = 0.1
+    confirm_share: float = 0.0
+
+    height_tolerance_mm: float = 0.5
+
+    offset_sd_mm: float = 0.92
+    tilt_sd_deg: float = 1.2
+    yaw_sd_deg: float = 0.6
+    protrusion_sd_mm: float = 0.45
+    grip_n: Range = (70.0, 160.0)
+    weak_grip_n: Range = (6.0, 30.0)
+
+    part_mass_kg: Range = (0.08, 0.30)
+    length_sd_mm: float = 0.08
+    clearance_mm: Range = (0.10, 0.45)
+    chamfer_mm: Range = (0.8, 2.0)
+    friction: Range = (0.10, 0.38)
+    extra_length_mm: Range = (0.5, 6.0)
+    extra_width_mm: Range = (0.2, 1.2)
+    debris_mm: Range = (0.2, 8.0)
+
+    gap_mm: Range = (3.5, 5.5)
+    delay_s: Range = (0.0, 0.10)
+    speed_mm_s: Range = (12.7, 14.3)
+    force_limit_n: Range = (25.0, 65.0)
+    overtravel_mm: Range = (1.1, 2.9)
+    lateral_n_mm: Range = (2.0, 8.0)
+    axial_n_mm: Range = (12.0, 30.0)
+    angular_nm_rad: Range = (5.0, 25.0)
+
+    missed_grasp: float = 0.03
+    weak_grip: float = 0.07
+    debris: float = 0.045
+    wrong_part: float = 0.025
+
+    noise_n: Range = (0.15, 0.60)
+    ripple_n: Range = (0.0, 0.5)
+    ripple_hz: Range = (8.0, 40.0)
+    bias_n: Range = (-2.0, 2.0)
+    drift_n: Range = (-1.0, 1.0)
+    step_n: Range = (0.02, 0.15)
+    dropped_share: Range = (0.0, 0.02)
+    bandwidth_hz: float = 90.0
+    torque_scale_m: float = 0.03
+    bias_offset_n: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            _check(field.name, getattr(self, field.name))
+        if (faults := self.missed_grasp + self.weak_grip + self.debris + self.wrong_part) > 1:
+            raise SettingError(f"Expected fault probabilities that sum to at most 1, got {faults:g}; lower one.")
+
+
+_PROBABILITIES = {"silent_share", "confirm_share", "missed_grasp", "weak_grip", "debris", "wrong_part"}
+_SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
+
+
+def _check(name: str, value: float | Range) -> None:
+    low, high = value if isinstance(value, tuple) else (value, value)
+    if not low <= high:
+        raise SettingError(f"Expected {name} as (low, high) with low <= high, got {value}; swap them.")
+    if name in _PROBABILITIES and not 0 <= low <= 1:
+        raise SettingError(f"Expected {name} as a probability from 0 to 1, got {value}; give a share of 1.")
+    if name not in _SIGNED and low < 0:
+        raise SettingError(f"Expected {name} to be at least 0, got {value}; the unit is in its name.")
+
 
 FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
 
@@ -97,3 +215,57 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     }
     shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
     return faults[str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))]
+
+
+# (parameters, cycle, cycles) -> the parameters of that cycle
+Scenario = Callable[[CellParameters, int, int], CellParameters]
+
+WEAR_FRICTION = 0.35  # added to the friction by the last cycle
+VARIANT_MASS_FACTOR, VARIANT_CLEARANCE_MM, VARIANT_CHAMFER_MM = 2.5, (0.04, 0.16), (0.5, 1.0)
+JUMP_N = 8.0
+
+
+def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
+    """Nothing changes."""
+    return parameters
+
+
+def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
+    """The tool wears: friction grows in proportion to the cycles done."""
+    low, high = parameters.friction
+    grown = WEAR_FRICTION * min(1.0, cycle / max(1, cycles - 1))
+    return replace(parameters, friction=(low + grown, high + grown))
+
+
+def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
+    """Half way a new part variant comes: heavier, a tighter fit, a smaller chamfer."""
+    if cycle < cycles // 2:
+        return parameters
+    low, high = parameters.part_mass_kg
+    return replace(
+        parameters,
+        part_mass_kg=(low * VARIANT_MASS_FACTOR, high * VARIANT_MASS_FACTOR),
+        clearance_mm=VARIANT_CLEARANCE_MM,
+        chamfer_mm=VARIANT_CHAMFER_MM,
+    )
+
+
+def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
+    """Half way the force sensor's offset jumps and stays; the world is as it was."""
+    return parameters if cycle < cycles // 2 else replace(parameters, bias_offset_n=parameters.bias_offset_n + JUMP_N)
+
+
+SCENARIOS: dict[str, Scenario] = {"nominal": nominal, "wear": wear, "variant": variant, "bias_jump": bias_jump}
+
+
+def find_scenario(name: str) -> Scenario:
+    """The scenario of this name."""
+    if name not in SCENARIOS:
+        raise SettingError(f"Expected a scenario of {', '.join(SCENARIOS)}; got {name!r}; choose one of these.")
+    return SCENARIOS[name]
+
+
+def first_change(name: str, cycles: int) -> int | None:
+    """The number, from 1, of the first cycle that is not as at the beginning; None where nothing changes."""
+    as_usual, change = CellParameters(), find_scenario(name)
+    return next((i + 1 for i in range(cycles) if change(as_usual, i, cycles) != as_usual), None)

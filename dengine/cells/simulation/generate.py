@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import SettingError
-from ...outputs import TRACES, write_output
-from .insertion import Insertion, insert_once
-from .parameters import CHANNELS, RATE_HZ, CellParameters
-from .scenarios import find_scenario
+from ...files import TRACES, write_output
+from .cell import Insertion, insert_once
+from .conditions import CHANNELS, RATE_HZ, CellParameters, find_scenario
 from .world import TIME_STEP_S
 
 _BLOCK = 100  # cycles simulated between two looks at the quotas

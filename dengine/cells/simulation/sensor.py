@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from .parameters import RATE_HZ, CellParameters
+from .conditions import RATE_HZ, CellParameters
 
 
 @dataclass(frozen=True, slots=True)

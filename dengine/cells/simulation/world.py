@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DengineError, SettingError
-from .parameters import RATE_HZ, SAMPLES
+from .conditions import RATE_HZ, SAMPLES
 
 if TYPE_CHECKING:
     from .conditions import Conditions

@@ -17,8 +17,7 @@ answer are in one stream, in one order. ur_rtde's client is what the tests hold 
 from __future__ import annotations
 
 from .cell import UrCell
-from .controller import FakeController, Trouble
-from .program import RobotProgram
+from .controller import FakeController, RobotProgram, Trouble
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import StreamReport
 

@@ -10,8 +10,7 @@ import sys
 import threading
 
 from ...errors import DengineError
-from .controller import FakeController
-from .program import RobotProgram
+from .controller import FakeController, RobotProgram
 from .protocol import PORT
 
 

@@ -3,6 +3,8 @@
 A package is its size (uint16, header included), its kind (uint8) and what it carries; all numbers are big-endian. A recipe
 is a list of fields that the controller has given types to: a data package is the recipe's number and the fields' values.
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+
+What a channel of a trace is called, and which number of the controller it is.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
-from ...errors import CellError
+from ...datasets.triggers import Trigger
+from ...errors import CellError, SettingError
 
 PORT = 30004
 VERSION = 2
@@ -197,3 +200,33 @@ def type_of(name: str) -> str:
     if found[2] == "bit":
         return "BOOL" if 64 <= number < 128 else NOT_FOUND
     return {"int": "INT32", "double": "DOUBLE"}[found[2]] if number < 48 else NOT_FOUND
+
+
+AXES = ("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base")
+POSES = ("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ")
+CHANNELS = {  # as recordings of UR cells call them; newtons and newton metres, metres and radians, in the robot's base
+    **{name: f"actual_TCP_force[{i}]" for i, name in enumerate(AXES)},
+    **{name: f"actual_TCP_pose[{i}]" for i, name in enumerate(POSES)},
+}
+
+
+def column_of(name: str) -> str:
+    """The controller's number that a channel or a signal is: by a name of CHANNELS, or by its own, `actual_q[5]`."""
+    column = CHANNELS.get(name, name)
+    field, _, index = column.partition("[")
+    kind = type_of(field)
+    size = 0 if kind == NOT_FOUND else TYPES[kind][1]
+    known = index == "" if size == 1 else index.endswith("]") and index[:-1].isdecimal() and int(index[:-1]) < size
+    if not known:
+        raise SettingError(
+            f"Expected a channel among {', '.join(CHANNELS)}, or a number of the controller, as actual_q[5] or "
+            f"output_double_register_24, got {name!r}."
+        )
+    return column
+
+
+def fields_of(channels: tuple[str, ...], trigger: Trigger, also: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """The fields to ask the controller for, each once, `timestamp` first."""
+    columns = [column_of(name) for name in (*channels, *trigger.signals)]
+    fields = [column.partition("[")[0] for column in columns]
+    return tuple(dict.fromkeys(("timestamp", *fields, *also)))

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...datasets.cutting import Gaps, Start, StartFinder, place
+from ...datasets.triggers import Trigger, as_trigger
 from ...errors import CellError, SettingError
-from ...recordings.cutting import Gaps, Start, StartFinder, place
-from ...recordings.triggers import Trigger, as_trigger
 from ...records import TraceSpec
-from .channels import column_of, fields_of
-from .protocol import PORT
+from .protocol import PORT, column_of, fields_of
 from .stream import Row, RtdeStream, StreamReport
 
 BAR_S = 0.5  # at most between two looks at the clock

@@ -11,9 +11,11 @@ from importlib.util import find_spec
 from inspect import Parameter, signature
 from typing import TYPE_CHECKING, Any
 
-from ..._lazy import find_class, lazy_names
+import lazy_loader
+
 from ...decision.policy import Policy
 from ...errors import SettingError
+from ...records import find_class
 
 if TYPE_CHECKING:
     from .base import Rival
@@ -51,7 +53,7 @@ class RivalKind:
 
 RIVALS: dict[str, RivalKind] = {
     "knn": RivalKind(
-        "neighbours:AgreeingNeighbours",
+        "baselines:AgreeingNeighbours",
         title="k-NN, all k agree",
         source="Duan et al. (2025), the authors' predecessor",
         bound="",
@@ -59,7 +61,7 @@ RIVALS: dict[str, RivalKind] = {
         chosen={"k": 5},
     ),
     "wskde": RivalKind(
-        "kernel:WilsonKernelDensity",
+        "densities:WilsonKernelDensity",
         title="Wilson-score kernel density",
         source="Iversen, Duan and Hagelskjær (2026), arXiv:2602.20947",
         bound="Wilson interval of kernel-weighted counts, at one look",
@@ -67,7 +69,7 @@ RIVALS: dict[str, RivalKind] = {
         chosen={"bandwidth": None},
     ),
     "gp": RivalKind(
-        "gaussian_process:GaussianProcess",
+        "densities:GaussianProcess",
         title="Gaussian process",
         source="Rasmussen and Williams (2006), scikit-learn",
         bound="credible interval under the prior, at one look",
@@ -80,7 +82,7 @@ RIVALS: dict[str, RivalKind] = {
         chosen={"n_components": 5, "amplitude": 3.0},
     ),
     "minirocket": RivalKind(
-        "rocket:RocketSelective",
+        "selective:RocketSelective",
         title="MiniRocket, logistic, SGR",
         source="Dempster et al. (2021), aeon; Geifman and El-Yaniv (2017)",
         bound="SGR risk bound, each side and each training by itself",
@@ -94,7 +96,7 @@ RIVALS: dict[str, RivalKind] = {
         needs="aeon",
     ),
     "mapie": RivalKind(
-        "controlled:ControlledRisk",
+        "selective:ControlledRisk",
         title="logistic, MAPIE risk control",
         source="Angelopoulos et al. (2021), MAPIE",
         bound="learn-then-test, each side and each training by itself",
@@ -108,7 +110,7 @@ RIVALS: dict[str, RivalKind] = {
         needs="mapie",
     ),
     "river": RivalKind(
-        "stream:StreamForest",
+        "baselines:StreamForest",
         title="adaptive random forest",
         source="Gomes et al. (2017), river",
         bound="",
@@ -117,14 +119,14 @@ RIVALS: dict[str, RivalKind] = {
         needs="river",
     ),
     "always": RivalKind(
-        "constant:AlwaysVerify",
+        "baselines:AlwaysVerify",
         title="always verify",
         source="the cell as it is",
         bound="no error: every part is verified",
         tries=({},) * 4,  # nothing to choose
     ),
     "never": RivalKind(
-        "constant:NeverVerify",
+        "baselines:NeverVerify",
         title="never verify",
         source="the cell without its check",
         bound="",
@@ -162,4 +164,4 @@ def require(name: str) -> None:
         raise SettingError(f'The rival {name} needs {needs}, which is missing; pip install "dengine[rivals]".')
 
 
-__getattr__, __dir__ = lazy_names(__name__, {"base": ("Rival",)})
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs={"base": ["Rival"]})

@@ -12,8 +12,8 @@ from typing import Any
 import sqlalchemy as sa
 from alembic import op
 
-from dengine.store import chain
-from dengine.store.chain import START, added_text, row_sum, settings_text, state_sum
+from dengine.store import ledger as chain
+from dengine.store.ledger import START, added_text, row_sum, settings_text, state_sum
 
 revision, down_revision = "0003", "0002"
 

@@ -1,0 +1,169 @@
+"""`dengine correct`, `forget`, `rollback`, `set-policy`, `retrain`: what people put right in a store, and train by hand."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .options import SETTINGS, cell_options, example, json_option
+from .output import certificate_record, show, write_json
+
+if TYPE_CHECKING:
+    from ..engine.corrections import Changed
+    from ..engine.engine import DataEngine
+
+Command = Callable[..., Any]
+LABELS = {"good": True, "bad": False}
+INTERVALS = ("binomial", "wilson", "clopper_pearson", "jeffreys")  # whose functions are not imported to parse
+POLICY = ("alpha", "lower_bound", "guarantee", "stops", "audit_rate")
+
+
+def store_argument(command: Command) -> Command:
+    """STORE, and whose rows of it."""
+    return click.argument("store", metavar="STORE")(cell_options()(command))
+
+
+author_option = click.option("--author", help="Who says so, for the record.  [default: the login name]")
+
+
+def _changed(
+    verb: str, store: str, author: str | None, change: Callable[[DataEngine, str], Changed], as_json: bool
+) -> None:
+    """Open the store's engine, change something, and say what happened."""
+    from ..engine.engine import DataEngine
+    from ..store.base import UNHURRIED
+
+    who = _login() if author is None else author
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
+        changed = change(engine, who)
+        certificate, policy = engine.certificate(), engine.policy
+    if as_json:
+        about = {"verb": verb, "store": store, "author": who, "changed": changed.event is not None}
+        write_json(about | asdict(changed) | {"policy": asdict(policy), "certificate": certificate_record(certificate)})
+        return
+    recorded = "" if changed.event is None else f" Event {changed.event}, by {who or 'nobody named'}."
+    show(f"{changed.text}{recorded}")
+
+
+def _login() -> str:
+    """The login name; "" where the system has none for this user."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # in a container a number may have no name
+        return ""
+
+
+@click.command(epilog=example("dengine correct engine.db import-d684ff7e4dbab839-0 bad"))
+@store_argument
+@click.argument("decision", metavar="ID")
+@click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@author_option
+@json_option
+def correct(store: str, decision: str, label: str, author: str | None, as_json: bool) -> None:
+    """Say that a label was wrong: the part was good, or bad.
+
+    From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
+    decided; the correction is a later row. A forgotten label counts again by it.
+    """
+    _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
+
+
+@click.command(epilog=example("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'"))
+@store_argument
+@click.argument("decisions", metavar="ID...", nargs=-1, required=True)
+@click.option("--reason", default="", help="Why, for the record.")
+@author_option
+@json_option
+def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | None, as_json: bool) -> None:
+    """Leave labels out of all that is learned and counted.
+
+    Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
+    where one is unknown or has no label, none.
+    """
+    _changed("forget", store, author, lambda engine, who: engine.forget(*decisions, author=who, reason=reason), as_json)
+
+
+@click.command(epilog=example("dengine rollback engine.db 1"))
+@store_argument
+@click.argument("version", metavar="VERSION", type=int)
+@author_option
+@json_option
+def rollback(store: str, version: int, author: str | None, as_json: bool) -> None:
+    """Let an earlier model version answer again, as a new one.
+
+    Labels that came since are among its references, and corrections count.
+    """
+    _changed("rollback", store, author, lambda engine, who: engine.rollback(version, who), as_json)
+
+
+def _policy_options(command: Command) -> Command:
+    for name in reversed(POLICY):
+        command = SETTINGS[name](command)
+    return command
+
+
+@click.command("set-policy", epilog=example("dengine set-policy engine.db --alpha 0.05 --lower-bound 0.95"))
+@store_argument
+@_policy_options
+@click.option("--interval", type=click.Choice(INTERVALS), help="The confidence interval.")
+@author_option
+@json_option
+def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> None:
+    """Decide by another policy from now on.
+
+    What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
+    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence.
+    """
+    from dataclasses import replace
+
+    asked: Mapping[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if not asked:
+        raise click.UsageError("Expected at least one setting, such as --alpha or --lower-bound; got none.")
+    _changed(
+        "set-policy", store, author, lambda engine, who: engine.set_policy(replace(engine.policy, **asked), who), as_json
+    )
+
+
+@click.command(epilog=example("dengine shadow engine.db on"))
+@store_argument
+@click.argument("state", type=click.Choice(["on", "off"]))
+@author_option
+@json_option
+def shadow(store: str, state: str, author: str | None, as_json: bool) -> None:
+    """Verify every part, or let the model decide again.
+
+    In the shadow mode it only says what it would have done. The mode lasts over restarts. `dengine status` counts
+    what the model would have done, and how much of that was wrong.
+    """
+    _changed("shadow", store, author, lambda engine, who: engine.set_shadow(state == "on", who), as_json)
+
+
+@click.command(epilog=example("dengine retrain engine.db"))
+@store_argument
+@author_option
+@json_option
+def retrain(store: str, author: str | None, as_json: bool) -> None:
+    """Train now, on the store's labels as they count.
+
+    A candidate that fails its gate is dropped and recorded, and the version before goes on answering.
+    """
+    from ..engine.engine import DataEngine
+    from ..experiments.tables import retrain_line
+    from ..store.base import UNHURRIED
+
+    who = _login() if author is None else author
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
+        report = engine.retrain()
+        text = f"trained by hand on {report.n_traces} traces: {report.reason}"
+        engine.store.put_event("retrain", text, asdict(report), who)
+    if as_json:
+        write_json({"verb": "retrain", "store": store, "author": who, "retrain": report})
+    else:
+        answers = f"Version {report.version} answers." if report.version else "No version answers yet."
+        show(f"{answers} {retrain_line([report])}")
+    if not report.accepted:
+        raise click.ClickException(f"The retrain was {report.reason}.")

@@ -1,0 +1,427 @@
+"""`dengine demo-cell`: a cell, its server and its page, at a speed that one can watch.
+
+`dengine run`: an engine drives a cell, and goes on where its store left off.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager, suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+from zlib import crc32
+
+import click
+
+from ..errors import CellError, OutputError
+from .options import (
+    DataChoice,
+    OutFolder,
+    RecipeChoice,
+    cell_options,
+    data_options,
+    example,
+    json_option,
+    must_have_mujoco,
+    out_option,
+    recipe_options,
+    scenario_option,
+    seed_option,
+    short_name,
+)
+from .output import (
+    EndAskedError,
+    certificate_record,
+    end_interrupted,
+    interruptible,
+    progress,
+    refusals_last,
+    show,
+    write_json,
+)
+from .robot import host_option, open_robot, recording_line, recording_record
+from .serve import must_have_serve
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..cells.base import Cell
+    from ..decision.certificate import Certificate
+    from ..engine.engine import DataEngine
+    from ..experiments.replay import RunLog
+    from ..records import Cycle
+    from ..serve.service import CellService
+    from ..store.base import Store
+
+STRETCHES = 6
+
+
+@click.command(epilog=example("dengine run --cell simulated --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9"))
+@click.option(
+    "--cell",
+    "kind",
+    type=click.Choice(["simulated", "replay", "ur"]),
+    default="simulated",
+    show_default=True,
+    help="simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller.",
+)
+@host_option
+@data_options()
+@scenario_option
+@click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
+@click.option("--store", metavar="FILE|URL", help="Remembers everything; without one the run is forgotten.")
+@cell_options("--cell-id", product=True)
+@recipe_options
+@click.option(
+    "--seed", type=click.IntRange(0), help="An integer, of a new store's engine and of the simulated cell.  [default: 0]"
+)
+@click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
+@out_option
+@json_option
+def run(
+    choice: RecipeChoice,
+    kind: str,
+    host: str | None,
+    source: DataChoice,
+    scenario: str,
+    cycles: int,
+    store: str | None,
+    seed: int | None,
+    shadow: bool,
+    out: OutFolder | None,
+    as_json: bool,
+) -> None:
+    """Drive a cell: verify, learn, and verify less.
+
+    With a store that exists the engine goes on where it was. The simulated cell then makes new parts, and a recording goes
+    on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
+    training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
+    Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
+    safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
+    """
+    if kind == "simulated":
+        must_have_mujoco()
+    from ..engine.engine import DataEngine
+
+    recipe = choice.load() if choice.asked else None
+    with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=recipe) as engine:
+        if shadow:
+            engine.set_shadow(True)
+        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
+        opened.callback(getattr(cell, "close", lambda: None))
+        log, changes, failure = _drive(engine, cell, cycles, name, as_json)
+        told = Told(changes, engine.safe_mode, engine.certificate())
+    title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
+    if len(log):
+        _report(log, told, cell, kind, title, cycles, out, as_json)
+    if failure is not None:
+        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {_kept(len(log), cycles, store)}") from failure
+    if len(log) < cycles:
+        _say_interrupted(len(log), cycles, store)
+
+
+@dataclass(frozen=True)
+class ModeChange:
+    """The safe mode began after this cycle, counted from 1, for a reason; or ended, for none."""
+
+    cycle: int
+    reason: str
+
+    @property
+    def line(self) -> str:
+        """For people."""
+        what = f"safe mode, every part is verified: {self.reason}" if self.reason else "safe mode ended"
+        return f"After cycle {self.cycle}: {what}."
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the engine said of itself: the safe mode's changes, why it is on in the end, and the certificate."""
+
+    changes: list[ModeChange]
+    safe_mode: str
+    certificate: Certificate
+
+
+def _drive(
+    engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
+) -> tuple[RunLog, list[ModeChange], CellError | None]:
+    """What was done, and what ended it, where the cell failed: what was done before that is shown first."""
+    from ..experiments.replay import RunRecorder
+
+    recorder, changes, mode = RunRecorder(cell), list[ModeChange](), engine.safe_mode
+    with interruptible() as asked, progress(name, cycles, quiet) as advance:
+
+        def count(cycle: Cycle) -> None:
+            nonlocal mode
+            advance(1)
+            if cycle.safe_mode != mode:
+                mode = cycle.safe_mode
+                changes.append(ModeChange(cycle.index + 1, mode))
+                if not quiet:
+                    click.echo(changes[-1].line, err=True)
+            if asked():  # between two cycles: no part is left half dealt with
+                raise EndAskedError
+
+        # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
+        try:
+            with suppress(EndAskedError, KeyboardInterrupt):
+                recorder.follow(engine, cycles, count)
+        except CellError as error:
+            return recorder.log(), changes, error
+    return recorder.log(), changes, None
+
+
+def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
+    shown = "the table shows those" if done else "there is nothing to show"
+    end_interrupted(f"Interrupted: {done} of {cycles} cycles were done; {shown}.", _kept(done, cycles, store))
+
+
+def _kept(done: int, cycles: int, store: str | None) -> str:
+    if store is None:
+        return "Nothing was stored: --store FILE keeps a run, and goes on with it."
+    return f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
+
+
+def _simulated(
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
+) -> tuple[Cell, str]:
+    from ..cells.simulation.cell import SimulatedCell
+    from ..store.base import is_shared
+
+    # Another seed for a resumed run: the same parts again would be counted twice.
+    seed += store.status()["decisions"]
+    if is_shared(store):  # sisters have one seed, and parts of their own all the same
+        seed += crc32(store.cell_id.encode())
+    return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
+
+
+def _recorded(
+    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
+) -> tuple[Cell, str]:
+    import numpy as np
+
+    from ..cells.replay import ReplayCell
+    from ..errors import SettingError
+    from ..folds import content_hash
+    from ..store.base import is_shared
+
+    dataset = source.load()
+    # By content: of a part that comes twice the store's own hash would name both.
+    played = store.own_labelled() if is_shared(store) else store.labelled()
+    hashes = content_hash(played.traces)
+    for id_ in store.unreported_accepts()[-1:]:
+        newest = store.get_decision(id_)
+        hashes = hashes if newest is None else np.append(hashes, content_hash(newest.trace[None]))
+    known = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
+    first = int(known[-1]) + 1 if len(known) else 0
+    left = len(dataset) - first
+    if cycles > left:
+        raise SettingError(
+            f"Expected at most {left} cycles, got {cycles}: {first} of {len(dataset)} parts were played before."
+        )
+    return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
+
+
+def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None) -> tuple[Cell, str]:
+    return open_robot(host, source), f"robot at {host}"
+
+
+CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
+
+
+def _report(
+    log: RunLog, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: OutFolder | None, as_json: bool
+) -> None:
+    from ..experiments.tables import retrain_line
+
+    total, stretches = log.summary(), log.stretches(STRETCHES)
+    clock = asdict(cell.report()) if hasattr(cell, "report") else None
+    worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
+    with refusals_last() as attempt:
+        files = [] if out is None else attempt(lambda: _save(log, title, out))
+        if as_json:
+            about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
+            counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording}
+            said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
+            said |= {"certificate": certificate_record(told.certificate)}
+            write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
+            return
+        show(_table([*stretches, total], title, clock is not None))
+        if clock is not None:
+            show(_clock_line(clock))
+        if recording is not None:
+            show(recording_line(recording))
+        show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
+        show(*(f"Wrote {path}" for path in files))
+
+
+def _clock_line(clock: dict[str, Any]) -> str:
+    """What the simulated clock says. Its seconds saved have the cost of stops and wrong rejects taken off already."""
+    saved = clock["seconds_saved"]
+    result = "nothing was saved" if abs(saved) < 0.5 else f"{abs(saved):.0f} s were {'saved' if saved > 0 else 'lost'}"
+    silent = f" Bad parts that went on unnoticed: {clock['escapes']}." if clock["escapes"] else ""
+    return (
+        f"Simulated: {clock['parts_per_hour']:.1f} good parts an hour. Against verifying every part {result}; this counts "
+        f"what stops ({clock['stops']}) and good parts sent back to the bin ({clock['sent_back']}) cost.{silent}"
+    )
+
+
+CAPTION = (
+    "\nFP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
+    "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
+    "cycles of safe mode."
+)
+
+
+def _table(rows: list[dict[str, Any]], title: str, timed: bool) -> Any:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
+    caption = CAPTION + (" good/h: good parts passed on an hour.\n" if timed else "\n")
+    table = Table(title=f"\n{title}\n", caption=caption, pad_edge=False, show_edge=False, **look)
+    names = ("cycles", "verified", "accepted", "FP", "stops", "rejected", "FN", "novel", "safe")
+    for name in (*names, *(["good/h"] if timed else [])):
+        table.add_column(name, justify="right", no_wrap=True)
+    for row in rows[:-1]:
+        table.add_row(*_cells(row, timed))
+    table.add_section()
+    table.add_row(*_cells(rows[-1], timed))
+    return table
+
+
+def _cells(row: dict[str, Any], timed: bool) -> list[str]:
+    names = ("accepted", "false_positive", "stops", "rejected", "false_negative", "novel", "safe_mode")
+    rate = row["parts_per_hour"]
+    return [
+        f"{row['first_cycle']} to {row['last_cycle']}",
+        f"{100 * row['verified_share']:.0f} %",
+        *(str(row[name]) for name in names),
+        *(["-" if rate is None else f"{rate:.1f}"] if timed else []),
+    ]
+
+
+def _save(log: RunLog, title: str, out: OutFolder) -> list[Path]:
+    from ..experiments.figures import run_picture, save
+    from ..experiments.tables import write_csv
+
+    table = write_csv(log.to_frame().reset_index(), out.path / "run.csv", out.force)
+    return [table, save(run_picture(log, title), out.path / "run.png", force=out.force)]
+
+
+BEFORE = 150  # parts that come at once, so that a model answers before one has read the page
+POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
+ENDLESS = 10**9
+PATIENT = 5.0  # seconds that a decision may wait: nobody but who watches waits for it
+
+
+@dataclass(frozen=True)
+class Demo:
+    """What was asked for.  cycles : None for all that there are."""
+
+    store: str
+    port: int
+    speed: float
+    before: int
+    cycles: int | None
+    kind: str
+    seed: int
+
+
+@click.command("demo-cell", epilog=example("dengine demo-cell --speed 2"))
+@click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0 takes a free one.")
+@click.option(
+    "--speed", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, help="Parts a second, to look on."
+)
+@click.option(
+    "--before",
+    type=click.IntRange(0),
+    default=BEFORE,
+    show_default=True,
+    help="Parts that come first, as fast as they can.",
+)
+@click.option("--cycles", type=click.IntRange(1), help="Parts in all; the page stays afterwards.  [default: all there are]")
+@click.option(
+    "--cell",
+    "kind",
+    type=click.Choice(["replay", "simulated"]),
+    default="replay",
+    show_default=True,
+    help="replay: the bundled recordings, shuffled. simulated: physics in MuJoCo, without end.",
+)
+@click.option("--keep", metavar="FILE", help="A new file that remembers everything.  [default: forgotten at the end]")
+@seed_option
+def demo_cell(port: int, speed: float, before: int, cycles: int | None, kind: str, keep: str | None, seed: int) -> None:
+    """Show a cell at work, live on a page.
+
+    Parts are inserted and decided on, and the page shows what became of them.
+
+    No robot is needed: recordings are played, or simulated. They go the way that a robot's traces go.
+    Only this computer can see the page. Ctrl-C ends it.
+    """
+    must_have_serve()
+    if kind == "simulated":
+        must_have_mujoco()
+    if keep is not None and Path(keep).exists():
+        raise OutputError(f"Expected a new file to keep the demonstration in, {keep} is there; name another one.")
+    with ExitStack() as stack:
+        file = keep or str(Path(stack.enter_context(TemporaryDirectory(prefix="dengine-demo-"))) / "demo.db")
+        _run(Demo(file, port, speed, before, cycles, kind, seed))
+    show(f"Everything is in {keep}." if keep else "It ended, and nothing of it was kept.")
+
+
+def _run(demo: Demo) -> None:
+    from ..engine.engine import DataEngine
+    from ..recipe import Recipe
+    from ..serve.server import Serving, serve
+
+    recipe = Recipe.load("conv").with_policy(**POLICY)
+    cell, cycles = _cell(demo)
+
+    def make(executor: Executor) -> DataEngine:
+        return DataEngine(recipe=recipe, store=demo.store, seed=demo.seed, executor=executor)
+
+    serving = Serving(port=demo.port, deadline=PATIENT, beside=(partial(_driven, cell, cycles, demo),))
+    serve(make, demo.store, serving, lambda line: click.echo(f"{line} Look at it in a browser; Ctrl-C ends it."))
+
+
+def _cell(demo: Demo) -> tuple[Cell, int]:
+    """The cell, and how many parts it inserts."""
+    if demo.kind == "simulated":
+        from ..cells.simulation.cell import SimulatedCell
+
+        return SimulatedCell(seed=demo.seed), demo.cycles or ENDLESS
+    import numpy as np
+
+    from ..cells.replay import ReplayCell
+    from ..datasets import load_dataset
+
+    data = load_dataset("insertion")
+    order = np.random.default_rng(demo.seed).permutation(len(data))
+    return ReplayCell(data, order), min(demo.cycles or len(data), len(data))
+
+
+@asynccontextmanager
+async def _driven(cell: Cell, cycles: int, demo: Demo, service: CellService) -> AsyncIterator[None]:
+    """The cell at work, as long as the server is there."""
+    from ..serve.demo import Pace, drive
+
+    driving = asyncio.ensure_future(drive(service, cell, Pace(demo.before, demo.speed), cycles))
+    driving.add_done_callback(_say_how_it_ended)
+    yield
+    driving.cancel()
+    await asyncio.wait([driving])
+
+
+def _say_how_it_ended(driving: asyncio.Future[int]) -> None:
+    if driving.cancelled():
+        return
+    if (error := driving.exception()) is not None:
+        click.echo(f"The cell stopped: {error}", err=True)
+        return
+    click.echo(f"All parts are through: {driving.result()} were decided on. The page stays until Ctrl-C.")

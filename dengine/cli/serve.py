@@ -1,0 +1,111 @@
+"""`dengine serve`: one engine behind HTTP, XML-RPC and a page."""
+
+from __future__ import annotations
+
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import SettingError
+from .options import RecipeChoice, cell_options, example, recipe_options
+from .robot import host_and_port
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..engine.engine import DataEngine
+
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "jinja2", "sse_starlette")
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.command(epilog=example("dengine serve --store cell.db --port 8000"))
+@click.option("--store", required=True, metavar="FILE|URL", help="Remembers everything; made where there is none.")
+@cell_options("--cell-id", product=True)
+@click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
+@click.option("--token-file", type=FILE, help="A file, its owner's alone, with the token that every request has to say.")
+@click.option("--cert", type=FILE, help="For TLS: the certificate, with its chain, in PEM.")
+@click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
+@click.option(
+    "--allow-host",
+    "allow_hosts",
+    multiple=True,
+    metavar="NAME",
+    help="A name by which the server is called, beside its own.",
+)
+@click.option(
+    "--deadline",
+    type=click.FloatRange(0.001, 60.0),
+    default=0.5,
+    show_default=True,
+    metavar="S",
+    help="Seconds that a decision may wait in line; then it is verify, and recorded so.",
+)
+@click.option(
+    "--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help="Requests a second of one client; 0: any."
+)
+@click.option("--largest", type=click.IntRange(1024), default=2**20, show_default=True, help="Bytes of a request's body.")
+@click.option("--connections", type=click.IntRange(1), default=100, show_default=True, help="Connections at once.")
+@click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
+@click.option(
+    "--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as a robot's program speaks it."
+)
+@click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
+@click.option(
+    "--opcua", type=click.IntRange(1, 65535), metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840."
+)
+@click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
+@click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
+@click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
+@click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
+@click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")
+@click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
+@recipe_options
+def serve(
+    choice: RecipeChoice,
+    store: str,
+    shadow: bool,
+    xmlrpc: bool,
+    page: bool,
+    robot: str | None,
+    trigger: str,
+    samples: int,
+    seed: int | None,
+    **how: Any,
+) -> None:
+    """Answer robots, controllers and people.
+
+    It goes on with its store, or starts a new one, and retrains in a process beside it. SIGTERM and Ctrl-C end it in order:
+    what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
+    machines reach it only with --host, which wants --token-file, and should have --cert and --key.
+    """
+    must_have_serve(*(["asyncua"] if how["opcua"] else []))
+    from ..cells import RtdeRecorder
+    from ..engine.engine import DataEngine
+    from ..serve.server import Serving, tell_safe_mode
+    from ..serve.server import serve as serve_cell
+
+    def make(executor: Executor) -> DataEngine:
+        options: dict[str, Any] = {"executor": executor, "on_safe_mode": tell_safe_mode}
+        engine = DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None, **options)
+        if shadow:
+            engine.set_shadow(True, "dengine serve --shadow")
+        return engine
+
+    interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
+    recorder = None
+    if robot:
+        host, port = host_and_port(robot)
+        recorder = partial(RtdeRecorder, host, trigger, samples, port=port)
+    serve_cell(make, store, Serving(interfaces=interfaces, recorder=recorder, **how), click.echo)
+
+
+def must_have_serve(*beside: str) -> None:
+    """SettingError where the server cannot run; asked before anything is made or begun."""
+    if missing := [name for name in (*NEEDED, *beside) if find_spec(name) is None]:
+        extras = "serve,opcua" if "asyncua" in missing else "serve"
+        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[{extras}]".')

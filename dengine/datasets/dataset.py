@@ -1,0 +1,195 @@
+"""What was asked of `load_dataset`, handed from one reader to another.
+
+A data set in memory: labelled traces of one form, what is known of them, and what could not be read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import DataError
+from ..records import FITS, TraceSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A recording that was left out.
+
+    source : the file, as seen from the folder; or what the rows are of.  line : in the file, or row of a table, from 1;
+    0 where it is the whole.  what : what was expected, and what came.
+    """
+
+    source: str
+    line: int
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.source}, line {self.line}: {self.what}" if self.line else f"{self.source}: {self.what}"
+
+
+class UnreadableError(DataError):
+    """Why one recording is left out; becomes its `Fault`."""
+
+    def __init__(self, what: str, line: int = 0) -> None:
+        super().__init__(what)
+        self.what, self.line = what, line
+
+    def fault(self, source: str) -> Fault:
+        """Of the recording with this name."""
+        return Fault(source, self.line, self.what)
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """Labelled traces in the order they were recorded.
+
+    X : (n, T) or (n, C, T) float32.  y : (n,) int8, 1 = success, 0 = failure.
+    name, rate_hz, unit : for people.  cause : (n,) why a part failed, where that is known.
+    part : (n,) the number of the part that each trace was recorded on; None: every trace is a part of its own.
+    faults : what could not be read and was left out.  channels : the channels' names, where they have any.
+    source : (n,) the file, or row, that each trace came from.  fit : how other lengths became T, as in `TraceSpec`.
+    lengths : (n,) samples as recorded.  rates : (n,) hertz, from each recording's own timestamps.
+    """
+
+    X: NDArray[np.float32]
+    y: NDArray[np.int8]
+    name: str = "data"
+    rate_hz: float = 500.0
+    unit: str = "N"
+    cause: NDArray[np.str_] | None = None
+    part: NDArray[np.str_] | None = None
+    faults: tuple[Fault, ...] = ()
+    channels: tuple[str, ...] = ()
+    source: NDArray[np.str_] | None = None
+    fit: str = "strict"
+    lengths: NDArray[np.int64] | None = None
+    rates: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    @property
+    def spec(self) -> TraceSpec:
+        """The contract by which a live engine takes traces of the same form, `DataEngine(trace=data.spec)`."""
+        n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
+        return TraceSpec(self.X.shape[-1], self.rate_hz, n_channels, self.unit, fit=self.fit, columns=self.channels)
+
+    def cut(self, samples: int) -> Dataset:
+        """The first `samples` samples of every trace: an earlier, harder moment to decide at."""
+        have = self.X.shape[-1]
+        if not 1 <= samples <= have:
+            raise DataError(f"Expected 1 to {have} samples of {self.name}, got {samples}.")
+        if samples < have and self.fit == "resample":
+            raise DataError(f"The traces of {self.name} are resampled: give the samples where they are loaded.")
+        fit = "cut" if samples < have and self.fit == "pad" else self.fit
+        return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
+
+    def pick(self, channels: tuple[str, ...]) -> Dataset:
+        """The channels of these names, in this order; one alone gives (n, T)."""
+        missing = [name for name in channels if name not in self.channels]
+        if missing:
+            have = ", ".join(self.channels) or "none that has a name"
+            raise DataError(f"Expected the channel {missing[0]} in {self.name}, it has {have}.")
+        if self.X.ndim == 2:
+            return self
+        places = [self.channels.index(name) for name in channels]
+        X = np.ascontiguousarray(self.X[:, places[0]] if len(places) == 1 else self.X[:, places])
+        return replace(self, X=X, channels=channels)
+
+
+def _real(X: ArrayLike) -> NDArray[np.float32]:
+    try:
+        array: NDArray[Any] = np.asarray(X)
+        if array.dtype.kind not in "cmMSU":
+            with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
+                return array.astype(np.float32, copy=False)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DataError(f"Expected X of real numbers, (n, T) or (n, C, T), got something else: {error}.") from error
+    raise DataError(f"Expected X of real numbers, got dtype {array.dtype}.")
+
+
+def _must_fit(X: NDArray[np.float32], rate_hz: float = 500.0, channels: tuple[str, ...] = ()) -> None:
+    if not 0 < rate_hz < np.inf:
+        raise DataError(f"Expected a rate above 0 Hz, got {rate_hz}.")
+    n_channels = 1 if X.ndim == 2 else X.shape[1]
+    if channels and len(channels) != n_channels:
+        raise DataError(f"Expected a name for each of {n_channels} channels, got {', '.join(channels)}.")
+
+
+def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
+    """A `Dataset` from arrays; DataError where they do not fit together."""
+    X, y = _real(X), np.asarray(y)
+    if X.ndim not in (2, 3) or y.shape != (len(X),):
+        raise DataError(f"Expected X (n, T) or (n, C, T) with n labels, got X {X.shape} and y {y.shape}.")
+    if not len(y):
+        raise DataError("Expected at least one trace, got none.")
+    if X.ndim == 3 and X.shape[1] > X.shape[2]:
+        raise DataError(
+            f"Expected X (n, channels, samples), got {X.shape[1]} channels of {X.shape[2]} samples, which looks "
+            "transposed; pass X.transpose(0, 2, 1)."
+        )
+    if not np.isin(y, (0, 1)).all():
+        raise DataError(f"Expected labels 1 (success) and 0 (failure), got {sorted(set(map(str, y.tolist())))[:5]}.")
+    _must_fit(X, **{name: about[name] for name in ("rate_hz", "channels") if name in about})
+    part, cause = (about.pop(name, None) for name in ("part", "cause"))
+    if part is not None:
+        part = np.asarray(part)
+        if part.shape != y.shape or part.dtype.kind not in "iuUS":
+            raise DataError(f"Expected {len(y)} parts' numbers, texts or integers, got {part.shape} of {part.dtype}.")
+        part = part.astype(np.str_)
+    if cause is not None and np.shape(cause) != y.shape:
+        raise DataError(f"Expected {len(y)} causes, one a trace, got {np.shape(cause)}.")
+    return Dataset(X, y.astype(np.int8), part=part, cause=cause, **about)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The options of `load_dataset`, under their names; `channels` are those of `channel`, taken apart."""
+
+    samples: int | None = None
+    part: str = "part"
+    channels: tuple[str, ...] = ()
+    label: str | None = None
+    labels: str | os.PathLike[str] | None = None
+    fit: str | None = None
+    rate_hz: float | None = None
+    trigger: Any = None
+    topic: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.label is not None and self.labels is not None:
+            raise DataError(
+                "Expected a pattern for the labels (label) or a file of them (labels), got both; leave one out."
+            )
+        if self.fit is not None and self.fit not in FITS:
+            raise DataError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise DataError(f"Expected a rate above 0 Hz, got {self.rate_hz}.")
+        if self.samples is not None and self.samples < 1:
+            raise DataError(f"Expected 1 or more samples, got {self.samples}.")
+        if len(set(self.channels)) != len(self.channels):
+            raise DataError(f"Expected each channel once, got {', '.join(self.channels)}.")
+
+    def refuse_cutting(self, what: str) -> None:
+        """DataError for options that cut a stream, where what is read is no stream."""
+        idle = [name for name in ("trigger", "topic") if getattr(self, name) is not None]
+        if idle:
+            raise DataError(f"Expected no {' or '.join(idle)} for {what}: it is cut into insertions already; leave it out.")
+
+    def refuse(self, what: str, *names: str) -> None:
+        """DataError for options that say nothing to what is read."""
+        idle = [name for name in names if getattr(self, name) is not None]
+        if idle:
+            raise DataError(f"Expected no {' or '.join(idle)} for {what}: it has its labels; leave it out.")
+
+
+def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
+    """`"FZ_Base,FX_Base"`, or a list of names, one by one."""
+    listed = channel.split(",") if isinstance(channel, str) else channel or ()
+    return tuple(name.strip() for name in listed if name.strip())

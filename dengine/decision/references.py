@@ -1,0 +1,351 @@
+"""How far the labels of one part go together: the intraclass correlation that decides what its repeats count.
+
+A part that comes m times is m independent trials only where its labels are no more alike than those of others that look the
+same. With an intraclass correlation rho, m trials are worth m / (1 + (m - 1) rho): all of them at rho = 0, one at rho = 1.
+Nothing is taken for independent until it was seen to be: rho is an upper confidence bound, and 1 while few parts came
+twice.
+
+Sources: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48, for counts of clusters.
+
+Counting known successes and failures around a query: exact, growing by one label at a time, in K spaces at once.
+
+    >>> index = RadiusIndex(dim=2, capacity=10_000)
+    >>> index.add(points, labels, spaces)
+    >>> n_success, n_failure = index.count(queries, radius=0.3)
+
+Brute force over at most `capacity` points takes tens of microseconds, needs no rebuilding, and scripts to TorchScript:
+one implementation counts in the engine, in the scikit-learn classifier and in the exported file. Points and queries
+are float32, as embeddings are, and so are the distances.
+
+Trials must be independent to be counted, so a part has one vote in a ball however often it came, more only as far as its
+labels were seen to go their own ways (`agreement`), and none where it is asked about itself. A part is known by a hash:
+of its number, or of its trace's content.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+FEWEST_PARTS = 20  # that came at least twice; fewer say nothing
+NEIGHBOURS = 30  # of other parts, that say what is usual where a trace lies
+SAMPLE = 3000  # of the newest points: the work does not grow
+CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
+
+
+def label_agreement(
+    points: NDArray[np.float32], labels: NDArray[np.int8], spaces: NDArray[np.int64], parts: NDArray[np.int64]
+) -> float:
+    """Upper bound on the intraclass correlation, in [0, 1], of labels within a part beyond what its place explains.
+
+    points (n, d), labels (n,), spaces (n,), parts (n,) hashes, 0 for a point of no known part; a part lies in one space.
+    """
+    points, labels, spaces, parts = points[-SAMPLE:], labels[-SAMPLE:], spaces[-SAMPLE:], parts[-SAMPLE:]
+    _, part, times = np.unique(parts, return_inverse=True, return_counts=True)
+    again = (times[part] > 1) & (parts != 0)
+    if len(np.unique(part[again])) < FEWEST_PARTS:
+        return 1.0
+    rest = np.zeros(len(labels))
+    for space in np.unique(spaces):
+        here = np.flatnonzero(spaces == space)
+        rest[here] = labels[here] - _rate_of_others(points[here], labels[here], part[here])
+    spread = float((rest[again] ** 2).mean())
+    own = np.bincount(part[again], rest[again], len(times))
+    alike = own**2 - np.bincount(part[again], rest[again] ** 2, len(times))  # products of different traces of one part
+    pairs = np.where(times > 1, times * (times - 1.0), 0.0) * (np.bincount(part[again], minlength=len(times)) > 0)
+    if spread == 0.0:
+        return 1.0  # every label as its place says: nothing to see
+    rho = float(alike.sum() / (pairs.sum() * spread))
+    error = float(np.sqrt(((alike / spread - rho * pairs) ** 2).sum()) / pairs.sum())
+    return float(np.clip(rho + CONFIDENCE * error, 0.0, 1.0))
+
+
+def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n,) success rate among the nearest points of other parts."""
+    from scipy.spatial.distance import cdist
+
+    distances = cdist(points, points, "sqeuclidean")
+    distances[part[:, None] == part] = np.inf
+    k = min(NEIGHBOURS, len(points) - 1)
+    if k < 1:
+        return np.full(len(points), 0.5)
+    nearest = np.argpartition(distances, k - 1, axis=1)[:, :k]
+    return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
+
+
+FARTHEST = 1e38  # squared: what is beyond all measure, the query's own part too, is in no ball
+Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
+class ReferenceRing(nn.Module):
+    """A bounded block of labelled points; the oldest leaves first, whatever its label.
+
+    points (d, capacity) float32, one row a dimension; labels (2, capacity) float32, ones, and 1.0 or 0.0;
+    spaces (capacity,) int64; parts (capacity,) int64, hashes, 0 for a point of no known part; total () int64, points ever
+    added; first (capacity,) int64, the slot that a part's votes are gathered in; repeats () int64, points of parts that are
+    there already; agreement () float64, how far the labels of one part go together (`agreement.label_agreement`).
+    """
+
+    points: Tensor
+    labels: Tensor
+    spaces: Tensor
+    parts: Tensor
+    first: Tensor
+    repeats: Tensor
+    agreement: Tensor
+    total: Tensor
+
+    def __init__(self, dim: int, capacity: int) -> None:
+        super().__init__()
+        self.dim = dim
+        self.capacity = capacity
+        self.farthest = FARTHEST
+        self.register_buffer("points", torch.zeros(dim, capacity))
+        self.register_buffer("labels", torch.ones(2, capacity))
+        self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
+        self.register_buffer("parts", torch.zeros(capacity, dtype=torch.int64))
+        self.register_buffer("first", torch.arange(capacity))
+        self.register_buffer("repeats", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("agreement", torch.ones((), dtype=torch.float64))
+        self.register_buffer("total", torch.zeros((), dtype=torch.int64))
+
+    @torch.jit.export
+    def size(self) -> int:
+        """Points held."""
+        return min(int(self.total.item()), self.capacity)
+
+    @torch.jit.export
+    def put(self, point: Tensor, label: float, space: int, part: int = 0) -> None:
+        """Add one point (d,) of space `space` and of `part`; on a full block it takes the oldest one's place."""
+        total = int(self.total.item())
+        slot = total % self.capacity
+        self.points[:, slot] = point
+        self.labels[1, slot] = label
+        self.spaces[slot] = space
+        self.total.fill_(total + 1)
+        self.join(slot, part)
+
+    @torch.jit.export
+    def join(self, slot: int, part: int) -> None:
+        """Make `part` that of a slot that is held, and find the slot in which its votes are gathered."""
+        same = self.parts == self.parts[slot]
+        if int(same.sum().item()) > 1 and int(self.parts[slot].item()) != 0:  # the leaving part's others stay together
+            same[slot] = False
+            self.first.masked_fill_(same, int(same.nonzero()[0].item()))
+            self.repeats.sub_(1)
+        self.parts[slot] = part
+        self.first[slot] = slot
+        if part != 0:
+            same = self.parts == part
+            if int(same.sum().item()) > 1:
+                self.first.masked_fill_(same, int(same.nonzero()[0].item()))
+                self.repeats.add_(1)
+
+    @torch.jit.export
+    def squared_distances(self, z: Tensor, part: int = 0) -> Tensor:
+        """(K, d) one query in every space -> (size,) squared distance to each point, in that point's own space.
+
+        part : of the query; its own points are infinitely far.
+        """
+        n = self.size()
+        own = z.t()  # (d, K)
+        if z.size(0) > 1:
+            own = own.index_select(1, self.spaces[:n])  # (d, size): a reference of fold k is met in space k only
+        distances = (self.points[:, :n] - own).square_().sum(0)
+        if part != 0:
+            distances.masked_fill_(self.parts[:n] == part, float("inf"))
+        return distances
+
+    @torch.jit.export
+    def count_near(self, distances: Tensor, radius: float, fraction: float) -> tuple[int, int]:
+        """(successes, failures) within `radius`, or, where 0 < fraction, among that fraction of the points, nearest first.
+
+        The fraction is rounded up and ties at its edge are all counted, so that no order of the points matters. Several
+        points of one part are worth less than as many parts: `votes`.
+        """
+        n = distances.size(0)
+        if n == 0:
+            return 0, 0
+        limit = radius * radius
+        if fraction > 0.0:
+            limit = float(distances.kthvalue(min(n, int(math_ceil(fraction * n))))[0].item())
+            limit = min(limit, self.farthest)
+        if int(self.repeats.item()) > 0:
+            return self.votes(distances <= limit)
+        inside = distances.clone().le_(limit)  # 1.0 or 0.0, without a mask in between
+        counts: list[float] = torch.mv(self.labels[:, :n], inside).tolist()  # exact below 2**24 points
+        return int(counts[1]), int(counts[0]) - int(counts[1])
+
+    def votes(self, inside: Tensor) -> tuple[int, int]:
+        """(successes, failures) of the points `inside`, (size,) bool, in votes: m points of a part are worth
+        m / (1 + (m - 1) agreement), one vote where its labels always agree. Rounded: bounds are of whole trials.
+        """
+        slots = inside.nonzero().flatten()
+        own = self.first.index_select(0, slots)
+        times = torch.zeros(self.capacity, dtype=torch.float64).index_add_(
+            0, own, torch.ones(own.size(0), dtype=torch.float64)
+        )
+        worth = 1.0 / (1.0 + (times.index_select(0, own) - 1.0) * self.agreement)
+        successes = float((worth * self.labels[1].index_select(0, slots)).sum().item())
+        failures = float(worth.sum().item()) - successes
+        return int(successes + 0.5), int(failures + 0.5)
+
+
+def math_ceil(x: float) -> int:
+    """Smallest integer not below x; `math.ceil` under a name that scripts in a method."""
+    whole = int(x)
+    return whole if x <= float(whole) else whole + 1
+
+
+class RadiusIndex:
+    """Labelled points in K spaces, and counts around queries.
+
+    dim : dimension d of a point.  capacity : points held at most; the oldest leave first, blind to labels.
+    """
+
+    def __init__(self, dim: int, capacity: int = 10_000) -> None:
+        self.ring = ReferenceRing(dim, capacity)
+
+    def __len__(self) -> int:
+        return self.ring.size()
+
+    @property
+    def dim(self) -> int:
+        """Dimension of a point."""
+        return self.ring.dim
+
+    @property
+    def capacity(self) -> int:
+        """Points held at most."""
+        return self.ring.capacity
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """(n, d) the points held, in the order of their places in the block."""
+        return self.ring.points[:, : len(self)].numpy().T
+
+    @property
+    def labels(self) -> NDArray[np.int8]:
+        """(n,) 1 success, 0 failure, in the order of `points`."""
+        return self.ring.labels[1, : len(self)].numpy().astype(np.int8)
+
+    @property
+    def spaces(self) -> NDArray[np.int64]:
+        """(n,) the space each point lives in, in the order of `points`."""
+        return self.ring.spaces[: len(self)].numpy()
+
+    @property
+    def parts(self) -> NDArray[np.int64]:
+        """(n,) the hash of each point's part, 0 for none, in the order of `points`."""
+        return self.ring.parts[: len(self)].numpy()
+
+    def add(
+        self, points: ArrayLike, labels: ArrayLike, spaces: ArrayLike | None = None, parts: ArrayLike | None = None
+    ) -> None:
+        """Add points (n, d) with labels (n,), 1 = success, 0 = failure.
+
+        spaces : (n,) the space each lives in, 0 if None.  parts : (n,) int64 hashes of their parts; None: of no known part.
+        """
+        z, y = np.array(points, dtype=np.float32), np.array(labels, dtype=np.float32)  # copies: torch needs writable ones
+        k, own = (np.zeros(len(z), np.int64) if v is None else np.array(v, dtype=np.int64) for v in (spaces, parts))
+        if z.ndim != 2 or z.shape[1] != self.dim or {y.shape, k.shape, own.shape} != {(len(z),)}:
+            raise ValueError(
+                f"Expected points (n, {self.dim}) with n labels, n spaces and n parts, "
+                f"got {z.shape}, {y.shape}, {k.shape} and {own.shape}."
+            )
+        ring, total = self.ring, int(self.ring.total)
+        keep = slice(max(0, len(z) - ring.capacity), None)  # of more than fit, the newest
+        slots = (total + np.arange(len(z))[keep]) % ring.capacity
+        ring.points[:, slots] = torch.from_numpy(z[keep].T)
+        ring.labels[1, slots] = torch.from_numpy(y[keep])
+        ring.spaces[slots] = torch.from_numpy(k[keep])
+        ring.parts[slots] = torch.from_numpy(own[keep])
+        ring.total.fill_(total + len(z))
+        if own.any() or int(ring.repeats) > 0:
+            self._gather_parts()
+
+    def relabel(self, newest: int, part: int, label: int | None) -> bool:
+        """Give a point another label, or take it out where `label` is None; the others keep their order of age.
+
+        newest : its place counted from the newest point, which is 1.  part : hash of its part.
+        A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
+        """
+        ring, n = self.ring, len(self)
+        slot = (int(ring.total) - newest) % ring.capacity
+        if newest > n:
+            return True
+        if newest < 1 or int(ring.parts[slot]) != part:
+            return False
+        if label is None:
+            self._take_out(slot)
+        else:
+            ring.labels[1, slot] = float(label)
+        return True
+
+    def _take_out(self, slot: int) -> None:
+        ring, n = self.ring, len(self)
+        order = (int(ring.total) - n + torch.arange(n)) % ring.capacity  # oldest first
+        order = order[order != slot]
+        for held in (ring.points, ring.labels, ring.spaces, ring.parts):
+            held[..., : n - 1] = held[..., order]
+        ring.points[:, n - 1 :], ring.labels[1, n - 1 :] = 0.0, 1.0
+        ring.spaces[n - 1 :], ring.parts[n - 1 :] = 0, 0
+        ring.total.fill_(n - 1)
+        self._gather_parts()
+
+    def weigh(self) -> None:
+        """Find out how far the labels of one part go together, for all counts until this is asked again."""
+        if int(self.ring.repeats) > 0:
+            self.ring.agreement.fill_(label_agreement(self.points, self.labels, self.spaces, self.parts))
+
+    def _gather_parts(self) -> None:
+        """Find for every slot the first one of its part, and how many are not that."""
+        ring, n = self.ring, len(self)
+        slots = np.arange(ring.capacity)
+        _, first, inverse = np.unique(self.parts, return_index=True, return_inverse=True)
+        slots[:n] = np.where(self.parts != 0, first[inverse], slots[:n])
+        ring.first.copy_(torch.from_numpy(slots))
+        ring.repeats.fill_(int((slots != np.arange(ring.capacity)).sum()))
+
+    def count(self, queries: ArrayLike, radius: float, fraction: float = 0.0) -> Counts:
+        """(n_success, n_failure), each (n,): labels around each query (n, d), or (n, K, d) for K spaces.
+
+        radius : of the ball, its surface included.
+        fraction : where positive, the ball grows instead until it holds this share of all points.
+        """
+        z = torch.from_numpy(np.array(queries, dtype=np.float32))
+        z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
+        n_success, n_failure = np.zeros(len(z), dtype=np.int64), np.zeros(len(z), dtype=np.int64)
+        for i in range(len(z)):
+            n_success[i], n_failure[i] = self.ring.count_near(self.ring.squared_distances(z[i]), radius, fraction)
+        return n_success, n_failure
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Plain arrays, copies: points (d, n), labels (n,), spaces (n,), parts (n,), and total, points ever added."""
+        own: dict[str, NDArray[Any]] = {"points": self.points.T.copy(), "labels": self.labels, "spaces": self.spaces.copy()}
+        whole = {"agreement": self.ring.agreement.numpy().copy(), "total": self.ring.total.numpy().copy()}
+        return own | {"parts": self.parts.copy()} | whole
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
+        """The index that `get_state` was taken from: the same points in the same places."""
+        index = cls(len(state["points"]), capacity)
+        ring, n = index.ring, state["points"].shape[1]
+        ring.points[:, :n] = torch.from_numpy(np.array(state["points"]))
+        ring.labels[1, :n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
+        ring.spaces[:n] = torch.from_numpy(np.array(state["spaces"]))
+        if "parts" in state:  # 0.2 and before did not keep them
+            ring.parts[:n] = torch.from_numpy(np.array(state["parts"]))
+            ring.agreement.fill_(float(state["agreement"]))
+        ring.total.fill_(int(state["total"]))
+        index._gather_parts()
+        return index
+
+    def digest(self) -> str:
+        """SHA-256 of what is held: points as (d, n) float32, labels as float32, spaces as int64, one after the other."""
+        arrays = self.points.T, self.labels.astype(np.float32), self.spaces
+        return hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in arrays)).hexdigest()

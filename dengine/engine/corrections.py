@@ -1,0 +1,240 @@
+"""What people put right: a wrong label, labels to forget, a version to go back to, another policy.
+
+    engine.correct(decision.id, success=False, author="kim")
+    engine.rollback(3)
+
+Each is an event that is kept for ever. Nothing is overwritten: a correction is a later row, an earlier version answers
+again as a new one, and what was decided stays as it was decided.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..decision.policy import Policy
+from ..decision.rule import SAFE_MODE
+from ..errors import ReportError, SettingError
+from ..records import as_success
+from ..store.base import Store
+from ..store.outbox import Keeper
+from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
+from .decide import DecisionMaker
+from .feedback import Feedback
+from .resume import Telling
+from .settings import EngineSettings
+from .trainer import HUNG
+from .versions import ModelVersions
+
+SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops")  # what a rule is made of, and its evidence measured by
+SHADOW = {True: "shadow mode: every part is verified from now on", False: "the shadow mode ended: the model decides again"}
+SAID = {True: "success", False: "failure", None: "forgotten"}
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """What a verb that puts something right did.
+
+    kind : "correct", "forget", "rollback", "policy" or "shadow".  text : in words.
+    event : number of the event that was recorded; None where everything was as asked already, and nothing changed.
+    version : of the model that answers now.
+    """
+
+    kind: str
+    text: str
+    event: int | None
+    version: int
+
+
+def _rate_behind(now: EngineSettings, policy: Policy) -> float:
+    """The audit rate that comes back when the shadow mode ends: of before it, whatever else is changed meanwhile."""
+    if policy.audit_rate < 1.0:
+        return 0.0
+    before = now.recipe.policy.audit_rate
+    return before if before < 1.0 else now.shadowed_rate
+
+
+class Corrections:
+    """The part of `DataEngine` that puts things right."""
+
+    store: Store
+    _settings: EngineSettings
+    _versions: ModelVersions
+    _feedback: Feedback
+    _keeper: Keeper
+    _maker: DecisionMaker
+
+    def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
+        """Say that a label was wrong, or that a forgotten one counts again: from the next decision on, it counts as this.
+
+        The references of the model that answers, the traces of the next retrain, the rule's evidence and the certificate
+        take the label as it is corrected. Its trace's fold stays. A rival, which cannot take a label back, is trained anew
+        at once. What was reported, and what was decided, stays in the store as it was.
+        success : True or False, or 1 or 0.  author : who says so, for the record.
+        Raises ReportError for an unknown decision, and for one without a label. A label that is so already changes nothing.
+        """
+        label = as_success(success)
+        (known,) = self._to_correct([decision_id])
+        if known.success is label:
+            return self._unchanged("correct", f"Decision {known.id} counts as a {SAID[label]} already; nothing changed.")
+        text = f"decision {known.id} counts as a {SAID[label]}, was {_was(known)}"
+        data = {"decisions": {known.id: {"was": known.success, "now": label}}}
+        return self._correct(Change("correct", text, data, author, (known.id,), label))
+
+    def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
+        """Leave labels out of all that is learned and counted, from the next decision on; `correct` brings one back.
+
+        The traces, and the labels as they were reported, stay in the store: nothing is deleted, and nothing is promised to
+        whoever asks for deletion. The next retrain is the first that never saw them; until then the encoder that was
+        trained with them goes on. A guarantee assumes that what is forgotten is chosen blind to its label; the certificate
+        takes a forgotten outcome of what was certain for a wrong decision, so that forgetting earns nothing.
+        Raises ReportError for an unknown decision, and for one without a label; then none is forgotten.
+        """
+        if not decision_ids:
+            raise ReportError("Expected the ids of decisions to forget, got none; name at least one.")
+        known = self._to_correct(list(dict.fromkeys(decision_ids)))
+        ids = [each.id for each in known if each.success is not None]
+        if not ids:
+            return self._unchanged("forget", f"{_listed([each.id for each in known])} forgotten already; nothing changed.")
+        text = f"{_listed(ids)} forgotten" + (f": {reason}" if reason else "")
+        was = {each.id: {"was": each.success, "now": None} for each in known if each.success is not None}
+        return self._correct(Change("forget", text, {"decisions": was, "reason": reason}, author, tuple(ids), None))
+
+    def rollback(self, version: int, author: str = "") -> Changed:
+        """Let an earlier version answer again, as a new version, so that the history goes on in one line.
+
+        Labels that came since are among its references, and corrections count. The rule keeps what it was told. The next
+        retrain is due after as many new labels as after a training, and goes on from this version.
+        A reducer that is stored by its traces (umap), and a rival, are fitted again, which takes a training's time: the
+        first on what it was fitted on, the second on the same traces with the labels as they count now.
+        Raises StoreError for a version that is not kept, which names those that are.
+        """
+        if isinstance(version, bool) or not isinstance(version, int | np.integer):
+            raise SettingError(f"Expected the number of a version, got {version!r}; `store.retrains()` lists them.")
+        self._make_ready()
+        if version == self._versions.version and version > 0:
+            return self._unchanged("rollback", f"Version {version} answers already; nothing changed.")
+        before, now = self._versions.version, self._versions.next_number
+        text = f"version {version} answers again, as version {now} after {before}"
+        event = Change("rollback", text, {"to": int(version), "was": before, "now": now}, author)
+        self._versions.roll_back(int(version), event)
+        return self._done(event)
+
+    def set_policy(self, policy: Policy, author: str = "") -> Changed:
+        """Decide by another policy from the next decision on; every earlier one keeps the bounds that it was decided by.
+
+        Where alpha, the lower bound, the interval, the guarantee or what is known of stops changes, the rule and its pooled
+        guarantee start anew, told of what is decided from now on: a tolerance that is chosen after the data was seen is not
+        one of those that alpha was spent on, and old bounds are of another scale. The audit rate alone leaves the rule.
+        `certificate` speaks of what is decided under the policy in force, that is since this change: by itself each
+        certificate keeps its level, but one who may choose among m policies' certificates errs with up to m alpha.
+        An engine in safe mode begins the new policy in it, where its rule has one, until fresh evidence ends it.
+        A part that was accepted before, and of which nothing was heard, stays unheard of.
+
+        Raises SettingError for what is no policy, and, where a model was handed in, for anything but audit_rate and stops:
+        it decides by its own numbers.
+        """
+        if not isinstance(policy, Policy):
+            raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
+        return self._go_on_under(policy, author)
+
+    def set_shadow(self, on: bool, author: str = "") -> Changed:
+        """Verify every part from the next decision on, or end that: the shadow mode, which lasts over restarts.
+
+        What the model is certain of is then an audit, each part's: `Decision.predicted` says what it would have done, and
+        its label, `Source.AUDIT`, whether that was right; all is learned from as ever. It is the policy with an audit rate
+        of 1, and its end brings back the rate from before; so the certificate begins anew with each.
+        """
+        if not isinstance(on, bool):
+            raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
+        policy, before = self._settings.recipe.policy, self._settings.shadowed_rate
+        if on == (policy.audit_rate == 1.0):
+            return self._unchanged("shadow", f"The shadow mode is {'on' if on else 'off'} already; nothing changed.")
+        return self._go_on_under(replace(policy, audit_rate=1.0 if on else before), author)
+
+    def _go_on_under(self, policy: Policy, author: str) -> Changed:
+        old = self._settings.recipe.policy
+        new = {name: value for name, value in asdict(policy).items() if value != getattr(old, name)}
+        if not new:
+            return self._unchanged("policy", "The policy is in force already; nothing changed.")
+        own = self._settings.model is not None  # a model that was handed in keeps its rule
+        idle = sorted(set(new) - {"audit_rate", "stops"}) if own else []
+        if idle:
+            raise SettingError(
+                f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
+                "change only audit_rate and stops."
+            )
+        self._make_ready()
+        anew = not own and any(name in new for name in SCORING)
+        settings = self._under(policy, anew)
+        was = {name: getattr(old, name) for name in new}
+        text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
+        kind = "policy"
+        if list(new) == ["audit_rate"] and 1.0 in (old.audit_rate, policy.audit_rate):
+            kind, text = "shadow", SHADOW[policy.audit_rate == 1.0]
+        data = {"old": asdict(old), "new": asdict(policy)}
+        event = Change(kind, text, data, author, settings=settings.to_store())
+        telling = Telling(settings.told_since, settings.began_in)
+        self._versions.set_policy(policy if anew else None, telling, event)
+        self._settings, self._maker.audit_rate = settings, policy.audit_rate
+        self._feedback.begin_policy(policy.stops == "all", settings.policy_since)
+        return self._done(event, "the rule of the policy in force has none")
+
+    def _under(self, policy: Policy, anew: bool) -> EngineSettings:
+        """The settings under another policy; anew : whether its rule begins without evidence."""
+        now = self._settings
+        since = 0 if self._versions.answering is None else self._versions.next_number
+        shadowed = _rate_behind(now, policy)
+        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, shadowed_rate=shadowed)
+        return replace(settings, told_since=since, began_in=SAFE_MODE.index(self._feedback.safe_mode)) if anew else settings
+
+    def _make_ready(self) -> None:
+        """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
+        self._keeper.check()
+        self._versions.collect(HUNG)
+        self._feedback.store_all()
+        if self._versions.fleet is not None:
+            self._versions.fleet.complete()
+
+    def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
+        self._make_ready()
+        found = []
+        for each in ids:
+            known = self.store.get_decision(each) if isinstance(each, str) else None
+            if known is None:
+                raise unknown_decision(each)
+            if known.source is None:
+                raise nothing_to_correct(each)
+            found.append(known)
+        return found
+
+    def _correct(self, change: Change) -> Changed:
+        self.store.record(change)
+        for name in change.decisions:
+            self._keeper.forget(name)
+        self._versions.correct()
+        return self._done(change)
+
+    def _done(self, change: Change, safe_again: str = "what was told anew keeps the tolerance") -> Changed:
+        number = self.store.events(1)[0].number
+        self._feedback.announce(safe_again)
+        return Changed(change.kind, _sentence(f"{change.text}."), number, self._versions.version)
+
+    def _unchanged(self, kind: str, text: str) -> Changed:
+        return Changed(kind, _sentence(text), None, self._versions.version)
+
+
+def _was(known: StoredDecision) -> str:
+    return "forgotten" if known.success is None else f"a {SAID[known.success]}"
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _listed(ids: Sequence[str], most: int = 5) -> str:
+    shown = ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
+    return f"the labels of {shown} are" if len(ids) > 1 else f"the label of {shown} is"

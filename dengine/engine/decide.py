@@ -1,0 +1,158 @@
+"""From one trace to a recorded decision: the gate, the model, the audits' coin; and what a report on it means."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..decision.rule import script
+from ..errors import ReportError, TraceError, shortened
+from ..folds import audited, own_hash
+from ..model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
+from ..records import LONGEST, REASONS, Action, Decision, Reason, Source, TraceSpec, is_name
+from ..store.records import DecidedTrace, StoredDecision
+from ..traces import TraceGate, as_agreed, first_contract
+
+log = logging.getLogger("dengine")
+
+
+class DecisionMaker:
+    """Makes decisions on traces of one contract, with ids of its own.
+
+    audit_rate, seed : of the audits' coin, a fixed function of the trace.
+    """
+
+    def __init__(self, audit_rate: float, seed: int) -> None:
+        self.audit_rate = audit_rate
+        self.seed = seed
+        self._run, self._count = uuid.uuid4().hex[:12], 0
+
+    def agree_on(self, trace: TraceSpec) -> None:
+        """Set the contract that the gate checks."""
+        self._gate = script(TraceGate(trace))
+
+    def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
+        """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
+        spec, fit = first_contract(x, trace)
+        self._gate = TraceGate(spec)  # a bad one needs it as well: to say what is bad
+        return spec if fit else None
+
+    def decide(
+        self,
+        x: NDArray[np.float32],
+        part: str | None,
+        model: EngineModel | None,
+        version: int,
+        unasked: Reason | None = None,
+        decision_id: str | None = None,
+    ) -> DecidedTrace:
+        """(C, T) of a part with this number -> what goes into the store.
+
+        unasked : why the part is verified whatever the model says; None: it is asked.
+        """
+        fault, content = self._gate(torch.from_numpy(x))
+        hash_ = own_hash(content, part)
+        reason = REASONS[fault] if fault else unasked
+        prediction = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
+        decision = self._record(prediction, part, content, version)
+        named = decision if decision_id is None else replace(decision, id=decision_id)
+        return DecidedTrace(named, x, hash_, bool(fault), 0.0, part)
+
+    def unasked(
+        self, x: NDArray[np.float32], part: str | None, version: int, reason: Reason, decision_id: str
+    ) -> DecidedTrace:
+        """(C, T) that is verified whatever the model says, for this reason or for what is wrong with it; in any thread."""
+        fault, content = self._gate(torch.from_numpy(x))
+        decision = unasked(decision_id, part, version, REASONS[fault] if fault else reason)
+        return DecidedTrace(decision, x, own_hash(content, part), bool(fault), 0.0, part)
+
+    def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> DecidedTrace:
+        """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
+        fault, content = self._gate(torch.from_numpy(x))
+        accept = replace(NOTHING_KNOWN, action=Action.ACCEPT, reason=Reason.CERTAIN)
+        decision = self._record(accept, part, content, version)
+        # The part went on unchecked, whatever the audits' coin says.
+        went_on = replace(decision, id=decision_id, action=Action.ACCEPT, reason=Reason.CERTAIN, audit=False)
+        return DecidedTrace(went_on, x, own_hash(content, part), bool(fault), 0.0, part)
+
+    def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
+        certain, rate = predicted.action is not Action.VERIFY, self.audit_rate
+        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self.seed)[0])
+        self._count += 1
+        return Decision(
+            id=f"{self._run}-{self._count}",
+            action=Action.VERIFY if audit else predicted.action,
+            predicted=predicted.action,
+            lower=predicted.lower,
+            upper=predicted.upper,
+            n_success=predicted.n_success,
+            n_failure=predicted.n_failure,
+            embedding=predicted.embedding,
+            model_version=version,
+            reason=Reason.AUDIT if audit else predicted.reason,
+            audit=audit,
+            propensity=rate if certain else 1.0,
+            part=part,
+        )
+
+
+def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
+    if model is None:
+        return NOTHING_KNOWN
+    try:
+        return checked(model.predict_one(x, hash_))
+    except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
+        log.exception("the model failed on a trace; the part is verified")
+        return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
+
+
+def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
+    """The decision that this id has already; TraceError where it was made on another trace."""
+    x = as_agreed(trace, spec, False)
+    if not np.array_equal(x, known.trace, equal_nan=True):
+        raise TraceError(
+            f"Expected the trace that decision {known.id!r} was made on, got another; give it an id of its own."
+        )
+    return as_decision(known)
+
+
+def as_decision(known: StoredDecision) -> Decision:
+    """The decision as it was answered."""
+    return Decision(**{field.name: getattr(known, field.name) for field in fields(Decision)})
+
+
+def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
+    """To verify, for this reason, whatever the model says."""
+    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, reason, False, 1.0, part)
+    return Decision(decision_id, Action.VERIFY, Action.VERIFY, *said)
+
+
+def as_part(part: Any) -> str | None:
+    """A part's number as text; TraceError for what is neither a text nor a whole number, or does not fit a line."""
+    if part is None:
+        return None
+    whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
+    text = str(part) if whole and abs(int(part)) < 10**LONGEST else part
+    if not is_name(text):
+        raise TraceError(
+            f"Expected a part's number, a whole number or a text of 1 to {LONGEST} characters that print, got "
+            f"{shortened(part)}; strip what a scanner added, or pass None."
+        )
+    return str(text)
+
+
+def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
+    """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
+    if action is Action.REJECT:
+        raise ReportError(
+            f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label to report."
+        )
+    if action is Action.VERIFY:
+        return Source.AUDIT if audit else Source.VERIFICATION
+    return Source.CONFIRMED if success else Source.STOP

@@ -1,0 +1,586 @@
+"""The data engine: decide, report, retrain, run. Source: the paper's section "Data engine".
+
+engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95), store="engine.db")
+for cycle in engine.run(cell, cycles=1503):
+    ...
+
+Ctrl-C that waits until what is half done is done.
+
+What an engine says of itself: its settings in force, its model, what it can certify, what an exporter takes.
+
+What an engine and its traces agreed on: their contract, set once, by a user, a sister cell or the first sound trace.
+
+Decisions for whoever waits no more: verify, on the disk before it is said, though the engine's thread is busy.
+
+What an engine says of its own past: the history, and the explanation of a decision; and both of a store alone.
+
+The loop over a cell: insert, decide, then verify, go on or reject, report. Source: the paper's section "Data engine".
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import replace
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ..cells.base import Cell
+from ..decision.certificate import Certificate, certificate_of
+from ..decision.policy import Policy
+from ..errors import DengineError, StoreError
+from ..history.status import history
+from ..model.base import EngineModel, Exportable, Model
+from ..recipe import Recipe
+from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec, as_id, as_outcome, as_success
+from ..store.base import Store, opening
+from ..store.outbox import CLOSE, Keeper, OwnedStore
+from ..store.records import DecidedTrace, StoredDecision, stored_decision
+from ..store.views import PastDecision
+from ..traces import as_agreed
+from .corrections import Corrections
+from .decide import DecisionMaker, as_decision, as_part, decided_before, source_of, unasked
+from .feedback import Feedback, unknown_stop
+from .peers import agreed, as_sisters, trace_of_sisters
+from .resume import Telling, resume
+from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
+from .trainer import Clock, EncoderTime, Limits, Retrainer, Window
+from .versions import ModelVersions
+
+if TYPE_CHECKING:
+    from ..history.explain import Explanation
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Hold SIGINT back until the block ends: a label is stored and counted, or neither."""
+    before = signal.getsignal(signal.SIGINT)
+    # Python delivers signals to the main thread alone; an ignored signal interrupts nothing, nor does one that C handles.
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    held: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if held:
+            before(*held[0])
+
+
+class EngineFacts:
+    """How an engine stands; nothing here changes it."""
+
+    seed: int
+    store: Store
+    _settings: EngineSettings
+    _keeper: Keeper
+    _versions: ModelVersions
+    _feedback: Feedback
+
+    def find(self, decision_id: str) -> StoredDecision | None:
+        """A decision with its trace, and with its label where it has one; None for an unknown id."""
+        return self._keeper.find(as_id(decision_id))
+
+    def know_ids(self) -> None:
+        """Learn which ids are taken, so that `decide` looks no new one up in the store: quicker, where callers name them.
+
+        It reads every id once, a second for a million of them.
+        """
+        self.flush()
+        self._keeper.recent.know(self.store.decision_ids())
+
+    def flush(self) -> None:
+        """Return when all that is known so far is on the disk."""
+        self._feedback.store_waiting()
+        self._keeper.flush()
+
+    @property
+    def retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or waits to be swapped in."""
+        return self._versions.busy
+
+    @property
+    def swapping(self) -> bool:
+        """Whether a version that an executor has trained is on its way in, a step each time that the engine is asked."""
+        return self._versions.swapping
+
+    @property
+    def encoder_time(self) -> EncoderTime:
+        """What the encoder's training took so far."""
+        return self._versions.retrainer.encoder_time
+
+    @property
+    def recipe(self) -> Recipe:
+        """Every setting as it is in force; all but the policy are fixed once the engine is made."""
+        return self._settings.recipe
+
+    @property
+    def policy(self) -> Policy:
+        """The user's numbers as they are in force; `set_policy` changes them."""
+        return self._settings.recipe.policy
+
+    @property
+    def shadow(self) -> bool:
+        """Whether every part is verified, and the model only says what it would have done; `set_shadow` changes it."""
+        return self.policy.audit_rate == 1.0
+
+    @property
+    def trace(self) -> TraceSpec | None:
+        """The traces' contract; None before the first sound trace."""
+        return self._settings.trace
+
+    @property
+    def model(self) -> Any:
+        """The model that answers, a rival as its author knows it; None before the first retrain."""
+        return None if self._versions.answering is None else self._versions.answering.user_model
+
+    @property
+    def version(self) -> int:
+        """Of the model that answers; 0 before the first retrain."""
+        return self._versions.version
+
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
+        return self._feedback.safe_mode
+
+    @property
+    def store_fault(self) -> str:
+        """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
+        return self._keeper.fault
+
+    def certificate(self) -> Certificate:
+        """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
+        self.flush()
+        return certificate_of(self.store.outcomes(self._settings.policy_since), self.policy)
+
+    @property
+    def new_labels(self) -> int:
+        """Labels since the last retrain began."""
+        return self._versions.new_labels
+
+    def exported(self, trace: TraceSpec | None = None) -> Exportable:
+        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
+        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
+        coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
+        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
+        return replace(own, note=self._keeper.event, **about, **coin)
+
+
+log = logging.getLogger("dengine")
+
+
+class TraceAgreement(EngineFacts):
+    """The part of `DataEngine` that knows the traces' contract."""
+
+    _maker: DecisionMaker
+    _settings_waiting: bool
+
+    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
+        if self.trace is None:
+            trace = trace_of_sisters(self._keeper) or trace
+            self._settings = replace(self._settings, trace=trace, inferred=inferred)
+            self._maker.agree_on(trace)
+            self._save_settings()
+        return self._settings.trace or trace
+
+    def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
+        x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
+        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
+            if self.agree_on(spec, inferred=True) != spec:  # a sister's trace came first
+                return as_agreed(trace, self.trace, False)
+        elif self._settings_waiting:
+            self._save_settings()
+        return x
+
+    def _save_settings(self) -> None:
+        """Store the settings, or do it before the next decision, if the store is away."""
+        try:
+            self._keeper.ask(lambda: self.store.save_settings(self._settings.to_store()))
+            self._settings_waiting = False
+        except StoreError:
+            self._settings_waiting = True
+            log.exception("the settings are stored later")
+
+
+class LateDecisions(TraceAgreement):
+    """The part of `DataEngine` that another thread than its own may call."""
+
+    def decide_late(self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str) -> Decision:
+        """VERIFY, `Reason.LATE`, in any thread: what `decide` in the engine's own would say comes too late.
+
+        It is on the disk when this returns, and `decide` answers the same from then on. An id that has a decision keeps it;
+        where both come to it at once, the first to record one. What is wrong with a trace is said as ever.
+        In memory, which belongs to the engine's thread, and before the first trace has set the contract, `decide` has to
+        record it, with `late`. Errors as of `decide`.
+        """
+        self._keeper.check()
+        id_ = as_id(decision_id)
+        if (known := self._known(id_)) is None:
+            number = as_part(part)
+            if self.trace is None or not isinstance(self.store, OwnedStore):
+                return unasked(id_, number, self.version, Reason.LATE)
+            reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
+            x = as_agreed(trace, self.trace, False)
+            known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
+        self._keeper.secure()
+        return decided_before(known, trace, self.trace)
+
+    def _record(self, item: DecidedTrace) -> StoredDecision:
+        """Record a decision; returns what its id has now: of two threads the first's."""
+        known = stored_decision(item)
+        first = self._keeper.recent.add(known)
+        if first is known:
+            self._keeper.decided(item)
+        return first
+
+    def _known(self, decision_id: str) -> StoredDecision | None:
+        try:
+            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
+        except StoreError as error:  # the store is away: what was decided lately is known all the same
+            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
+            return None
+
+
+class EngineReview:
+    """The part of `DataEngine` that looks back."""
+
+    store: Store
+    _versions: ModelVersions
+
+    def history(
+        self,
+        last: int | None = None,
+        action: Action | str | None = None,
+        reason: Reason | str | None = None,
+        label: str | None = None,
+        since: float | None = None,
+        until: float | None = None,
+        predicted: Action | str | None = None,
+    ) -> Iterator[PastDecision]:
+        """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
+        return history(self.store, last, action, reason, label, since, until, predicted)
+
+    def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
+        """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
+        from ..history.explain import Records, explain
+
+        versions = self._versions
+        return explain(decision_id, Records(self.store, lambda: versions.answering, versions.version), neighbours)
+
+
+def explain_stored(store: Store, decision_id: str, neighbours: int = 10) -> Explanation:
+    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes."""
+    from ..history.explain import Records, explain
+
+    last = store.past_retrains()
+    version = max((each.report.version for each in last if each.report.accepted), default=0)
+    return explain(decision_id, Records(store, lambda: _present(store), version), neighbours)
+
+
+def _present(store: Store) -> EngineModel | None:
+    """The model that answers now, rebuilt; None where it needs an object that the store cannot name."""
+    try:
+        settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
+        telling = Telling(settings.told_since, settings.began_in)
+        return resume(store, template, Window(settings.recipe.window), telling).model
+    except DengineError as error:
+        log.info("the present model cannot be rebuilt from the store alone: %s", error)
+        return None
+
+
+KNOWN = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}  # silence is not a success
+
+
+def drive(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Cycle]:
+    """Let an engine drive a cell; a record a cycle. What is known is written when the loop ends, whatever ends it.
+
+    A cell that knows its parts' numbers tells that of the part it inserted last as `part`.
+    """
+    try:
+        for index in range(cycles):
+            yield _cycle(engine, cell, index)
+    finally:
+        engine.flush()
+
+
+def _cycle(engine: DataEngine, cell: Cell, index: int) -> Cycle:
+    trace = cell.insert()
+    begin = engine.clock()
+    decision = engine.decide(trace, getattr(cell, "part", None))
+    seconds = engine.clock() - begin
+    outcome, success, source = None, None, None
+    if decision.action is Action.VERIFY:
+        success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
+    elif decision.action is Action.ACCEPT:
+        outcome = as_outcome(cell.proceed(), f"decision {decision.id}, by proceed()")
+        success = KNOWN.get(outcome)
+    else:
+        cell.reject()
+    if success is not None:
+        source = source_of(decision.id, decision.action, decision.audit, success)
+        engine.report(decision.id, success)
+    return Cycle(index, decision, outcome, success, source, seconds, engine.settle(), engine.safe_mode)
+
+
+OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
+OnSafeMode = Callable[[str], object] | None
+StoreLike = str | os.PathLike[str] | Store
+
+
+class DataEngine(LateDecisions, EngineReview, Corrections):
+    """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
+
+    reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
+    policy : the user's two numbers.  trace : the traces' contract; None: the first sound trace sets it.
+    radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides.
+    store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
+    seed : of the reducer and of the audits' coin.
+    recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
+    model : any `Model`, a rival, in place of reducer and neighbours. It decides by its own rule: of a policy only
+        audit_rate and stops count then.
+    on_safe_mode : called with the reason when safe mode begins, "" when it ends.
+    executor : None retrains in line, between cycles; a `concurrent.futures.Executor` retrains while the cell goes on.
+    replaying : stop a retrain on steps alone and never on the clock, so that a seed repeats exactly.
+    clock : seconds, of any origin, by which retrains and decisions are timed.
+
+    One engine belongs to one thread, which it sets to one torch thread: steadier by far at these sizes.
+    Raises SettingError for settings that are out of range or contradict each other, StoreError for a used store.
+    """
+
+    def __init__(
+        self,
+        reducer: Any = None,
+        policy: Policy | None = None,
+        trace: TraceSpec | None = None,
+        radius: float | None = None,
+        folds: int | None = None,
+        retrain_every: int | None = None,
+        budget: float | None = None,
+        store: StoreLike | None = None,
+        seed: int = 0,
+        *,
+        recipe: Recipe | str | os.PathLike[str] | None = None,
+        model: Model | None = None,
+        executor: Executor | None = None,
+        replaying: bool = False,
+        clock: Clock = time.perf_counter,
+        on_safe_mode: OnSafeMode = None,
+    ) -> None:
+        beside = {"radius": radius, "folds": folds, "retrain_every": retrain_every, "budget": budget, "policy": policy}
+        if model is not None:
+            refuse_idle(reducer, beside)
+        settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
+        settings, template = settings.with_template(model)  # before a store is made: a wrong setting leaves none behind
+        with opening(store) as opened:
+            if opened.settings():
+                raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
+            self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
+            with self._closed_on_failure():
+                self.store.save_settings(self._settings.to_store())
+                self._versions.join()
+
+    def _start(
+        self,
+        settings: EngineSettings,
+        template: EngineModel,
+        store: Store,
+        executor: Executor | None = None,
+        replaying: bool = False,
+        clock: Clock = time.perf_counter,
+        on_safe_mode: OnSafeMode = None,
+        reading: bool = False,
+    ) -> None:
+        torch.set_num_threads(1)
+        limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
+        encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
+        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
+        self._keeper = Keeper(store, owning=not reading, patient=replaying)
+        weakref.finalize(self, self._keeper.close)  # of a program that forgot to
+        telling, since = Telling(settings.told_since, settings.began_in), settings.policy_since
+        self._versions = ModelVersions(template, retrainer, self._keeper, clock, telling)
+        stops_all = settings.recipe.policy.stops == "all"
+        self._feedback = Feedback(self._keeper, self._versions, stops_all, on_safe_mode, since)
+        self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
+        self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
+        self._settings_waiting = False
+        if settings.trace is not None:
+            self._maker.agree_on(settings.trace)
+
+    @contextmanager
+    def _closed_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._keeper.close()
+            raise
+
+    @classmethod
+    def from_recipe(cls, recipe: Recipe | str | os.PathLike[str], store: Any = None, **options: Any) -> Self:
+        """An engine with every setting from a recipe: a `Recipe`, a name or a TOML file."""
+        return cls(recipe=recipe, store=store, **options)
+
+    @classmethod
+    def open(
+        cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, wait: float | None = None, **options: Any
+    ) -> Self:
+        """Go on with a store: the same version, the same decisions, bit for bit.
+
+        wait : seconds for a file or URL, as `SqlStore` takes it.
+        reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
+        options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them; reading=True looks at a
+            store that another engine may own, to export it for one, and neither decides nor learns.
+        Raises StoreError where there is nothing to go on with or another engine owns the cell, SettingError where an object
+        is missing.
+        """
+        engine = cls.__new__(cls)
+        with opening(url, must_exist=True, wait=wait) as store:
+            name = "the store" if isinstance(url, Store) else str(url)
+            settings = EngineSettings.from_store(store.settings(), name, reducer, model)
+            engine._start(*settings.with_template(model), store, **options)
+            with engine._closed_on_failure():
+                engine._versions.resume()
+                engine._feedback.resume()
+        engine.resumed = True
+        return engine
+
+    @classmethod
+    def open_or_create(
+        cls, store: StoreLike | None, seed: int | None = None, *, wait: float | None = None, **settings: Any
+    ) -> Self:
+        """Go on with a store that has been used, or start on a new one: the same line at every start of a program.
+
+        wait : as for `open`.
+        settings : as `DataEngine` takes them. Those given must be what a used store was made with, or a SettingError
+            says so: a running cell's settings do not change in silence.
+        """
+        with opening(store, wait=wait) as opened:
+            if not opened.settings():
+                return cls(store=opened, **as_sisters(settings | {"seed": seed}, opened))
+            options = {name: settings.pop(name) for name in OPTIONS if name in settings}
+            engine = cls.open(opened, reducer=object_of(**settings), **options)
+            with engine._closed_on_failure():
+                engine._settings.must_agree_with(settings | {"seed": seed})
+            return engine
+
+    def decide(
+        self,
+        trace: ArrayLike,
+        part: str | int | None = None,
+        *,
+        wait: bool = False,
+        decision_id: str | None = None,
+        late: bool = False,
+    ) -> Decision:
+        """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
+
+        TraceError for a wrong shape, and for a first trace of less than 10 samples; whatever else fails becomes VERIFY, a
+        store that is away too.
+        part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
+        wait : return only when the decision is in the store; by default it is there before any report on it returns.
+        decision_id : of the caller's, used once, so that whoever died before the answer asks again: the same id and trace
+            have the same decision for ever, which is on the disk, in the store's journal at least, when this returns.
+            TraceError for the id of another trace, ReportError for what is no id.
+        late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
+        """
+        self._keeper.check()
+        with uninterrupted():
+            id_ = None if decision_id is None else as_id(decision_id)
+            if id_ is not None and (known := self._known(id_)) is not None:
+                return decided_before(known, trace, self.trace)
+            self._versions.collect()
+            self.encoder_time.earn()
+            x, number = self._as_trace(trace), as_part(part)
+            self._feedback.settle()
+            unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
+            known = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
+            if wait:
+                self._keeper.flush()
+            elif id_ is not None:
+                self._keeper.secure()
+        return as_decision(known)
+
+    def _put(self, item: DecidedTrace) -> StoredDecision:
+        known = self._record(item)
+        self._feedback.decided(known)
+        return known
+
+    def report(
+        self, decision_id: str, success: bool, trace: ArrayLike | None = None, part: str | int | None = None
+    ) -> RetrainReport | None:
+        """Tell what became of a decision; the label survives a killed process once this returns.
+
+        success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
+        trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
+        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a report
+        on a rejected part, or a label that is neither a bool nor exactly 1 or 0; StoreError where neither the store nor its
+        journal can be written: nothing is taken then.
+        """
+        said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
+        self._keeper.check()
+        with uninterrupted():
+            self._versions.collect()
+            known = self._keeper.find(id_) or self._lost_stop(id_, said, trace, part)
+            self._feedback.report(known, said)
+            return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
+
+    def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
+        if trace is None or success:
+            raise unknown_stop(decision_id)
+        item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
+        return self._put(item)
+
+    def retrain(self) -> RetrainReport:
+        """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
+        self._keeper.check()
+        with uninterrupted():
+            return self._versions.retrain()
+
+    def start_retrain(self) -> RetrainReport | None:
+        """Retrain in the executor while the cell goes on; without one in line, as `retrain`, which returns its report."""
+        return self._versions.start_retrain()
+
+    def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
+        """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written."""
+        return drive(self, cell, cycles)
+
+    def settle(self, brief: bool = False) -> RetrainReport | None:
+        """Do what need not wait for a report: a retrain, a new version, a slice of training; the newest retrain, once.
+
+        brief : bring a version that an executor has trained a step further, a few milliseconds, and not to the end.
+        """
+        with uninterrupted():
+            self._versions.collect(to_the_end=not brief)
+            self._versions.work(self.recipe.retrain_every)
+            return self._versions.take_news()
+
+    def close(self) -> None:
+        """Finish a retrain under way, within seconds, write everything, and let the store go; a second time does nothing.
+
+        StoreError where something is left that neither the store nor its journal takes; close again when there is room.
+        """
+        with uninterrupted():
+            if self._keeper.usable:
+                self._feedback.store_waiting()
+                self._versions.collect(CLOSE)
+            self._keeper.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -1,0 +1,210 @@
+"""What an engine is, apart from what it has learned: the settings that it was made with, and that its store keeps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Self
+
+from .. import __version__
+from ..decision.policy import Policy
+from ..errors import SettingError, StoreError, shortened
+from ..model.base import EngineModel, Model
+from ..model.neighbours import ModelPrediction
+from ..model.rival import as_engine_model
+from ..recipe import OBJECT, Recipe, described
+from ..records import TraceSpec, is_whole
+
+SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
+LOOP = (
+    "seed",
+    "trace",
+    "retrain_every",
+    "budget",
+    "encoder_budget",
+    "max_steps",
+    "window",
+    "audit_rate",
+    "stops",
+)  # that count for any model
+MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set
+
+
+@dataclass(frozen=True, slots=True)
+class EngineSettings:
+    """An engine's settings.
+
+    recipe : as it is in force.  seed : of the reducer and of the audits' coin, 0 or more.
+    model : what a model that was handed in is called; None: the recipe describes the model.
+    described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
+    trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
+    policy_since : the first model version under the policy in force; 0: every one.
+    told_since : the first version of whose decisions the rule in force is told.  began_in : the position in `SAFE_MODE`
+        that it began in.
+    shadowed_rate : the audit rate that the shadow mode took the place of.
+    """
+
+    recipe: Recipe
+    seed: int = 0
+    model: str | None = None
+    described: str | None = None
+    trace: TraceSpec | None = None
+    inferred: bool = False
+    policy_since: int = 0
+    told_since: int = 0
+    began_in: int = 0
+    shadowed_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not is_whole(self.seed, 0, SEEDS):
+            raise SettingError(f"Expected a seed of 0 or more, an integer of at most {SEEDS}, got {shortened(self.seed)}.")
+        if not (self.trace is None or isinstance(self.trace, TraceSpec)):
+            raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
+
+    def to_store(self) -> dict[str, str]:
+        """As `Store.save_settings` takes them."""
+        known = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
+        known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
+        if self.trace is not None:
+            known["trace"] = json.dumps(asdict(self.trace))
+        if self.inferred:
+            known["inferred"] = "true"
+        return known | {name: str(value) for name in (*MARKS, "shadowed_rate") if (value := getattr(self, name))}
+
+    @classmethod
+    def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
+        """What `to_store` gave. name : of the store, for errors.
+
+        reducer, model : objects that the store cannot bring back, handed in again. Raises StoreError for a store that no
+        engine has used, SettingError where an object is missing, or is another one than the store was made with.
+        """
+        if "recipe" not in known:
+            raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
+        recipe = Recipe.from_toml(known["recipe"], f"the recipe in {name}")
+        made_with = known.get("described")
+        if "model" in known and model is None:
+            raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
+        unnamed = str(known.get("dengine")).startswith("0.1.")  # that version did not say whose model it drove
+        if "model" not in known and model is not None and not unnamed:
+            raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
+        if model is not None or recipe.name.startswith(OBJECT):
+            if model is None and (reducer is None or isinstance(reducer, str)):
+                raise SettingError(
+                    f"The reducer of {name}, {recipe.reducer}, has no name in TOML: hand it in again, reducer=..."
+                )
+            given = described(reducer) if model is None else as_engine_model(model).description
+            if made_with is not None and given != made_with:
+                raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")
+            recipe = recipe if model is not None else replace(recipe, reducer=reducer, params={})
+        elif reducer is not None and not isinstance(reducer, str):
+            again = Recipe.from_toml(Recipe(reducer).to_toml())
+            if (again.reducer, again.params) != (recipe.reducer, recipe.params):
+                raise SettingError(
+                    f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
+                )
+        inferred = "inferred" in known
+        marks = {name: int(known.get(name, "0")) for name in MARKS}
+        model_, trace, rate = known.get("model"), trace_in(known), shadowed_rate_in(known)
+        return cls(recipe, seed_in(known), model_, made_with, trace, inferred, **marks, shadowed_rate=rate)
+
+    def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
+        """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
+        if model is None:
+            own = self.recipe.reducer
+            described_ = None if isinstance(own, str) else described(own)
+            return replace(self, described=described_), ModelPrediction.from_recipe(self.recipe, self.seed)
+        template = as_engine_model(model)
+        in_force = template.in_force(self.recipe)  # of our own kind its numbers count, a rival's are its own affair
+        return replace(self, recipe=in_force, model=template.name, described=template.description), template
+
+    def must_agree_with(self, asked: Mapping[str, Any]) -> None:
+        """SettingError where what is asked for, as `DataEngine` takes it, is not what is set; None asks for nothing."""
+        given = {name: value for name, value in asked.items() if value is not None}
+        reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
+        have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
+        if self.recipe.policy.audit_rate == 1.0:  # a program's settings are the same in the shadow mode
+            have["audit_rate"] = self.shadowed_rate
+        unknown = sorted(set(given) - set(have))
+        if unknown:
+            raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
+        wished = {} if recipe is None else flat(chosen_recipe(reducer, recipe, {}))
+        wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
+        if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
+            wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
+        counts = LOOP if self.model is not None else tuple(have)
+        other = sorted(name for name in wished if name in counts and wished[name] != have[name])
+        if other:
+            stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
+            raise SettingError(
+                f"Expected the store's own settings ({stored}), got {got}; leave them out or name a new store."
+            )
+
+
+def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:
+    """The recipe that was asked for, or the reducer's own, with the settings that were given beside it.
+
+    SettingError where both are given and contradict each other: a recipe's radius and parameters belong to its reducer.
+    """
+    base = Recipe.load(recipe if recipe is not None else "conv" if reducer is None else reducer)
+    if recipe is not None and reducer is not None and reducer != base.reducer:
+        raise SettingError(f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out.")
+    return base.with_settings(**beside)
+
+
+def object_of(reducer: Any = None, recipe: Any = None, **others: Any) -> Any:
+    """The reducer among settings that is an object, if any: a store may not be able to bring it back."""
+    found = recipe.reducer if reducer is None and isinstance(recipe, Recipe) else reducer
+    return None if isinstance(found, str) else found
+
+
+def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
+    """SettingError for settings beside a model that was handed in and decides by its own: they would have no effect."""
+    idle = [name for name in ("radius", "folds") if beside.get(name) is not None]
+    idle += [] if reducer is None else ["reducer"]
+    policy = beside.get("policy")
+    idle += [] if policy is None or replace(policy, audit_rate=0.0, stops="some") == Policy() else ["policy"]
+    if idle:
+        raise SettingError(
+            f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
+            "set it on the model, or leave it out (of a policy audit_rate and stops alone count)."
+        )
+
+
+def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
+    """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
+    if "trace" not in known:
+        return None
+    try:
+        return TraceSpec(**json.loads(known["trace"]))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(
+            f"Expected the contract of traces in the store's settings, got {shortened(known['trace'])}: {error}; restore "
+            "the store from a copy."
+        ) from error
+
+
+def seed_in(known: Mapping[str, str]) -> int:
+    """The seed among a store's settings. StoreError for what is none."""
+    seed = known.get("seed", "0")
+    if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
+        raise StoreError(f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy.")
+    return int(seed)
+
+
+def shadowed_rate_in(known: Mapping[str, str]) -> float:
+    """The audit rate behind the shadow mode among a store's settings. StoreError for what is none."""
+    text = known.get("shadowed_rate", "0")
+    try:
+        return Policy(audit_rate=float(text)).audit_rate
+    except (ValueError, SettingError) as error:
+        raise StoreError(
+            f"Expected an audit rate in the store's settings, got {shortened(text)}; restore the store from a copy."
+        ) from error
+
+
+def flat(recipe: Recipe) -> dict[str, Any]:
+    """Every setting of a recipe by its name, the policy's among them."""
+    plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
+    policy: Policy = plain.pop("policy")
+    return plain | asdict(policy)

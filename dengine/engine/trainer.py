@@ -1,0 +1,382 @@
+"""A retrain inside its time budget: the candidate, the gate, the swap's reserve.
+
+A retrain in an executor, which may die or hang: neither stops the cell.
+
+The window that a retrain sees: the newest labelled traces, in memory.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from dataclasses import dataclass, replace
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..errors import DengineError, SettingError
+from ..model.base import EngineModel
+from ..reducers.base import StopRule
+from ..store.records import Labelled
+
+log = logging.getLogger("dengine")
+HUNG = 60.0  # seconds after which work in the executor is given up
+
+T = TypeVar("T")
+
+
+class Pending(Generic[T]):
+    """Work in an executor.
+
+    seq : the labels that it was given.
+    gave_up : whether the executor is of no more use. It is the caller's, and cannot be made anew here: what follows is done
+        in line.
+    """
+
+    def __init__(self, future: Future[T], seq: NDArray[np.int64]) -> None:
+        self.seq = seq
+        self.gave_up = False
+        self._future = future
+        self._began = time.monotonic()
+
+    @classmethod
+    def submit(
+        cls, executor: Executor, work: Callable[..., T], args: tuple[Any, ...], seq: NDArray[np.int64]
+    ) -> Self | None:
+        """Begin; None where the executor takes no more work, for it is broken or shut down."""
+        try:
+            return cls(executor.submit(work, *args), seq)
+        except RuntimeError as error:
+            log.error("the executor takes no more work, retrains are in line from now on: %s", error)
+            return None
+
+    def due(self, wait: float) -> bool:
+        """Whether a result may be asked for: it is there, or worth so many seconds, or will not come."""
+        return self._future.done() or wait > 0.0 or self._left() <= 0.0
+
+    def result(self, wait: float) -> T:
+        """Return it within so many seconds. Raises what the work raised, RuntimeError where it died or is not done."""
+        try:
+            return self._future.result(timeout=max(0.0, min(wait, self._left())))
+        except BrokenExecutor as error:
+            self.gave_up = True
+            raise RuntimeError(f"{type(error).__name__}: {error} Retrains are in line from now on.") from error
+        except TimeoutError as error:
+            if self._future.done():  # the work's own
+                raise
+            self.gave_up = True
+            self._future.cancel()
+            seconds = time.monotonic() - self._began
+            raise RuntimeError(
+                f"not done after {seconds:.0f} s in the executor. Retrains are in line from now on."
+            ) from error
+
+    def _left(self) -> float:
+        return self._began + HUNG - time.monotonic()
+
+
+class Window:
+    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._clear()
+
+    def _clear(self) -> None:
+        self.total = 0
+        self._traces: NDArray[np.float32] | None = None
+        self._labels = np.zeros(0, dtype=np.int8)
+        self._hashes = np.zeros(0, dtype=np.int64)
+        self._seq = np.zeros(0, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return min(self.total, self.capacity)
+
+    @property
+    def newest_seq(self) -> int:
+        """Sequence number of the newest label; 0 before the first."""
+        return int(self._seq[(self.total - 1) % self.capacity]) if self.total else 0
+
+    def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+        """Take in one labelled trace (C, T); on a full window it takes the oldest one's place."""
+        self._grow(trace)
+        assert self._traces is not None  # for the type checker: _grow made it
+        if self.total == self.capacity:
+            self._traces = self._traces.copy()  # from now on places are taken again: who has a snapshot keeps the old ones
+        slot = self.total % self.capacity
+        self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
+        self.total += 1
+
+    def extend(self, labelled: Labelled) -> None:
+        """Take in many, oldest first."""
+        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
+            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
+
+    def refill(self, labelled: Labelled) -> None:
+        """Hold these, oldest first, in the place of all that was held."""
+        self._clear()
+        self.extend(labelled)
+
+    def after(self, seq: int) -> int:
+        """How many labels after this one are held."""
+        return len(self.newer(seq))
+
+    def draw(self, n: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Traces (m, C, T) and hashes (m,) of `n` at most, drawn blind to labels, others at each new label."""
+        assert self._traces is not None  # the caller knows of labels; for the type checker
+        slots = np.random.default_rng(self.total).permutation(len(self))[:n]
+        return self._traces[slots], self._hashes[slots]
+
+    def snapshot(self) -> Labelled:
+        """What is held, oldest first. Nobody writes to these arrays afterwards."""
+        order = self._order()
+        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces
+        # Until the window is full no place is written twice: only then they have to be copied.
+        traces = traces[: len(order)] if self.total <= self.capacity else traces[order]
+        return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
+
+    def newer(self, seq: int) -> NDArray[np.int64]:
+        """Sequence numbers of the labels after this one, in the order in which they came."""
+        held = self._seq[self._order()]
+        return held[held > seq]
+
+    def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
+        """Trace (C, T), label and hash of a label that is held."""
+        assert self._traces is not None  # the caller knows of the label; for the type checker
+        slot = int(np.flatnonzero(self._seq[: len(self)] == seq)[-1])
+        return self._traces[slot], int(self._labels[slot]), int(self._hashes[slot])
+
+    def _order(self) -> NDArray[np.int64]:
+        """The places of what is held, oldest first."""
+        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
+        return (np.arange(n) + first) % self.capacity
+
+    def _grow(self, trace: NDArray[np.float32]) -> None:
+        # Doubled as needed: a full window of 10,000 x 1000 samples is 40 MB, and most cells start with none.
+        room = 0 if self._traces is None else len(self._traces)
+        if self.total < room or room == self.capacity:
+            return
+        size = min(self.capacity, max(64, 2 * room))
+        grown = np.zeros((size, *trace.shape), dtype=np.float32)
+        if self._traces is not None:
+            grown[:room] = self._traces
+        self._traces = grown
+        self._labels = np.concatenate([self._labels, np.zeros(size - room, dtype=np.int8)])
+        self._hashes, self._seq = (
+            np.concatenate([a, np.zeros(size - room, dtype=np.int64)]) for a in (self._hashes, self._seq)
+        )
+
+
+SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
+MARGIN = 1.2  # the tail grows a little with each retrain
+SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
+STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
+MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
+DRAWN = 1024  # traces that a slice trains on
+
+Clock = Callable[[], float]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a retrain may use.
+
+    budget : seconds of wall time for the whole; None: time decides nothing.
+    max_steps : optimiser steps; None: as many as the reducer's own settings say.
+    reserve : seconds kept for what follows the last step: re-embedding, compiling, the swap. The default serves until
+        a tail was measured.
+    """
+
+    budget: float | None = None
+    max_steps: int | None = None
+    reserve: float = 0.3
+
+
+@dataclass(frozen=True)
+class Slice:
+    """What one run of the encoder's training may use: seconds by the clock, or steps where a seed must repeat exactly."""
+
+    seconds: float | None
+    steps: int | None
+
+    def stop(self, clock: Clock) -> StopRule:
+        """The rule, from now on."""
+        return StopRule(None if self.seconds is None else clock() + self.seconds, self.steps, clock)
+
+
+class EncoderTime:
+    """The time in which the encoder may train: so much a cycle on average, saved up and taken in slices.
+
+    per_cycle : seconds.
+    in_steps : whether a step counts as `STEP_SECONDS`, whatever it took.
+    steps : taken so far.  seconds : that they counted as.  longest : seconds by the clock of the longest slice in line.
+    """
+
+    def __init__(self, per_cycle: float, in_steps: bool) -> None:
+        self.per_cycle, self.in_steps = per_cycle, in_steps
+        self.saved = 0.0
+        self.steps, self.seconds, self.longest = 0, 0.0, 0.0
+
+    def earn(self) -> None:
+        """A cycle has begun."""
+        self.saved = min(self.saved + self.per_cycle, max(MOST_SECONDS, self.per_cycle))
+
+    def take(self, least: float = 0.0, most: float = MOST_SECONDS) -> Slice | None:
+        """Up to `most` seconds of what is saved up, where it is `least` at least; None: nothing is due."""
+        seconds = min(self.saved, most)
+        if seconds <= 0.0 or self.saved < least:
+            return None
+        if self.in_steps:
+            return Slice(None, steps) if (steps := round(seconds / STEP_SECONDS)) else None
+        return Slice(seconds, None)
+
+    def spend(self, steps: int, seconds: float) -> None:
+        """Account for steps that took so long."""
+        counted = steps * STEP_SECONDS if self.in_steps else seconds
+        # What trained nothing, having nothing to train or failing at it, is not asked again at every cycle.
+        self.saved = max(0.0, self.saved - counted) if steps else 0.0
+        self.steps, self.seconds = self.steps + steps, self.seconds + counted
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """The outcome of a training.
+
+    model : to swap in; None: dropped.  reason : why, in words.
+    seconds : of the whole.  tail : of what followed the last step, the next retrain's reserve.
+    encoder_steps, encoder_seconds : that the encoder trained before, beside the cell.
+    """
+
+    model: EngineModel | None
+    reason: str
+    n_steps: int
+    seconds: float
+    tail: float
+    encoder_steps: int = 0
+    encoder_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A candidate, the labels it was trained on, and when that began by the retrainer's clock."""
+
+    candidate: Candidate
+    seq: NDArray[np.int64]
+    begin: float
+
+
+class Retrainer:
+    """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
+
+    clock : seconds, of any origin; with a process executor it must pickle, as `time.perf_counter` does.
+    encoder_time : in which the encoder may train; None: it never does.
+    """
+
+    def __init__(
+        self,
+        window: Window,
+        limits: Limits,
+        executor: Executor | None,
+        clock: Clock = time.perf_counter,
+        encoder_time: EncoderTime | None = None,
+    ) -> None:
+        self.encoder_time = encoder_time or EncoderTime(0.0, in_steps=True)
+        self.window = window
+        self.limits = limits
+        self.executor = executor
+        self.clock = clock
+        self._pending: Pending[Candidate] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a retrain is under way beside the cell, or waits to be swapped in."""
+        return self._pending is not None
+
+    def improve(self, current: EngineModel) -> None:
+        """Train the current model's encoder for a slice, in line, where one is due."""
+        piece = self.encoder_time.take(SLICE_SECONDS, SLICE_SECONDS)
+        if piece is None or self.executor is not None or not len(self.window):
+            return
+        begin = self.clock()
+        steps = current.improve_safely(*self.window.draw(DRAWN), piece.stop(self.clock))
+        seconds = self.clock() - begin
+        self.encoder_time.spend(steps, seconds)
+        self.encoder_time.longest = max(self.encoder_time.longest, seconds)
+
+    def train(self, current: EngineModel) -> Trained:
+        """Train a successor of the current model, in line."""
+        begin, data = self.clock(), self.window.snapshot()
+        candidate = train_candidate(current.successor(), data, self.limits, self.clock)
+        return self._note(Trained(candidate, data.seq, begin))
+
+    def start(self, current: EngineModel) -> bool:
+        """Train a successor of the current model beside the cell; False where the executor takes no more work."""
+        assert self.executor is not None  # the caller asked; for the type checker
+        data, piece = self.window.snapshot(), self.encoder_time.take()
+        work = (current.successor(), data, self.limits, self.clock, piece)
+        self._pending = Pending.submit(self.executor, _train_beside, work, data.seq)
+        self.executor = self.executor if self.busy else None
+        return self.busy
+
+    def collect(self, wait: float = 0.0) -> Trained | None:
+        """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
+        pending = self._pending
+        if pending is None or not pending.due(wait):
+            return None
+        self._pending = None
+        try:
+            candidate = pending.result(wait)
+        except Exception as error:  # recorded, and the old version goes on answering
+            log.error("a retrain in the executor failed: %s", error, exc_info=not pending.gave_up)
+            candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
+            self.executor = None if pending.gave_up else self.executor
+        self.encoder_time.spend(candidate.encoder_steps, candidate.encoder_seconds)
+        return self._note(Trained(candidate, pending.seq, self.clock() - candidate.seconds))
+
+    def _note(self, trained: Trained) -> Trained:
+        if trained.candidate.model is not None:
+            self.limits = replace(self.limits, reserve=SWAP_SECONDS + MARGIN * trained.candidate.tail)
+        return trained
+
+
+def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock, piece: Slice | None) -> Candidate:
+    torch.set_num_threads(1)  # per thread, and first thing in each
+    begin, steps = clock(), 0
+    if piece is not None and len(data.seq):
+        steps = successor.improve_safely(data.traces, data.hashes, piece.stop(clock))
+    seconds = clock() - begin
+    return replace(train_candidate(successor, data, limits, clock), encoder_steps=steps, encoder_seconds=seconds)
+
+
+def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:
+    """Train a successor on the data; a plain function of plain arguments, so that any executor can run it.
+
+    The gate reads no label. One on held-out loss belongs to each head, inside the reducer: here it would let fold k's
+    labels choose encoder k.
+    """
+    begin = clock()
+    deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
+    stop = StopRule(deadline, limits.max_steps, clock)
+    n_steps, reason = 0, ""
+    try:
+        if not len(data.seq):
+            raise SettingError("there is no labelled trace yet; report one first")
+        report = successor.train(data.traces, data.labels, hashes=data.hashes, stop=stop).report
+        n_steps, defect = report.n_steps, successor.defect()
+        model = None if defect else successor
+        reason = f"dropped: {defect}" if defect else "; ".join(filter(None, ("accepted", report.note)))
+    except DengineError as error:
+        model, reason = None, f"dropped: {error}"
+    except Exception as error:  # no exception inside a model reaches the cell: it is recorded
+        model, reason = None, _dropped(error)
+    end = clock()
+    return Candidate(model, reason, n_steps, end - begin, end - (stop.asked_at or begin))
+
+
+def _dropped(error: Exception) -> str:
+    lines = str(error).splitlines() or [""]
+    return f"dropped: {type(error).__name__}: {lines[0]}"

@@ -1,0 +1,10 @@
+from .bundle import make_key as make_key
+from .bundle import read_metadata as read_metadata
+from .bundle import sum_file as sum_file
+from .onnx import export_onnx as export_onnx
+from .onnx import load_onnx as load_onnx
+from .torchscript import ExportedDecision as ExportedDecision
+from .torchscript import ExportedModel as ExportedModel
+from .torchscript import export_sources as export_sources
+from .torchscript import export_torchscript as export_torchscript
+from .torchscript import load_exported as load_exported

@@ -1,0 +1,377 @@
+"""An exported file, whatever its format: what it is made from, what it says of itself, and its checksum.
+
+The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. What does is a
+signature, by `key`.
+
+Signatures: whether a file comes from who has the key, found out before a byte of it is run.
+
+    dengine make-key cell.key
+    dengine export engine.db --out model.ts --key cell.key          # model.ts.sig beside it
+    load_exported("model.ts", key="cell.key")
+
+HMAC-SHA256 (FIPS 198-1) with a secret that both sides have: it is symmetric, so whoever can check a signature can make
+one. Keep the key's file where only the exporter and the controller read it. An earlier file that was signed with the same
+key is as valid as the newest one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import io
+import json
+import os
+import re
+import secrets
+import time
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import __version__
+from ..decision.policy import RULES
+from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS
+from ..errors import ExportError, OutputError
+from ..files import SUMS, Kind, check_output, write_output
+from ..model.base import Exportable
+from ..records import Action, Reason, TraceSpec
+from .decision import FIELDS, DecisionModule
+
+PREFIX = "hmac-sha256:"
+SHORTEST_KEY = 16  # bytes
+KEY_BYTES = 32
+
+KeyFile = str | os.PathLike[str]
+
+
+def make_key(path: KeyFile) -> Path:
+    """Write a new random key, 64 hexadecimal digits, to a file that is not there yet and that only its owner reads.
+
+    ExportError where there is a file already: models were signed with it.
+    """
+    target = Path(path)
+    try:
+        descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise ExportError(f"{target} is there already, and files may be signed with it; name a new one.") from error
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(secrets.token_hex(KEY_BYTES) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    return target
+
+
+def _unwritable(target: Path, error: OSError) -> ExportError:
+    return ExportError(f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable.")
+
+
+def read_key(path: KeyFile) -> bytes:
+    """The secret in a key's file, without the line end; ExportError for what is too short to be one."""
+    try:
+        key = Path(path).read_bytes().rstrip(b"\r\n")
+    except OSError as error:
+        raise ExportError(
+            f"The key's file {path} cannot be read: {error.strerror}; dengine make-key writes one."
+        ) from error
+    if len(key) < SHORTEST_KEY:
+        raise ExportError(
+            f"Expected a key of {SHORTEST_KEY} bytes or more in {path}, got {len(key)}; use dengine make-key."
+        )
+    return key
+
+
+def signature_file(path: Path) -> Path:
+    """Where the signature lies."""
+    return path.with_name(path.name + ".sig")
+
+
+def signature(content: bytes, key: bytes) -> str:
+    """What a signature's line begins with."""
+    return PREFIX + hmac.new(key, content, hashlib.sha256).hexdigest()
+
+
+def listed(text: str, name: str) -> list[str]:
+    """The first words of the lines that are about a file, or about none in particular.
+
+    Two while a file is being replaced: the earlier one and the next. A file that was renamed together with its one line is
+    still known by it.
+    """
+    found: list[str] = []
+    others: list[str] = []
+    for line in text.splitlines():
+        word, _, about = line.strip().partition(" ")
+        if word:
+            (found if about.lstrip(" *") in ("", name) else others).append(word)
+    return others if not found and len(others) == 1 else found
+
+
+def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
+    """ExportError unless the content was signed with this key."""
+    found = signature(content, read_key(key))
+    try:
+        known = listed(signature_file(path).read_text(encoding="utf-8"), path.name)
+    except FileNotFoundError as error:
+        raise ExportError(
+            f"A key was given, and {path} is not signed: {error.filename} is missing; export it anew with it."
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ExportError(f"The signature of {path} cannot be read: {error}.") from error
+    if not any(hmac.compare_digest(each.encode(), found.encode()) for each in known):
+        raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
+
+
+def write_signatures(path: Path, signatures: Sequence[str]) -> None:
+    """One line each, all at once."""
+    target = signature_file(path)
+    partial = target.with_name(f"{target.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with partial.open("x", encoding="utf-8") as file:
+            file.writelines(f"{each}  {path.name}\n" for each in signatures)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(target)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def earlier_signatures(path: Path) -> list[str]:
+    """The signatures that may hold for the file that is there. ExportError for a file of that name that is none of ours."""
+    known = signature_file(path)
+    try:
+        found = listed(known.read_text(encoding="utf-8"), path.name)
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError):
+        found = [""]
+    if not all(each.startswith(PREFIX) for each in found):
+        raise ExportError(f"{known} is no signature of dengine's and would be replaced; move it away.")
+    return found
+
+
+SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
+METADATA = "dengine.json"
+SCRIPTABLE = "conv, pca or rocket"
+SHA256 = re.compile(r"[0-9a-f]{64}")
+SUM_BYTES = 2**16
+TRIES = 3
+UNREADABLE = (zipfile.BadZipFile, zlib.error, StopIteration, ValueError, EOFError, NotImplementedError, RuntimeError)
+
+
+def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
+    """What an exporter starts from; ExportError for a rival, and before the first training."""
+    try:
+        exported = engine_or_model.exported
+    except AttributeError as error:
+        raise ExportError(
+            f"Expected a DataEngine or a ModelPrediction to export, got {type(engine_or_model).__name__}; "
+            "a rival method stays in Python."
+        ) from error
+    source: Exportable = exported(trace)
+    return source
+
+
+def decision_module(source: Exportable) -> DecisionModule:
+    """The decision of a fitted model as one eager module; ExportError where a part of it does not compile."""
+    model = source.model
+    if not model.rule.scriptable:
+        raise ExportError(
+            f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not compile to TorchScript; "
+            f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
+        )
+    if model.untold:
+        raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
+    predictor = model.predictor
+    if model.spaces.module() is None:
+        raise ExportError(f"{model.name} cannot be scripted: it has no module; use {SCRIPTABLE} instead.")
+    size = model.n_spaces, model.index.dim
+    return DecisionModule(source.trace, predictor, *size, source.audit_rate, source.seed, source.stops_all)
+
+
+def describe(source: Exportable) -> dict[str, Any]:
+    """What the file says of itself, readable without loading it."""
+    model, index = source.model, source.model.index
+    return {
+        "schema": SCHEMA,
+        "dengine": __version__,
+        "torch": torch.__version__,
+        "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "trace": asdict(source.trace),
+        "alpha": model.classifier.alpha,
+        "lower_bound": model.classifier.lower_bound,
+        "interval": model.classifier.interval,
+        "guarantee": _guarantee_of(model.rule),
+        "stops": "all" if source.stops_all else "some",
+        "novelty": model.novelty,
+        "spaces": model.n_spaces,
+        "dim": index.dim,
+        "capacity": index.capacity,
+        "references": len(index),
+        "references_sha256": index.digest(),
+        "fields": list(FIELDS),
+        "actions": [str(a) for a in Action],
+        "reasons": [str(r) for r in Reason],
+        "safe_modes": list(SAFE_MODE),
+        "model_version": source.model_version,
+        "recipe": source.recipe,
+        "audit_rate": source.audit_rate,
+        "seed": source.seed,
+    }
+
+
+def _guarantee_of(rule: Any) -> str:
+    """What `Policy.guarantee` calls a rule of this class."""
+    own = f"{type(rule).__module__}:{type(rule).__qualname__}"
+    return next((name for name, rules in RULES.items() if own in rules.values()), own)
+
+
+def write_export(
+    path: str | os.PathLike[str],
+    content: bytes,
+    kind: Kind,
+    force: bool = False,
+    key: KeyFile | None = None,
+    source: Exportable | None = None,
+) -> Path:
+    """`write_checked`, signed with a key, and noted in the store that the engine remembers in.
+
+    The new signature stands beside the earlier one until the file is replaced, so that one of them always fits.
+    """
+    target, secret = Path(path), None if key is None else read_key(key)
+    check_target(target, kind, force)
+    earlier = earlier_signatures(target)
+    if secret is not None:
+        write_signatures(target, [*earlier[-1:], signature(content, secret)])
+    if source is not None and source.note is not None:
+        source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
+    written = write_checked(target, content, kind, force)
+    if secret is not None:
+        write_signatures(target, [signature(content, secret)])
+    elif earlier:
+        signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
+    return written
+
+
+def check_target(path: str | os.PathLike[str], kind: Kind, force: bool) -> None:
+    """ExportError where a file and its sum must not be written: before the work of an export."""
+    with _as_export_error():
+        check_output(path, kind, force)
+        check_output(sum_file(Path(path)), SUMS, force)
+
+
+def write_checked(path: str | os.PathLike[str], content: bytes, kind: Kind, force: bool = False) -> Path:
+    """Write a file and its checksum; ExportError where they must not or cannot be written.
+
+    A file and its sum are two renames, and a kill may come between: so until both are done the sum file lists the new sum
+    and that of the file that is there, a line each, and whichever file is there is accepted.
+    """
+    target, digest = Path(path), hashlib.sha256(content).hexdigest()
+    check_target(target, kind, force)
+    with _as_export_error():
+        sums = [digest, *_accepted(target, digest)]
+        write_output(sum_file(target), _sum_lines(sums, target), SUMS, force)
+        write_output(target, content, kind, force)
+        if len(sums) > 1:
+            write_output(sum_file(target), _sum_lines([digest], target), SUMS, force)
+    return target
+
+
+def _sum_lines(sums: Sequence[str], target: Path) -> bytes:
+    return "".join(f"{digest}  {target.name}\n" for digest in sums).encode()
+
+
+def _accepted(target: Path, new: str) -> list[str]:
+    """The sum of the file that is there, where its sum file lists it and it is another one."""
+    try:
+        checked_bytes(target)
+    except ExportError:
+        return []  # it was not accepted before
+    old = hashlib.sha256(target.read_bytes()).hexdigest()
+    return [old] if old != new else []
+
+
+@contextmanager
+def _as_export_error() -> Iterator[None]:
+    try:
+        yield
+    except OutputError as error:
+        raise ExportError(str(error)) from error
+
+
+def sum_file(path: Path) -> Path:
+    """Where the checksum lies, in the form that `sha256sum --check` reads."""
+    return path.with_name(path.name + ".sha256")
+
+
+def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
+    """What a file says of itself, after checking its sum, and its signature by a key, and without loading its code."""
+    return metadata_of(checked_bytes(Path(path), key), Path(path))
+
+
+def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
+    """A file's content; ExportError unless its sum file lists its sum, and, with a key, its signature fits.
+
+    libtorch itself does not notice flipped bits.
+    """
+    _read(path, most=0)  # of the two it is the file itself that is named where both are missing
+    for _ in range(TRIES):  # an export may replace file and sums between the two looks
+        sums = _sums_of(path)
+        content = _read(path)
+        found = hashlib.sha256(content).hexdigest()
+        if found in sums:
+            if key is not None:
+                check_signature(path, content, key)
+            return content
+        if _sums_of(path) == sums:
+            break
+    expected = " or ".join(f"{digest[:12]}…" for digest in sums)
+    raise ExportError(f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {expected}; copy it again.")
+
+
+def _sums_of(path: Path) -> list[str]:
+    """The sums that a sum file lists: one, or two where an export was killed between its two renames."""
+    sums = listed(_read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace"), path.name)
+    if not sums or any(not SHA256.fullmatch(each) for each in sums):
+        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
+    return sums
+
+
+def _read(path: Path, most: int = -1) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(most)
+    except FileNotFoundError as error:
+        raise ExportError(f"{error.filename} is missing; an export is a file and its .sha256, copied together.") from error
+    except (OSError, ValueError) as error:
+        raise ExportError(f"{path} cannot be read: {error}.") from error
+
+
+def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
+    """What the content of a TorchScript file says of itself."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            name = next(n for n in archive.namelist() if n.endswith(f"extra/{METADATA}"))
+            metadata = json.loads(archive.read(name))
+    except UNREADABLE as error:
+        raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error
+    return checked_schema(metadata, path)
+
+
+def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:
+    """A description that this version can read; ExportError for a newer one."""
+    schema = metadata.get("schema") if isinstance(metadata, dict) else None
+    if not isinstance(schema, int) or schema > SCHEMA:
+        made_by = metadata.get("dengine", "an unknown version") if isinstance(metadata, dict) else "something else"
+        raise ExportError(
+            f"{path} has schema {schema}, written by dengine {made_by}; this one reads up to {SCHEMA}: upgrade it."
+        )
+    return dict(metadata)

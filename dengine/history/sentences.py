@@ -1,0 +1,295 @@
+"""Why a decision came out so, in sentences; how its bound came out, and what another action would have needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..decision.policy import RULES, Policy
+from ..decision.rule import NOBODY, DecisionRule, WatchedRule
+from ..recipe import Recipe
+from ..records import Action, Reason, TraceSpec
+from ..store.views import PastDecision
+
+MOST = 20_000  # more labels in a ball than that are not thought of
+BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
+KINDS = {"accept": ("success", "successes", "failure"), "reject": ("failure", "failures", "success")}
+DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
+
+
+@dataclass(frozen=True, slots=True)
+class Novelty:
+    """Squared distance to the nearest reference over its limit, in level and in texture: above 1 it is novel."""
+
+    level: float
+    texture: float
+
+    @property
+    def is_novel(self) -> bool:
+        """Whether either is beyond its limit."""
+        return not max(self.level, self.texture) <= 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A bound, and what it was held against.
+
+    interval, alpha : by which it was made.  n_success, n_failure, lower, upper : as recorded.
+    ball : which references were counted, in words.
+    accept_at, reject_at : accepted where lower >= accept_at, rejected where upper <= reject_at; None where nothing was
+        let pass on that side, or where it is not known.
+    level : what set these two, in words.
+    successes_needed, failures_needed : more labels of this kind, and none of the other, that would have been accepted, or
+        rejected; 0 where it was; None where no number would do.
+    repeats : whether the recorded bound is what the settings give for the recorded counts.
+    """
+
+    interval: str
+    alpha: float
+    n_success: int
+    n_failure: int
+    lower: float
+    upper: float
+    ball: str
+    accept_at: float | None
+    reject_at: float | None
+    level: str
+    successes_needed: int | None
+    failures_needed: int | None
+    repeats: bool
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What is known of the moment of a decision.
+
+    model : what a model that was handed in is called.  rule : as it stood, None where that is not kept.
+    coin : where the audits' coin fell, in [0, 1).  safe_mode : why everything was verified, "" where it was not.
+    """
+
+    recipe: Recipe = field(default_factory=Recipe)
+    spec: TraceSpec = field(default_factory=lambda: TraceSpec(1))
+    model: str | None = None
+    rule: DecisionRule | None = None
+    novelty: Novelty | None = None
+    coin: float = 1.0
+    safe_mode: str = ""
+
+
+def bound_of(past: PastDecision, found: Circumstances) -> Bound | None:
+    """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
+    if past.reason not in BOUNDED or _was_lost(past):
+        return None
+    policy = found.recipe.policy
+    accept_at, reject_at, level = _thresholds(found)
+    lower, upper = policy.bound(past.n_success, past.n_failure)
+    return Bound(
+        interval=policy.interval,
+        alpha=policy.alpha,
+        n_success=past.n_success,
+        n_failure=past.n_failure,
+        lower=past.lower,
+        upper=past.upper,
+        ball=_ball(past, found),
+        accept_at=accept_at,
+        reject_at=reject_at,
+        level=level,
+        successes_needed=None if accept_at is None else _needed(policy, past, accept_at, 1),
+        failures_needed=None if reject_at is None else _needed(policy, past, reject_at, 0),
+        repeats=found.model is not None or bool(np.allclose((lower, upper), (past.lower, past.upper), atol=1e-6)),
+    )
+
+
+def _was_lost(past: PastDecision) -> bool:
+    """Whether the row was made from a stop whose decision was lost: an accept on no evidence."""
+    return past.reason is Reason.CERTAIN and past.action is Action.ACCEPT and (past.lower, past.upper) == (0.0, 1.0)
+
+
+def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
+    policy, rule = found.recipe.policy, found.rule
+    if found.model is not None and rule is None:
+        return None, None, f"{found.model} decides by its own rule"
+    if policy.guarantee not in RULES:
+        return None, None, f"{policy.guarantee} decides by its own rule"
+    if policy.guarantee == "local" and not found.safe_mode:
+        return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the ball around the part"
+    if not isinstance(rule, WatchedRule):
+        return None, None, "the levels that held then are not kept"
+    accept_at, reject_at = (float(level) for level in rule.open)
+    held = "the lowest level that held then" if policy.guarantee == "pooled" else "what held in safe mode"
+    return (
+        accept_at if accept_at < NOBODY else None,
+        1.0 - reject_at if reject_at < NOBODY else None,
+        held,
+    )
+
+
+def _ball(past: PastDecision, found: Circumstances) -> str:
+    recipe = found.recipe
+    if found.model is not None and found.rule is None:
+        return "as the model counts them"
+    if recipe.fraction is None:
+        return f"within the radius {recipe.radius:g}"
+    narrow = recipe.reject_fraction if past.predicted is Action.REJECT else None
+    return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
+
+
+def _needed(policy: Policy, past: PastDecision, threshold: float, success: int) -> int | None:
+    more = np.arange(MOST + 1)
+    lower, upper = policy.bound(past.n_success + success * more, past.n_failure + (1 - success) * more)
+    enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
+    return int(enough[0]) if len(enough) else None
+
+
+def verdict(past: PastDecision, trace: NDArray[np.float32], bound: Bound | None, found: Circumstances) -> Iterator[str]:
+    """The sentences: what was done and why, then how the bound came out."""
+    yield _why(past, trace, found)
+    if bound is not None:
+        yield from _bound_sentences(past, bound, found)
+    if found.novelty is not None and past.reason is not Reason.NOVEL:
+        yield f"It is not novel: {_scores(found.novelty)}."
+    yield _outcome(past)
+
+
+def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    did = DID[past.action].capitalize()
+    if _was_lost(past):
+        return f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
+    return f"{did}{WHY[past.reason](past, trace, found)}"
+
+
+Why = Callable[[PastDecision, NDArray[np.float32], Circumstances], str]
+
+
+def _certain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the bound meets the policy."
+
+
+def _uncertain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the bound does not meet the policy."
+
+
+def _no_model(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": no model had been trained yet, so every part was."
+
+
+def _audit(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return (
+        f" as an audit: the model alone would have {DID[past.predicted]} it. The audits' coin fell on {found.coin:.4f}, "
+        f"below the audit rate {past.propensity:g}; it is a function of the trace and the seed."
+    )
+
+
+def _not_finite(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    n = int((~np.isfinite(trace)).sum())
+    return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
+
+
+def _constant(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f": every sample is {float(trace.flat[0]):g} {found.spec.unit}: a dead sensor."
+
+
+def _saturated(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f": {_saturation(trace, found.spec)}"
+
+
+def _model_error(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the model raised an error, which the log of that time tells."
+
+
+def _novel(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    score = "" if found.novelty is None else f": {_scores(found.novelty)}"
+    return f": unlike all that was learned from{score}. What its neighbours say does not count then."
+
+
+def _safe(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
+
+
+def _no_store(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
+
+
+def _late(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    return ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."
+
+
+WHY: dict[Reason, Why] = {
+    Reason.CERTAIN: _certain,
+    Reason.UNCERTAIN: _uncertain,
+    Reason.NO_MODEL: _no_model,
+    Reason.AUDIT: _audit,
+    Reason.NOT_FINITE: _not_finite,
+    Reason.CONSTANT: _constant,
+    Reason.SATURATED: _saturated,
+    Reason.MODEL_ERROR: _model_error,
+    Reason.NOVEL: _novel,
+    Reason.SAFE_MODE: _safe,
+    Reason.NO_STORE: _no_store,
+    Reason.LATE: _late,
+}
+
+
+def _saturation(trace: NDArray[np.float32], spec: TraceSpec) -> str:
+    if spec.limit is None:
+        return "the trace touched the sensor's range."
+    touching = np.argwhere(np.abs(trace) >= spec.limit)
+    if not len(touching):
+        return f"the trace touched the sensor's range, which is now {spec.limit:g} {spec.unit}."
+    channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
+    return (
+        f"{len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, first after "
+        f"{sample / spec.rate_hz:.3f} s (channel {channel + 1})."
+    )
+
+
+def _scores(novelty: Novelty) -> str:
+    both = (("level", novelty.level), ("texture", novelty.texture))
+    return ", ".join(f"in {name} {value:.2f} times the limit" for name, value in both)
+
+
+def _bound_sentences(past: PastDecision, bound: Bound, found: Circumstances) -> Iterator[str]:
+    n = bound.n_success + bound.n_failure
+    if found.model is not None and found.rule is None:
+        yield f"{found.model} gives {bound.n_success} successes, {bound.n_failure} failures, bound {_range(bound)}."
+        return
+    counted = f"{bound.n_success} of {n} labels {bound.ball} are successes" if n else f"No label {bound.ball}"
+    name = bound.interval.replace("_", "-").capitalize()
+    yield f"{counted}; {name} at alpha {bound.alpha:g} bounds the success rate by {_range(bound)}."
+    if bound.accept_at is None and bound.reject_at is None:
+        yield f"Nothing could pass, whatever the bound: {_no_level(bound, found)}."
+        return
+    if past.predicted is not Action.REJECT:
+        yield _side("accept", "lower", bound.lower, "at least", bound.accept_at, bound.successes_needed, bound.level)
+    if past.predicted is not Action.ACCEPT:
+        yield _side("reject", "upper", bound.upper, "at most", bound.reject_at, bound.failures_needed, bound.level)
+
+
+def _no_level(bound: Bound, found: Circumstances) -> str:
+    return found.safe_mode or (bound.level if found.rule is None else "no level of evidence held yet")
+
+
+def _side(action: str, end: str, value: float, than: str, threshold: float | None, needed: int | None, level: str) -> str:
+    if threshold is None:
+        return f"To {action}: no level held, so nothing could be {action}ed."
+    one, many, other = KINDS[action]
+    lead = f"To {action}, {end} must be {than} {threshold:.4g} ({level}); it is {value:.3f}"
+    if needed == 0:
+        return f"{lead}, enough."
+    if needed is None:
+        return f"{lead}: no number of labels would do."
+    return f"{lead}: {needed} more {one if needed == 1 else many} and no {other} would do."
+
+
+def _range(bound: Bound) -> str:
+    return f"{bound.lower:.3f} to {bound.upper:.3f}"
+
+
+def _outcome(past: PastDecision) -> str:
+    if past.success is None:
+        return "Nothing was reported of the part."
+    source = "" if past.source is None else f" ({past.source.value})"
+    return f"The part turned out {'good' if past.success else 'bad'}{source}."

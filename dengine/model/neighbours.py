@@ -1,0 +1,342 @@
+"""The model prediction: reducer, references and rule together, with honest counting.
+
+A label may be counted for a query only in an embedding that never saw that label. So the reducer spans K spaces, fold k's
+references live in space k, a query is embedded in all K, and its counts are summed.
+
+Parts that seem to come twice although nobody says so: traces much closer to another one than to all the rest.
+
+Labels are counted as independent trials. A part that is inserted again brings its label again, so its repeats must be
+known as such (`part=`); where they are not, this notices the plain cases and says so. It reads no label, and changes no
+decision: repeats that look as different as parts do, and those of which there are more than `NEIGHBOURS`, are not seen.
+The independence of parts with different numbers is assumed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+
+from ..decision.classifier import WilsonRadiusClassifier
+from ..decision.novelty import NoveltyGate, fit_novelty
+from ..decision.policy import Policy
+from ..decision.references import RadiusIndex
+from ..decision.rule import SAFE_MODE, DecisionRule, learns
+from ..errors import ExportError
+from ..folds import content_hash, fold_of
+from ..recipe import NOVELTY, Recipe, described
+from ..records import ACTIONS, REASONS, TraceSpec, as_labels, as_success
+from ..reducers import make_reducer, reducer_of
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, space_scale
+from ..reducers.cross_fitting import as_reducer
+from ..traces import as_traces
+from .base import EngineModel, Exportable, ManyPredictions, Prediction, Told
+from .compiled import CompiledPredictor, compile_predictor
+
+NEWEST = 500  # traces that are looked at: the work does not grow
+FEWEST = 100
+POINTS = 50  # of each channel, means of equal stretches: the sensor's noise is no difference
+NEIGHBOURS = 10
+NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
+SUSPICIOUS = 0.05  # share of such traces
+
+
+def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
+    """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes."""
+    x, own = traces[-NEWEST:], parts[-NEWEST:]
+    if len(x) < FEWEST:
+        return 0
+    n, channels, samples = x.shape
+    length = max(1, samples // POINTS)
+    from scipy.spatial.distance import cdist
+
+    whole = x[:, :, : samples // length * length].astype(np.float64)
+    means = whole.reshape(n, channels, -1, length).mean(3)
+    scale = means.std((0, 2), keepdims=True)
+    rows = ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
+    distances = cdist(rows, rows)
+    distances[own[:, None] == own] = np.inf
+    nearest = np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]]
+    with np.errstate(invalid="ignore"):
+        return int((nearest[:, 0] < NEAR * nearest[:, 1]).sum())
+
+
+def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
+    """What to say of near repeats; "" where there are few."""
+    n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
+    if n <= SUSPICIOUS * looked_at:
+        return ""
+    return (
+        f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
+    )
+
+
+WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
+
+
+class ModelPrediction(ManyPredictions, EngineModel):
+    """Reducer + references + rule, from traces.
+
+    reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
+    classifier : a `WilsonRadiusClassifier` holding radius and policy; it is cloned, never fitted itself.
+    folds : K, for a label-using transformer that does not cross-fit by itself.
+    rule : what turns counts into an action; None: the classifier's policy.
+    novelty : how far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
+
+    Embeddings are scaled space by space to a root mean square radius of 1, so that one `radius` means the same in every
+    reducer; the scale of space k comes from fold k's traces, whose labels that space never saw. One whose axis has a
+    unit of its own (`Reducer.own_unit`) is left as it is: where probabilities hardly differ, they are not to be spread.
+    """
+
+    def __init__(
+        self,
+        reducer: Any = "conv",
+        classifier: WilsonRadiusClassifier | None = None,
+        folds: int = 2,
+        rule: DecisionRule | None = None,
+        novelty: float = NOVELTY,
+    ) -> None:
+        self.novelty = novelty
+        self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
+        self.classifier = classifier or WilsonRadiusClassifier()
+        self.folds = folds
+        self.rule = rule or self.classifier.policy().rule()
+        self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
+        self._compiled: CompiledPredictor | None = None
+        self._note = ""
+
+    @classmethod
+    def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
+        """The untrained model that a recipe describes."""
+        policy = recipe.policy
+        classifier = WilsonRadiusClassifier(
+            radius=recipe.radius,
+            alpha=policy.alpha,
+            lower_bound=policy.lower_bound,
+            interval=policy.interval,
+            fraction=recipe.fraction,
+            reject_fraction=recipe.reject_fraction,
+            capacity=recipe.window,
+        )
+        return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
+
+    @property
+    def user_model(self) -> ModelPrediction:
+        """Itself."""
+        return self
+
+    @property
+    def name(self) -> str:
+        """Its reducer."""
+        return type(self.reducer).__name__
+
+    @property
+    def description(self) -> str:
+        """Its reducer, its classifier and its folds, with their settings."""
+        own = f"{described(self.reducer)} under {described(self.classifier)}"
+        return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
+
+    def in_force(self, recipe: Recipe) -> Recipe:
+        """The recipe with the classifier's numbers."""
+        own = self.classifier
+        policy = replace(recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval)
+        near = replace(recipe, radius=own.radius, fraction=own.fraction, reject_fraction=own.reject_fraction)
+        return replace(near, policy=policy, folds=max(2, self.folds), novelty=self.novelty)
+
+    @property
+    def n_spaces(self) -> int:
+        """K, embedding spaces."""
+        return self.spaces.n_spaces
+
+    @property
+    def report(self) -> FitReport:
+        """What the last fit says of itself, and of the traces."""
+        own = self.spaces.report
+        return replace(own, note="; ".join(filter(None, (own.note, self._note))))
+
+    def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
+        self.spaces = as_reducer(clone(self.reducer), self.folds)
+        return self.train(X, y, hashes=hashes, stop=stop)
+
+    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+        """Train the reducer, warm where it can be, and make every trace a reference.
+
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
+        their content.
+        Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
+        """
+        X, y = as_traces(X), as_labels(y)
+        parts = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
+        folds = fold_of(parts, self.n_spaces)
+        points = self.spaces.train(X, y, folds, stop)
+        self.trace_shape = X.shape[1:]
+        own_unit = self.spaces.own_unit
+        self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
+        self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
+        self.index.add(points / self.scale[folds, None], y, folds, parts)
+        self.index.weigh()
+        self._note = repeats_note(X, parts)
+        self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
+        self._compiled = None  # built by `prepare`, or when it is asked
+        return self
+
+    def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
+        """Train the reducer's encoder further, apart from what answers."""
+        return self.spaces.improve(as_traces(X), hashes, stop)
+
+    def look_ahead(self, X: NDArray[np.float32]) -> int:
+        return self.spaces.look_ahead(X)
+
+    def prepare(self, previous: EngineModel) -> None:
+        """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
+        if isinstance(previous, ModelPrediction):
+            self.rule, self.untold = previous.rule, previous.untold
+            self._compile(previous._compiled)
+
+    def _compile(self, mould: CompiledPredictor | None = None) -> CompiledPredictor:
+        around = self.classifier.around(self.index, self.rule)
+        self._compiled = compile_predictor(self.spaces, self.scale, self.gate, around, mould)
+        if self._compiled.structure is not None and (mould is None or mould.structure != self._compiled.structure):
+            for _ in range(WARM_UP):
+                self.predict_one(np.zeros(self.trace_shape, dtype=np.float32))
+        return self._compiled
+
+    @property
+    def predictor(self) -> Any:
+        """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
+        if "index" not in vars(self):
+            raise ValueError("Expected a fitted model; call fit(X, y) first.")
+        return (self._compiled or self._compile()).predictor
+
+    def add(self, x: ArrayLike, y: ArrayLike) -> Self:
+        """Take in one labelled trace, (T,) or (C, T), as a reference."""
+        X = as_traces(np.asarray(x)[None])
+        hash_ = int(content_hash(X)[0])
+        self.add_reference(self.reference_point(X[0], hash_), int(as_success(np.asarray(y))), hash_)
+        return self
+
+    def reference_point(
+        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
+    ) -> Floats:
+        """(C, T) -> (d,): where the trace lives as a reference, in its own fold's space."""
+        if embedding is not None:
+            return np.array(embedding[self._fold(hash_)], dtype=np.float32)
+        with torch.inference_mode():
+            return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
+
+    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+        """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
+        self.index.ring.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_)
+
+    def change_reference(self, newest: int, hash_: int, y: int | None) -> bool:
+        return self.index.relabel(newest, hash_, y)
+
+    def _fold(self, hash_: int) -> int:
+        return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
+
+    def tell(self, told: Told) -> None:
+        """Tell the rule what became of a part."""
+        before = dict(self.rule.state_dict())
+        self.rule.note(told.silent, told.novel)
+        self.rule.tell(told.lower, told.upper, told.success)
+        for name, now in self.rule.state_dict().items():
+            if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
+                before[name].copy_(now)
+                setattr(self.rule, name, before[name])
+
+    def forget(self) -> None:
+        """The rule as it was before it was told anything; in place, for the compiled module reads it."""
+        fresh = type(self.rule)(self.rule.alpha, self.rule.accept_at, self.rule.interval)
+        self.rule.load_state_dict(fresh.state_dict())
+
+    @property
+    def remembers(self) -> bool:
+        return learns(self.rule)
+
+    def under(self, policy: Policy) -> Self:
+        """Another rule, and another module around the same references."""
+        new, own = copy.copy(self), {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
+        new.classifier = clone(self.classifier).set_params(**own)
+        new.rule, new.untold, new._compiled = policy.rule(), False, None
+        return new
+
+    def begin_safely_in(self, mode: int) -> None:
+        self.rule.begin_in(mode)
+
+    @property
+    def safe_mode(self) -> str:
+        """Why the rule lets nothing pass at present; "" where it does."""
+        return SAFE_MODE[self.rule.safe_mode()]
+
+    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+        """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
+        if self.untold:
+            raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
+        with torch.inference_mode():
+            action, reason, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x), hash_)
+        embedding = tuple(tuple(row) for row in z.tolist())
+        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+
+    def successor(self) -> ModelPrediction:
+        """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
+        new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule, self.novelty)
+        new.spaces = copy.deepcopy(self.spaces)
+        return new
+
+    def defect(self) -> str:
+        """Whether a reference has no finite place."""
+        return "" if np.isfinite(self.index.points).all() else "the embedding of a reference is not finite"
+
+    def get_state(self) -> State:
+        """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
+        state = {"trace_shape": np.array(self.trace_shape), "scale": self.scale} | self.index.get_state()
+        if self.untold:
+            state["untold"] = np.array(True)  # what the rule learned is not whole: an opened engine tells it all anew
+        else:
+            state |= {f"rule.{name}": buffer.numpy().copy() for name, buffer in self.rule.state_dict().items()}
+        if not self.gate.asleep:
+            state |= {f"novelty.{name}": buffer.numpy().copy() for name, buffer in self.gate.state_dict().items()}
+        return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        """Restore references and rule, and the reducer unless it was refitted, so that decisions repeat bit for bit."""
+        if "points" not in state:  # 0.1 drove our own model, handed in, as it drove a rival: it was refitted
+            return self
+        if not self.needs_refit(state):
+            self.spaces.set_state(_part(state, "reducer."))
+        self.trace_shape = tuple(int(n) for n in state["trace_shape"])
+        self.scale = np.asarray(state["scale"])
+        self.index = RadiusIndex.from_state(state, self.classifier.capacity)
+        self.gate = NoveltyGate(*self.trace_shape)
+        self.gate.asleep = not _part(state, "novelty.")
+        for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
+            own = module.state_dict()  # shares its tensors with the module
+            for name, value in _part(state, prefix).items():
+                own[name].copy_(torch.from_numpy(np.array(value)))
+        self._compiled = None
+        return self
+
+    def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
+        """Whether the reducer gave no arrays of its own."""
+        return not _part(state, "reducer.")
+
+    def exported(self, trace: TraceSpec | None) -> Exportable:
+        """The model as an exporter takes it; without a contract, one of its traces' shape."""
+        if "trace_shape" not in vars(self):
+            raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")
+        return Exportable(self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1]))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A scripted module does not travel between processes; the receiver builds its own.
+        return self.__dict__ | {"_compiled": None}
+
+
+def _part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

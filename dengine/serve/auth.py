@@ -1,0 +1,295 @@
+"""Stands before every route: refuses what `Access` does not let in, before any of it is read.
+
+Who may ask, and how much: a token, the names by which the server is called, sizes, times and rates.
+
+Whoever is on this machine may ask without a token, but for web pages of others: a browser carries their requests here
+too. They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import hmac
+import os
+import stat
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, MutableMapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from ..errors import SettingError
+from .api import Refusal, problem
+
+SHORTEST = 16  # characters of a token
+CLIENTS = 4096  # whose rate is remembered
+SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+WITHOUT_TOKEN = frozenset({"/healthz"})
+RPC = "/RPC2"  # where a robot that cannot send headers may have its token in the path or the query
+NAMES = frozenset({"localhost"})
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Who may ask, and how much.
+
+    token : what `Authorization: Bearer` has to say, or Basic as its password; "" asks for none.
+    hosts : names by which the server is called, beside localhost; an address of numbers is always taken.
+    largest : bytes of a request's body.  body_seconds : in which it has to come.
+    rate : requests a second of one client, on average; 0: as many as it likes.  burst : of them at once.
+    """
+
+    token: str = field(default="", repr=False)
+    hosts: tuple[str, ...] = ()
+    largest: int = 2**20
+    body_seconds: float = 5.0
+    rate: float = 500.0
+    burst: int = 1000
+
+
+class Rates:
+    """A token bucket for each client; those that were not seen for longest are forgotten first."""
+
+    def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rate, self.burst, self.clock = rate, burst, clock
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when they were counted
+
+    def take(self, client: str) -> bool:
+        """Take one token; False where there is none."""
+        if self.rate <= 0.0:
+            return True
+        now = self.clock()
+        tokens, since = self._buckets.pop(client, (float(self.burst), now))
+        tokens = min(float(self.burst), tokens + (now - since) * self.rate)
+        taken = tokens >= 1.0
+        self._buckets[client] = (tokens - taken, now)
+        if len(self._buckets) > CLIENTS:
+            self._buckets.popitem(last=False)
+        return taken
+
+
+def read_token(file: Path) -> str:
+    """The token in a file that nobody but its owner may read; SettingError where it is none, or others may."""
+    try:
+        with file.open("rb") as opened:
+            mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(4096)
+    except OSError as error:
+        raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
+    # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
+    if mode & (0o037 if _is_credential(file) else 0o077):
+        raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
+    token = text.strip()
+    if len(token) < SHORTEST or not token.isascii() or not token.decode("ascii").isprintable() or b" " in token:
+        raise SettingError(
+            f"Expected a token of at least {SHORTEST} characters of ASCII without blanks in {file}; "
+            f"make one: (umask 077; openssl rand -hex 24 > {file})"
+        )
+    return token.decode("ascii")
+
+
+def _is_credential(file: Path) -> bool:
+    """Whether systemd handed this file to the service, `LoadCredential`: nobody else gets into its folder."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY", "")
+    return folder != "" and file.absolute().parent == Path(folder)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that listens there."""
+    try:
+        return ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def in_url(host: str) -> str:
+    """A host as an address has it, before its port."""
+    return f"[{host}]" if ":" in host else host
+
+
+def is_called(host: str | None, names: Iterable[str]) -> bool:
+    """Whether a request calls the server by a name that is its own: a page that had its own name point here does not."""
+    name = host_name(host)
+    if name is None:
+        return False
+    try:
+        ip_address(name)
+    except ValueError:
+        return name in NAMES or name in {each.lower() for each in names}
+    return True
+
+
+def host_name(host: str | None) -> str | None:
+    """The name in a `Host` header, without its port; None where it is none."""
+    if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
+        return None
+    try:
+        parts = urlsplit(f"//{host}")
+        parts.port  # noqa: B018  # it raises for what is no port
+    except ValueError:
+        return None
+    return parts.hostname
+
+
+def is_own_page(origin: str | None, fetch_site: str | None, host: str | None) -> bool:
+    """Whether what a browser says of a request lets it be one of this server's own pages, or of no page at all."""
+    if fetch_site is not None and fetch_site not in ("same-origin", "none"):
+        return False
+    if origin is None:
+        return True
+    _, _, called = origin.partition("://")
+    return host is not None and called.lower() == host.lower()
+
+
+def may_ask(token: str, authorization: str | None) -> bool:
+    """Whether a request says the token: as a bearer's, or as the password that a browser asks for."""
+    kind, _, said = (authorization or "").partition(" ")
+    if kind.lower() == "bearer":
+        return is_same(token, said.strip())
+    if kind.lower() == "basic":
+        try:
+            return is_same(token, base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2])
+        except (binascii.Error, UnicodeDecodeError, ValueError):
+            return False
+    return False
+
+
+def is_same(token: str, said: str) -> bool:
+    """Compare in a time that says nothing of where they differ."""
+    return hmac.compare_digest(token.encode(), said.encode("utf-8", "surrogatepass"))
+
+
+def split_rpc(path: str, query: bytes) -> tuple[str, bytes, str | None]:
+    """The path and the query of a robot's request without the token in them, and that token; None where there is none."""
+    if path.startswith(f"{RPC}/"):
+        return RPC, query, path.removeprefix(f"{RPC}/")
+    if path != RPC or b"token=" not in query:
+        return path, query, None
+    pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True, max_num_fields=None)
+    said = [value for name, value in pairs if name == "token"]
+    rest = urlencode([(name, value) for name, value in pairs if name != "token"]).encode("ascii")
+    return path, rest, said[0] if len(said) == 1 else ""
+
+
+ASK = 'Bearer realm="dengine", Basic realm="dengine", charset="UTF-8"'
+CLOSE = {"Connection": "close"}  # what was not read is not to be taken for the next request
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+}
+
+
+class Guard:
+    """ASGI middleware: names, tokens, rates and sizes; and the headers that every answer has."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self.app = app
+        self.access = access
+        self.rates = Rates(access.rate, access.burst)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request in, or answer it."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        if scope["type"] != "http":  # there is no websocket here
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        try:
+            self._look(scope)
+        except Refusal as refusal:
+            answer = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
+            await answer(scope, receive, _with_headers(send))
+            return
+        await self.app(scope, Body(receive, self.access).receive, _with_headers(send))
+
+    def _look(self, scope: MutableMapping[str, Any]) -> None:
+        headers = Headers(scope=scope)
+        host, client = headers.get("host"), (scope.get("client") or ("", 0))[0]
+        if not is_called(host, self.access.hosts):
+            raise Refusal(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                "Expected the server to be called by its address, localhost, or a name that it was given "
+                "(dengine serve --allow-host NAME).",
+            )
+        self._must_have_token(scope, headers)
+        if scope["method"] not in SAFE and not is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host):
+            raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
+        if not self.rates.take(client):
+            raise Refusal(
+                HTTPStatus.TOO_MANY_REQUESTS, f"Expected at most {self.access.rate:g} requests a second of one client."
+            )
+        length = headers.get("content-length", "0")
+        if not (length.isascii() and length.isdecimal()):
+            raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
+        if len(length) > 18 or int(length) > self.access.largest:
+            raise _too_large(self.access.largest)
+
+    def _must_have_token(self, scope: MutableMapping[str, Any], headers: Headers) -> None:
+        path, query, said = split_rpc(scope["path"], scope["query_string"])
+        if said is not None:  # it is nobody's business from here on, with a token or without
+            scope.update(path=path, raw_path=RPC.encode("ascii"), query_string=query)
+        token = self.access.token
+        if not token or path in WITHOUT_TOKEN or (said is not None and is_same(token, said)):
+            return
+        if not may_ask(token, headers.get("authorization")):
+            raise Refusal(
+                HTTPStatus.UNAUTHORIZED,
+                "Expected the server's token: Authorization: Bearer TOKEN, or any user name with it as the password.",
+                {"WWW-Authenticate": ASK},
+            )
+
+
+class Body:
+    """A request's body, that has to be of a size, and to come in time."""
+
+    def __init__(self, receive: Receive, access: Access) -> None:
+        self._receive, self._access = receive, access
+        self._left, self._more = access.largest, True
+        self._until = asyncio.get_running_loop().time() + access.body_seconds
+
+    async def receive(self) -> Message:
+        """The next piece; Refusal where it is too much, or too late."""
+        if not self._more:  # what follows is the word that the client has gone, which may take as long as it likes
+            return await self._receive()
+        try:
+            async with asyncio.timeout_at(self._until):
+                message = await self._receive()
+        except TimeoutError:
+            seconds = self._access.body_seconds
+            raise Refusal(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's body within {seconds:g} s.", CLOSE) from None
+        self._more = bool(message.get("more_body", False))
+        self._left -= len(message.get("body", b""))
+        if self._left < 0:
+            raise _too_large(self._access.largest)
+        return message
+
+
+def _too_large(largest: int) -> Refusal:
+    text = f"Expected a request of at most {largest} bytes (dengine serve --largest), got a larger one."
+    return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text, CLOSE)
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return sending

@@ -1,0 +1,235 @@
+"""What a robot's program may call, in the few types that it knows: int, bool, float, string, list, and a struct of these.
+
+    id = begin()                      # a new part; the recorder waits for its insertion
+    answer = decide_recorded(id)      # answer.action: 0 verify, 1 accept, 2 reject
+    kept = report(id, True)
+
+What is the world's fault (a full line, a recording that did not come, a store that is away) is answered, by "verify" and by
+False: a fault ends a robot's program. What is the caller's bug (a wrong type, another trace under a known id) is a fault.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import uuid
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from dataclasses import asdict
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..engine.decide import as_decision
+from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, shortened
+from ..records import ACTIONS, Action, Decision, as_id
+from .metrics import overview
+from .service import CellService
+
+log = logging.getLogger("dengine")
+PATIENCE = 1.0  # seconds that a recording may take to arrive after the insertion
+OPEN = 8  # parts whose pieces are on their way; one more gives up the oldest
+SAMPLES = 200_000  # of all pieces of a part
+BUSY, NOT_RECORDED = "busy", "not_recorded"  # beside the names in `Reason`: nothing of the part is known
+
+Answered = dict[str, Any]
+Call = Callable[..., Awaitable[Any]]
+
+
+class Recording(Protocol):
+    """One insertion that was cut out of a stream. trace : (T,) or (C, T); NaN where a sample never came."""
+
+    @property
+    def trace(self) -> ArrayLike:
+        """The samples."""
+
+
+class Recorder(Protocol):
+    """Cuts insertions out of what a robot sends, as `RtdeRecorder` does; its calls may block."""
+
+    def arm(self) -> None:
+        """Look for an insertion from now on."""
+
+    def record(self, timeout: float) -> Recording:
+        """The next insertion; an error after `timeout` seconds without one."""
+
+
+class RobotCalls:
+    """The calls by name, over one service. recorder : of the traces of `decide_recorded`; None: there is none.
+
+    patience : seconds that a recording may take to arrive.
+    """
+
+    def __init__(self, service: CellService, recorder: Recorder | None = None, patience: float = PATIENCE) -> None:
+        self._service, self._recorder, self._patience = service, recorder, patience
+        self._pieces: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
+        self._armed: str | None = None
+        self._recording = asyncio.Lock()  # one insertion at a time
+
+    def table(self) -> dict[str, tuple[Call, int, int]]:
+        """Each call by its name, with the fewest and the most arguments that it takes."""
+        return {
+            "begin": (self.begin, 0, 1),
+            "add": (self.add, 2, 2),
+            "decide": (self.decide, 1, 3),
+            "decide_added": (self.decide_added, 1, 2),
+            "decide_recorded": (self.decide_recorded, 0, 2),
+            "action": (_as_action(self.decide), 2, 3),
+            "action_added": (_as_action(self.decide_added), 1, 2),
+            "action_recorded": (_as_action(self.decide_recorded), 1, 2),
+            "report": (self.report, 2, 2),
+            "status": (self.status, 0, 0),
+        }
+
+    async def begin(self, request: Any = "") -> str:
+        """A new part: its id, a new one or the caller's. The recorder waits for its insertion from now on."""
+        id_ = uuid.uuid4().hex if request == "" else as_id(request)
+        self._pieces.pop(id_, None)
+        self._pieces[id_] = []
+        while len(self._pieces) > OPEN:
+            self._pieces.popitem(last=False)
+        if self._recorder is not None:
+            async with self._recording:
+                await self._arm(self._recorder, id_)
+        return id_
+
+    async def _arm(self, recorder: Recorder, request: str) -> None:
+        self._armed = None
+        try:
+            await asyncio.to_thread(recorder.arm)
+            self._armed = request
+        except (DengineError, OSError) as error:  # the part will be verified
+            log.warning("the recorder does not listen: %s", error)
+
+    async def add(self, request: Any, samples: Any) -> int:
+        """A piece of a part's trace, one channel, in order; how many samples there are by now."""
+        pieces = self._pieces.get(as_id(request))
+        if pieces is None:
+            raise TraceError(
+                f"Expected begin before add, got pieces of {shortened(request)}; the newest {OPEN} parts are kept."
+            )
+        piece = as_samples(samples)
+        if piece.ndim != 1:
+            raise TraceError("Expected a piece of one channel, a list of numbers; use decide for several channels.")
+        if sum(map(len, pieces)) + len(piece) > SAMPLES:
+            raise TraceError(f"Expected at most {SAMPLES} samples of a part, got more.")
+        pieces.append(piece)
+        return sum(map(len, pieces))
+
+    async def decide(self, trace: Any, request: Any = "", part: Any = "") -> Answered:
+        """Decide on a whole trace, (T,) or (channels, T), of lists."""
+        return await self.decide_on(as_samples(trace), request, part)
+
+    async def decide_added(self, request: Any, part: Any = "") -> Answered:
+        """Decide on the pieces that were added; asked again, the answer is the same."""
+        if (known := await self._known(request)) is not None:
+            return known
+        pieces = self._pieces.get(as_id(request))
+        if not pieces:
+            raise TraceError(f"Expected begin and add before decide_added, got no pieces of {shortened(request)}.")
+        answer = await self.decide_on(np.concatenate(pieces), request, part)
+        if answer["id"]:
+            self._pieces.pop(request, None)
+        return answer
+
+    async def decide_recorded(self, request: Any = "", part: Any = "") -> Answered:
+        """Decide on the insertion since `begin`, as the recorder has it; asked again, the answer is the same.
+
+        request : as `begin` gave it; left out, the newest one's.
+        """
+        if self._recorder is None:
+            raise SettingError(
+                "Expected a recorder, this server was started without one; send the trace, or start it with one."
+            )
+        async with self._recording:
+            id_ = self._armed if request == "" else as_id(request)
+            if id_ is not None and (known := await self._known(id_)) is not None:
+                return known
+            if id_ is None or id_ != self._armed:  # another part's, or the server was started anew meanwhile
+                return _unknown(NOT_RECORDED)
+            try:
+                recording = await asyncio.to_thread(self._recorder.record, self._patience)
+            except (DengineError, OSError) as error:
+                log.warning("no recording of %s: %s", shortened(id_), error)
+                return _unknown(NOT_RECORDED)
+            finally:
+                self._armed = None
+            return await self.decide_on(recording.trace, id_, part)
+
+    async def decide_on(self, trace: ArrayLike, request: Any, part: Any) -> Answered:
+        """Decide on a trace as an array; an empty request or part is none."""
+        id_ = as_id(request) if request != "" else None
+        try:
+            answer = await self._service.decide(trace, id_, None if part == "" else part)
+        except (BusyError, StoreError) as error:
+            log.warning("verified without a record: %s", error)
+            return _unknown(BUSY)
+        return _answered(answer.decision)
+
+    async def report(self, decision_id: Any, success: Any) -> bool:
+        """What became of a part, True for good. Returns whether it is kept: it is not where nothing under this id was
+        recorded, where the server is busy, or where its store is away.
+        """
+        try:
+            if decision_id == "" or await self._service.find(decision_id) is None:  # "": as `decide_recorded` gave it
+                return False
+            await self._service.report(decision_id, success)
+        except (BusyError, StoreError) as error:
+            log.warning("a report on %s was not kept: %s", shortened(decision_id), error)
+            return False
+        return True
+
+    async def status(self) -> Answered:
+        """How the cell is doing, as `Overview`."""
+        return asdict(await overview(self._service))
+
+    async def _known(self, request: Any) -> Answered | None:
+        try:
+            known = await self._service.find(as_id(request))
+        except (BusyError, StoreError):
+            return None
+        return None if known is None else _answered(as_decision(known))
+
+
+def as_samples(value: Any) -> NDArray[np.float32]:
+    """A list of numbers, or a list of such lists of one length, as float32; TraceError for anything else."""
+    rows = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+    for row in rows:
+        if not isinstance(row, list) or not {*map(type, row)} <= {int, float}:
+            raise TraceError("Expected a list of numbers, or a list of such lists of one length, a channel each.")
+    if len({*map(len, rows)}) != 1 or not rows[0]:
+        raise TraceError("Expected as many samples of each channel, and at least one.")
+    try:
+        with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
+            x = np.array(rows, dtype=np.float64).astype(np.float32)
+    except OverflowError as error:
+        raise TraceError("Expected numbers that a float can hold, got an integer beyond that.") from error
+    return x[0] if rows[0] is value else x
+
+
+def _as_action(call: Call) -> Call:
+    """The same call, answered by its action alone, for a controller that knows no structs."""
+
+    async def action(*arguments: Any) -> int:
+        answer: Answered = await call(*arguments)
+        number: int = answer["action"]
+        return number
+
+    return action
+
+
+def _answered(decision: Decision) -> Answered:
+    return {
+        "action": ACTIONS.index(decision.action),
+        "id": decision.id,
+        "reason": str(decision.reason),
+        "lower": decision.lower,
+        "upper": decision.upper,
+        "version": decision.model_version,
+    }
+
+
+def _unknown(reason: str) -> Answered:
+    """Verify; nothing was recorded, so there is no id to report on."""
+    return {"action": ACTIONS.index(Action.VERIFY), "id": "", "reason": reason, "lower": 0.0, "upper": 1.0, "version": 0}

@@ -1,0 +1,225 @@
+"""What a cell asks of its product's other cells, and the list of all cells of a database.
+
+What cells of one product share, apart from the database: addresses, news, and the settings that must agree.
+
+open_store(address("fleet.db", "cell-7", "gear-12"))
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import sqlalchemy as sa
+from numpy.typing import NDArray
+
+from ..errors import SettingError, StoreError
+from ..recipe import Recipe
+from .connections import advice, make_engine
+from .queries import cells_of, lock_product
+from .records import Labelled
+from .schema import DECISION, LABEL, OWNER_KEY, PRODUCT_KEY, RESERVED, SETTING, VERSION
+
+if TYPE_CHECKING:
+    from .connections import SqlDatabase
+
+RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
+EMBEDDING = ("reducer", "params", "folds", "window", "novelty")  # of a recipe: what a version's arrays were made by
+
+
+class CellAddress(str):
+    """A store's file or URL, and whose rows of it: wherever the name of a store is taken, this is too.
+
+    cell_id : the cell.  product : what it makes; None: as the store says, or nothing that is shared.
+    """
+
+    cell_id: str
+    product: str | None
+
+    def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
+        made = super().__new__(cls, url)
+        made.cell_id, made.product = cell_id, product
+        return made
+
+
+def address(store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None) -> str:
+    """A store's file or URL with its cell and product, as far as they were given."""
+    url = os.fspath(store)
+    return url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """What became known in a product.
+
+    labelled : labels of all its cells, this one's too, oldest first, as they count now.
+    version : number of its newest accepted version; 0 before the first.  correction : of its newest one; 0 likewise.
+    """
+
+    labelled: Labelled
+    version: int
+    correction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CellSummary:
+    """One cell of a database.
+
+    version : number of the newest accepted version that it may answer by, its product's or its own; None before the first.
+    last_seen : time of its newest decision or label, in seconds.
+    owner : the engine that drives it, where the store knows one.
+    """
+
+    cell_id: str
+    product: str | None
+    decisions: int
+    labels: int
+    version: int | None
+    last_seen: float | None
+    owner: str | None
+
+
+def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """A version's arrays but for what its maker's own parts taught its rule."""
+    return {name: values for name, values in state.items() if not name.startswith(RULE)}
+
+
+def must_agree(mine: Mapping[str, str], sister: Mapping[str, str], name: str, product: str) -> None:
+    """SettingError where two cells of a product, by what `Store.settings` gives of each, would embed a trace differently.
+
+    name : of the sister.  A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
+    """
+    if "recipe" not in mine or "recipe" not in sister:
+        return
+    have, asked = _embedding(sister), _embedding(mine)
+    either = ("trace",) if None in (have["trace"], asked["trace"]) else ()  # the first trace of any cell sets the contract
+    other = [key for key in have if key not in either and have[key] != asked[key]]
+    if other:
+        stored, got = (", ".join(f"{key} {values[key]}" for key in other) for values in (have, asked))
+        raise SettingError(
+            f"Expected the settings of product {product!r}, as cell {name!r} has them ({stored}), got {got}; "
+            "cells that share labels share what embeds them: give the same, or name another product."
+        )
+
+
+def _embedding(settings: Mapping[str, str]) -> dict[str, Any]:
+    recipe = Recipe.from_toml(settings["recipe"])
+    own = {key: getattr(recipe, key) for key in EMBEDDING}
+    return own | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
+
+
+class ProductShare:
+    """What `SqlStore` reads of its product; of a cell without one there is nothing to read."""
+
+    cell_id: str
+    _database: SqlDatabase
+
+    @property
+    def product(self) -> str | None:
+        """What the cell makes; None: it shares nothing."""
+        return self._database.scope.product
+
+    def sisters_settings(self) -> dict[str, dict[str, str]]:
+        """The settings of the product's other cells, by cell."""
+        with self._database.transaction(write=False) as connection:
+            return self._sisters(connection)
+
+    def _sisters(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
+        product = self._database.scope.product
+        if product is None:
+            return {}
+        query = sa.select(SETTING).where(SETTING.c.cell_id.in_(cells_of(product)), SETTING.c.cell_id != self.cell_id)
+        found: dict[str, dict[str, str]] = {}
+        for row in connection.execute(query.where(SETTING.c.key.not_in(RESERVED)).order_by(SETTING.c.cell_id)):
+            found.setdefault(row.cell_id, {})[row.key] = row.value
+        return found
+
+    def _refuse_disagreement(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
+        """SettingError where a sister embeds otherwise; the product stays locked, so that no sister comes in between."""
+        product = self._database.scope.product
+        if product is None:
+            return
+        self._database.scope.lock_cell(connection)
+        lock_product(connection, product)
+        for name, theirs in self._sisters(connection).items():
+            must_agree(settings, theirs, name, product)
+
+
+@contextmanager
+def _reading(url: str) -> Iterator[sa.Connection]:
+    engine = make_engine(url)
+    try:
+        with engine.connect() as connection:
+            yield connection
+    except (sa.exc.SQLAlchemyError, OSError) as error:
+        raise StoreError(
+            f"Could not read {without_password(url)}: {getattr(error, 'orig', None) or error}. {advice(error)}"
+        ) from error
+    finally:
+        engine.dispose()
+
+
+def without_password(url: str) -> str:
+    """A file or URL as it may be shown."""
+    return sa.make_url(url).render_as_string(hide_password=True) if "://" in url else url
+
+
+def cell_names(url: str) -> list[str]:
+    """The cells of a database, none where it holds no store; it is read and never made."""
+    with _reading(url) as connection:
+        found = sa.inspect(connection)
+        columns = found.get_columns(SETTING.name) if found.has_table(SETTING.name) else []
+        if {column["name"] for column in columns} != set(SETTING.c.keys()):
+            return []
+        return list(connection.execute(sa.select(SETTING.c.cell_id).distinct().order_by(SETTING.c.cell_id)).scalars())
+
+
+def must_have_cell(url: str, cell_id: str) -> None:
+    """StoreError for a cell that a database does not hold; a database without cells says what it is when it is opened."""
+    names: list[str] = []
+    with suppress(StoreError):
+        names = cell_names(url)
+    if names and cell_id not in names:
+        held = ", ".join(map(str, names))
+        raise StoreError(f"Expected a cell of this store, got {cell_id!r}; it holds {held}. Name one of them: --cell NAME.")
+
+
+def list_cells(url: str) -> list[CellSummary]:
+    """Every cell of a database, by name. StoreError where it holds none."""
+    names = cell_names(url)
+    if not names:
+        raise StoreError(
+            f"Expected a store that engines have used, {make_engine(url).url.render_as_string()} holds no cell."
+        )
+    with _reading(url) as connection:
+        settings = {(row.cell_id, row.key): row.value for row in connection.execute(sa.select(SETTING))}
+        decisions = _counts(connection, DECISION)
+        labels = _counts(connection, LABEL)
+        accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(VERSION.c.accepted == sa.true())
+        versions = {row[0]: row[1] for row in connection.execute(accepted.group_by(VERSION.c.cell_id))}
+    products = {name: settings.get((name, PRODUCT_KEY)) for name in names}
+    return [
+        CellSummary(
+            cell_id=name,
+            product=products[name],
+            decisions=decisions.get(name, (0, None))[0],
+            labels=labels.get(name, (0, None))[0],
+            version=max((versions[n] for n in _kin(name, products) if n in versions), default=None),
+            last_seen=max((row[name][1] for row in (decisions, labels) if name in row), default=None),
+            owner=settings.get((name, OWNER_KEY)),
+        )
+        for name in names
+    ]
+
+
+def _kin(name: str, products: Mapping[str, str | None]) -> list[str]:
+    product = products[name]
+    return [name] if product is None else [other for other, made in products.items() if made == product]
+
+
+def _counts(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:
+    query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(table.c.cell_id)
+    return {row[0]: (row[1], row[2]) for row in connection.execute(query)}

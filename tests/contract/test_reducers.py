@@ -1,0 +1,147 @@
+"""One contract over every entry of `REDUCERS`, and over reducers that come from outside: whoever joins keeps it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+from dengine import REDUCERS, ModelPrediction, make_reducer
+from dengine.errors import SettingError
+from dengine.reducers import Reducer
+from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
+
+QUICK: dict[str, dict[str, Any]] = {
+    "umap": {"n_epochs": 40, "n_neighbors": 8},
+    "conv": {"folds": 2},
+    "rocket": {"folds": 2},
+}
+EXPORTABLE = [name for name in REDUCERS if name != "umap"]
+
+every_reducer = pytest.mark.parametrize("name", REDUCERS)
+every_check = pytest.mark.parametrize("check", REDUCER_CHECKS, ids=lambda check: check.__name__)
+
+
+def new(name: str) -> Any:
+    return make_reducer(name, random_state=0, **QUICK.get(name, {}))
+
+
+@every_check
+@every_reducer
+def test_a_shipped_reducer_keeps_the_contract(name: str, check: Any) -> None:
+    check(new(name))
+
+
+@every_check
+@pytest.mark.parametrize("reducer", [PCA(2, random_state=0), LinearDiscriminantAnalysis()], ids=["PCA", "LDA"])
+def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) -> None:
+    check(reducer)
+
+
+@pytest.mark.parametrize("name", EXPORTABLE)
+def test_every_reducer_but_umap_can_be_exported_and_restored(name: str) -> None:
+    X, y = toy_traces()
+    fitted = new(name).fit(X, y)
+    assert fitted.module() is not None
+    assert fitted.get_state()
+
+
+@every_reducer
+def test_too_little_to_learn_from_is_a_setting_error(name: str) -> None:
+    X, _ = toy_traces(2)
+    with pytest.raises(SettingError):
+        ModelPrediction(new(name)).fit(X, np.ones(2))
+
+
+@every_reducer
+def test_an_unknown_setting_is_an_error_that_lists_the_known(name: str) -> None:
+    with pytest.raises(SettingError, match=r"no parameter dimm; it has .*random_state"):
+        make_reducer(name, dimm=2)
+
+
+def test_an_unknown_reducer_lists_the_known() -> None:
+    with pytest.raises(SettingError, match="conv, umap, pca"):
+        make_reducer("pac")
+
+
+# ------------------------------------------------------------------------------------------- caught when it is broken
+
+
+class Means(Reducer):
+    """A reducer of somebody else's, the least that is needed: means of the halves of a trace."""
+
+    def __init__(self, n_components: int = 2) -> None:
+        self.n_components = n_components
+
+    def fit(self, X: Any, y: Any = None) -> "Means":
+        self.check_traces(X, reset=True)
+        return self
+
+    def transform(self, X: Any) -> np.ndarray:
+        halves = np.array_split(self.check_traces(X), self.n_components, axis=2)
+        return np.stack([half.mean(axis=(1, 2)) for half in halves], axis=1)
+
+
+class Peeking(Means):
+    """Dishonest: it keeps the labels' mean of all folds, whatever space it is asked about."""
+
+    uses_labels, n_spaces = True, 2
+
+    def train(self, X: Any, y: Any, folds: Any, stop: Any = None) -> np.ndarray:
+        self.rate_ = float(np.mean(y * np.arange(len(y))))
+        return self.fit(X).embed_own(X, folds)
+
+    def embed(self, X: Any) -> np.ndarray:
+        Z = self.transform(X) * getattr(self, "rate_", 1.0)
+        return np.stack([Z, Z], axis=1).astype(np.float32)
+
+
+class Forgetful(Means):
+    """`fit` goes on from an earlier fit."""
+
+    def fit(self, X: Any, y: Any = None) -> "Forgetful":
+        self.gain_ = getattr(self, "gain_", 1.0) * 2.0
+        return super().fit(X)
+
+    def transform(self, X: Any) -> np.ndarray:
+        return super().transform(X) * self.gain_
+
+
+class Overwriting(Means):
+    """Writes to the caller's traces."""
+
+    def transform(self, X: Any) -> np.ndarray:
+        out = super().transform(X)
+        np.asarray(X)[:] = 0.0
+        return out
+
+
+class Unbounded(TransformerMixin, BaseEstimator):
+    """A transformer that gives infinities."""
+
+    def fit(self, X: Any, y: Any = None) -> "Unbounded":
+        return self
+
+    def transform(self, X: Any) -> np.ndarray:
+        return np.full((len(X), 2), np.inf)
+
+
+def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
+    check_reducer(Means())
+
+
+@pytest.mark.parametrize(
+    ("reducer", "clause"),
+    [
+        (Peeking(), "labels_of_a_fold_move_nothing_in_its_space"),
+        (Forgetful(), "fit_starts_afresh"),
+        (Overwriting(), "embedding_leaves_the_traces_as_they_are"),
+        (Unbounded(), "it_embeds_every_trace_in_every_space"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseEstimator) else "",
+)
+def test_a_broken_reducer_is_told_which_clause_it_breaks(reducer: Any, clause: str) -> None:
+    with pytest.raises(AssertionError, match=clause):
+        check_reducer(reducer)

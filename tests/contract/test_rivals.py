@@ -1,0 +1,379 @@
+"""Rivals in the same loop: what each promises to the engine, and what its method says by hand."""
+
+import copy
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from dengine import Action, DataEngine, Policy, Recipe, ReplayCell, load_dataset, wilson_interval
+from dengine.errors import SettingError
+from dengine.experiments.replay import Replay, collect
+from dengine.experiments.rivals import RIVALS, Rival, make_rival
+from dengine.experiments.rivals.densities import BANDWIDTHS, chosen_bandwidth, credible_interval, kernel_counts
+from dengine.experiments.rivals.features import Components, References, segment_means
+from dengine.experiments.rivals.selective import guaranteed_threshold, held_out, risk_bound
+from dengine.model import Model
+from dengine.records import Reason
+
+LOOSE = Policy(alpha=0.5, lower_bound=0.8)
+QUICK: dict[str, dict[str, Any]] = {
+    "minirocket": {"n_kernels": 168},
+    "river": {"n_models": 3, "threshold": 0.8},
+    "gp": {"n_components": 2},
+}
+LEARN_AT_ONCE = ("knn", "wskde", "river")  # those that take labels in between two trainings
+
+every_rival = pytest.mark.parametrize("name", RIVALS)
+learning_rival = pytest.mark.parametrize("name", [name for name in RIVALS if name not in ("always", "never")])
+
+
+def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Rival:
+    if RIVALS[name].needs:
+        pytest.importorskip(RIVALS[name].needs)
+    return make_rival(name, policy, seed, **QUICK.get(name, {}) | params)
+
+
+@pytest.fixture
+def traces(make_data: Any) -> tuple[np.ndarray, np.ndarray]:
+    """160 traces (n, 1, T) of two shapes; the first 120 are for training."""
+    data = make_data(160, 60, failures=0.4)
+    return data.X[:, None, :], data.y
+
+
+def trained(name: str, traces: tuple[np.ndarray, np.ndarray]) -> Rival:
+    X, y = traces
+    return new(name).fit(X[:120], y[:120])
+
+
+# ------------------------------------------------------------------------------------------------------- the contract
+
+
+@every_rival
+def test_a_rival_gives_the_engine_what_it_asks_for(name: str, traces: Any) -> None:
+    rival, X = trained(name, traces), traces[0][120:]
+    assert isinstance(rival, Model)
+    lower, upper = rival.predict_interval(X)
+    n_success, n_failure = rival.count(X)
+    assert lower.shape == upper.shape == n_success.shape == n_failure.shape == (40,)
+    assert ((lower >= 0) & (lower <= upper) & (upper <= 1)).all()
+    assert n_success.dtype.kind == n_failure.dtype.kind == "i"
+    assert (n_success >= 0).all()
+    assert (n_failure >= 0).all()
+    assert all(isinstance(action, Action) for action in rival.decide(X))
+
+
+@learning_rival
+def test_on_easy_traces_a_rival_is_certain_of_both_kinds_and_right(name: str, traces: Any) -> None:
+    X, y = traces
+    actions = trained(name, traces).decide(X[120:])
+    accepted, rejected = actions == Action.ACCEPT, actions == Action.REJECT
+    assert accepted.sum() >= 5
+    assert rejected.sum() >= 3
+    assert y[120:][accepted].all()
+    assert not y[120:][rejected].any()
+
+
+@every_rival
+def test_one_trace_alone_is_judged_as_among_others(name: str, traces: Any) -> None:
+    rival, X = trained(name, traces), traces[0][120:130]
+    together, alone = rival.judge(X), [rival.judge(x[None]) for x in X]
+    assert [each.action[0] for each in alone] == list(together.action)
+    assert [each.lower[0] for each in alone] == pytest.approx(together.lower, abs=1e-6)
+
+
+@every_rival
+def test_the_same_seed_gives_the_same_judgements(name: str, traces: Any) -> None:
+    X, y = traces
+    first, second = (new(name, seed=3).fit(X[:80], y[:80]).predict_interval(X[120:]) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@learning_rival
+@pytest.mark.parametrize("labels", [np.ones(60), np.zeros(60)], ids=["successes", "failures"])
+def test_labels_of_one_class_verify_everything(name: str, labels: np.ndarray, traces: Any) -> None:
+    X = traces[0]
+    rival = new(name).fit(X[:60], labels)
+    rival.add(X[60], 1)
+    assert set(rival.decide(X[120:])) == {Action.VERIFY}
+    assert list(rival.predict_interval(X[120:])[0]) == [0.0] * 40
+
+
+@learning_rival
+def test_too_few_labels_verify_everything(name: str, traces: Any) -> None:
+    X, y = traces
+    two = [int(np.flatnonzero(y == label)[0]) for label in (0, 1)]
+    assert set(new(name).fit(X[two], y[two]).decide(X[120:])) == {Action.VERIFY}
+
+
+@learning_rival
+def test_a_rival_before_its_first_training_verifies(name: str, traces: Any) -> None:
+    rival = new(name).add(traces[0][0], 1)
+    assert set(rival.decide(traces[0][:5])) == {Action.VERIFY}
+
+
+@every_rival
+def test_what_a_copy_learns_stays_with_the_copy(name: str, traces: Any) -> None:
+    X, y = traces
+    rival = trained(name, traces)
+    before = rival.predict_interval(X[120:])
+    successor = copy.deepcopy(rival)
+    successor.fit(X[40:], 1 - y[40:])
+    for x in X[120:]:
+        successor.add(x, 0)
+    rival._last = None  # ask the model and not its memory
+    np.testing.assert_array_equal(rival.predict_interval(X[120:]), before)
+
+
+@every_rival
+def test_a_label_between_two_trainings_counts_where_the_method_learns_at_once(name: str, traces: Any) -> None:
+    X, y = traces
+    rival = new(name, **({"k": 1} if name == "knn" else {})).fit(X[:120], y[:120])
+    before = rival.predict_interval(X[120:])
+    for x, label in zip(X[120:], y[120:], strict=True):
+        rival.add(x, 1 - label)
+    changed = not np.array_equal(rival.predict_interval(X[120:]), before)
+    assert changed == (name in LEARN_AT_ONCE)
+
+
+@pytest.mark.parametrize("name", [name for name in RIVALS if name != "minirocket"])  # aeon would compile for a minute
+def test_a_rival_takes_several_channels(name: str, traces: Any) -> None:
+    X, y = traces
+    wide = np.concatenate([X, -X], axis=1)
+    assert len(new(name).fit(wide[:120], y[:120]).decide(wide[120:])) == 40
+
+
+def test_a_wrong_shape_is_an_error_that_names_it() -> None:
+    with pytest.raises(SettingError, match=r"\(n, C, T\), got \(3, 40\)"):
+        new("knn").fit(np.zeros((3, 40)), [0, 1, 1])
+
+
+# ------------------------------------------------------------------------------------------------------------- by name
+
+
+def test_the_table_is_complete_and_imports_nothing() -> None:
+    code = (
+        "import sys; from dengine.experiments.rivals import RIVALS; [k.title for k in RIVALS.values()]\n"
+        "print(*[m for m in ('aeon', 'mapie', 'river', 'sklearn.gaussian_process') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+    assert list(RIVALS) == ["knn", "wskde", "gp", "minirocket", "mapie", "river", "always", "never"]
+    assert all(len(kind.tries) == 4 and kind.chosen in kind.tries for kind in RIVALS.values())
+    assert [name for name, kind in RIVALS.items() if not kind.bound] == ["knn", "river", "never"]
+
+
+@every_rival
+def test_every_try_can_be_made(name: str) -> None:
+    for params in {repr(sorted(each.items())): each for each in RIVALS[name].tries}.values():
+        assert type(new(name, **params)) is RIVALS[name].rival
+
+
+def test_a_rival_has_the_policys_numbers() -> None:
+    rival = make_rival("knn", Policy(alpha=0.2, lower_bound=0.85, audit_rate=0.1), seed=7)
+    assert (rival.policy.alpha, rival.policy.lower_bound, rival.seed) == (0.2, 0.85, 7)
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "words"),
+    [
+        ("nope", {}, "rival among knn, wskde"),
+        ("knn", {"n": 3}, "rival knn has no parameter n; it has k"),
+        ("always", {"n": 3}, "it has none"),
+        ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
+        ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
+        ("gp", {"n_components": 1.5}, "n_components to be an integer"),
+        ("gp", {"amplitude": 1.0}, "amplitude above 1, got 1.0"),
+        ("minirocket", {"holdout": 1.0}, "holdout to be a number above 0 and below 1"),
+        ("mapie", {"fwer": "none"}, "bonferroni_holm or fixed_sequence"),
+        ("river", {"threshold": 0.5}, "0.5 < threshold <= 1"),
+    ],
+)
+def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str) -> None:
+    if name in RIVALS and RIVALS[name].needs:
+        pytest.importorskip(RIVALS[name].needs)
+    with pytest.raises(SettingError, match=words):
+        make_rival(name, LOOSE, 0, **params)
+
+
+def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(RIVALS, "absent", replace(RIVALS["knn"], needs="a_library_of_nobody"))
+    with pytest.raises(SettingError, match=r'needs a_library_of_nobody.*pip install "dengine\[rivals\]"'):
+        make_rival("absent", LOOSE, 0)
+
+
+# ---------------------------------------------------------------------------------------------------- methods, by hand
+
+
+def test_neighbours_decide_only_where_all_k_agree() -> None:
+    X = np.array([0.0, 1.0, 2.0, 10.0, 11.0, 12.0, 13.0])[:, None, None]
+    rival = new("knn", k=3).fit(X, [1, 1, 1, 0, 0, 0, 1])
+    asked = np.array([1.0, 11.0, 12.5])[:, None, None]
+    assert list(rival.decide(asked)) == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
+    assert [list(counts) for counts in rival.count(asked)] == [[3, 0, 1], [0, 3, 2]]
+    np.testing.assert_allclose(rival.predict_interval(asked), [[1.0, 0.0, 1 / 3]] * 2)
+
+
+def test_a_neighbour_counts_from_the_next_part_on() -> None:
+    X = np.arange(4.0)[:, None, None]
+    rival = new("knn", k=1).fit(X, [1, 1, 0, 0])
+    assert rival.decide(X[:1]) == [Action.ACCEPT]
+    rival.fit(X, [1, 1, 0, 0]).add(X[0] - 0.1, 0)
+    assert rival.decide(X[:1] - 0.1) == [Action.REJECT]
+
+
+def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> None:
+    # The published effective sample size in two dimensions is 2 sum w: Wilson's interval of twice the counts.
+    X, y = traces
+    rival = new("wskde", bandwidth=1e-5).fit(X[:120], y[:120])
+    good = int(np.flatnonzero(y[:120])[0])
+    assert [int(n[0]) for n in rival.count(X[good : good + 1])] == [2, 0]
+    np.testing.assert_allclose(
+        np.ravel(rival.predict_interval(X[good : good + 1])), wilson_interval(2, 0, LOOSE.alpha), atol=1e-6
+    )
+
+
+def test_a_kernel_wider_than_the_data_counts_every_label_twice(traces: Any) -> None:
+    X, y = traces
+    rival = new("wskde", bandwidth=1e6).fit(X[:120], y[:120])
+    n_success = int(y[:120].sum())
+    expected = wilson_interval(2 * n_success, 2 * (120 - n_success), LOOSE.alpha)
+    np.testing.assert_allclose(np.ravel(rival.predict_interval(X[120:121])), expected, atol=1e-9)
+
+
+def test_among_dense_traces_the_kernels_sample_size_is_kishs() -> None:
+    grid = np.stack(np.meshgrid(*[np.linspace(-3, 3, 121)] * 2), axis=-1).reshape(-1, 2)
+    distances = (grid**2).sum(axis=1)[None]
+    weights = np.exp(-0.5 * distances / 0.4**2)
+    n_success, n_failure = kernel_counts(distances, np.ones(len(grid), dtype=bool), 0.4)
+    assert n_failure[0] == 0
+    assert n_success[0] == pytest.approx(weights.sum() ** 2 / (weights**2).sum(), rel=1e-3)
+
+
+def test_the_bandwidth_follows_the_detail_that_the_labels_have() -> None:
+    rng = np.random.default_rng(0)
+    Z = rng.normal(size=(400, 2))
+    fine = np.sin(12.0 * Z[:, 0]) > 0
+    noise = rng.random(400) < 0.7
+    assert chosen_bandwidth(Z, fine, 0.1) < 0.15
+    assert chosen_bandwidth(Z, noise, 0.1) == max(BANDWIDTHS)
+
+
+@pytest.mark.parametrize(("wrong", "n", "delta"), [(0, 20, 0.1), (3, 50, 0.05), (49, 50, 0.2)])
+def test_the_risk_bound_inverts_the_binomial_tail(wrong: int, n: int, delta: float) -> None:
+    assert binom.cdf(wrong, n, risk_bound(wrong, n, delta)) == pytest.approx(delta, rel=1e-9)
+
+
+def test_nothing_seen_and_nothing_right_bound_nothing() -> None:
+    assert risk_bound(0, 0, 0.1) == risk_bound(5, 5, 0.1) == 1.0
+    assert guaranteed_threshold(np.empty(0), np.empty(0, dtype=bool), 0.1, 0.1) == np.inf
+
+
+def test_the_threshold_parts_the_confident_from_the_wrong() -> None:
+    confidence = np.linspace(0.5, 1.0, 256)
+    wrong = confidence < 0.75
+    found = guaranteed_threshold(confidence, wrong, 0.1, 0.1)
+    beyond = confidence >= found
+    assert 0.7 < found <= 0.76
+    assert risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), 0.1 / 8) < 0.1  # log2(256) = 8 looks
+
+
+def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_sets() -> None:
+    rng = np.random.default_rng(1)
+    found = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
+    assert np.mean(found) <= 0.2
+
+
+def test_what_is_held_out_trains_nothing() -> None:
+    train, rest = held_out(101, 0.3, seed=5)
+    assert len(rest) == 30
+    assert sorted([*train, *rest]) == list(range(101))
+
+
+@pytest.mark.parametrize("name", ["minirocket", "mapie"])
+def test_labels_of_noise_get_no_threshold(name: str, traces: Any) -> None:
+    noise = np.random.default_rng(2).random(160) < 0.5
+    rival = new(name, Policy(alpha=0.1, lower_bound=0.9)).fit(traces[0], noise)
+    assert set(rival.decide(traces[0])) == {Action.VERIFY}
+
+
+def test_a_smaller_alpha_gives_a_wider_credible_interval(traces: Any) -> None:
+    X, y = traces
+    bounds = [new("gp", Policy(alpha, 0.9)).fit(X[:80], y[:80]).predict_interval(X[120:]) for alpha in (0.5, 0.1, 0.01)]
+    for (lower, upper), (wider_lower, wider_upper) in pairwise(bounds):
+        assert (wider_lower < lower).all()
+        assert (wider_upper > upper).all()
+
+
+def test_a_certain_latent_function_has_a_point_for_an_interval() -> None:
+    lower, upper = credible_interval(np.array([0.0, np.log(9.0)]), np.zeros(2), 0.1)
+    np.testing.assert_allclose([lower, upper], [[0.5, 0.9]] * 2)
+
+
+def test_the_stream_learner_learns_each_label_once(traces: Any) -> None:
+    X, y = traces
+    rival = new("river").fit(X[:60], y[:60])
+    for x, label in zip(X[60:120], y[60:120], strict=True):
+        rival.add(x, label)
+    before = rival.predict_interval(X[120:])
+    np.testing.assert_array_equal(rival.fit(X[:120], y[:120]).predict_interval(X[120:]), before)
+
+
+# ------------------------------------------------------------------------------------------------------ what they look at
+
+
+def test_segment_means_are_means_of_stretches_that_cover_the_trace() -> None:
+    X = np.arange(14.0, dtype=np.float32).reshape(1, 2, 7)
+    np.testing.assert_allclose(segment_means(X, 2), [[1.0, 4.5, 8.0, 11.5]])
+    np.testing.assert_allclose(segment_means(X, 50), X.reshape(1, 14))
+
+
+def test_components_keep_their_proportions_or_are_whitened(traces: Any) -> None:
+    plain, white = (Components(3, whiten=whiten, seed=0).fit(traces[0]).std(axis=0) for whiten in (False, True))
+    assert plain[0] == pytest.approx(1.0)
+    assert plain[0] > plain[1] > plain[2]
+    assert white == pytest.approx(np.ones(3))
+
+
+def test_references_grow_and_keep_their_order() -> None:
+    held = References(np.zeros((1, 2)), np.array([True]))
+    for i in range(1, 6):
+        held.add(np.full((1, 2), float(i)), i % 2 == 0)
+    assert len(held) == 6
+    assert held.points[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert held.good.tolist() == [True, False, True, False, True, False]
+
+
+# -------------------------------------------------------------------------------------------------------- in the loop
+
+
+def short_replay(rival: Rival, cycles: int = 150) -> Replay:
+    data = load_dataset("insertion")
+    order = np.random.default_rng(0).permutation(len(data))[:cycles]
+    engine = DataEngine.from_recipe(Recipe.load("conv"), model=rival, seed=0, replaying=True)
+    return collect(engine, ReplayCell(data, order), data, seed=0)
+
+
+@every_rival
+def test_a_rival_plays_in_the_engines_loop(name: str) -> None:
+    played = short_replay(new(name))
+    assert len(played) == 150
+    assert (played.version[50:] >= 1).all()  # it answers after the first retrain
+    assert all(report.accepted for report in played.retrains)  # and no training failed
+    assert set(played.reason) <= {Reason.NO_MODEL, Reason.UNCERTAIN, Reason.CERTAIN}
+    assert (played.action[:50] == "verify").all()
+
+
+def test_never_verifying_accepts_everything_from_the_first_model_on() -> None:
+    played = short_replay(new("never"))
+    assert played.accepted[50:].all()
+    assert played.stopped.sum() == (~played.truth[50:]).sum() > 0
+
+
+def test_always_verifying_decides_nothing() -> None:
+    assert short_replay(new("always")).verified.all()

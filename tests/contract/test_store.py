@@ -1,0 +1,874 @@
+"""One contract over every store: in memory, SQLite in a file, PostgreSQL where DENGINE_TEST_POSTGRES names one."""
+
+import hashlib
+import os
+import sqlite3
+import subprocess
+import sys
+import threading
+import uuid
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from dengine.errors import ReportError, StoreError
+from dengine.records import Action, Decision, Reason, RetrainReport, Source
+from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, open_store
+from dengine.store import connections as sql_queue
+from dengine.store import queries as sql_queries
+from dengine.store.queries import Scope
+
+C, T = 2, 30
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+DATABASES = [
+    "sqlite",
+    pytest.param(
+        "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+    ),
+]
+
+
+def url_of(kind: str, directory: Path) -> str:
+    return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
+
+
+@pytest.fixture(params=["memory", *DATABASES])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
+    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=DATABASES)
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+    """A URL and a cell of its own, to open again and again."""
+    return url_of(request.param, tmp_path), uuid.uuid4().hex
+
+
+def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
+    return Decision(name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0)
+
+
+def trace(seed: int = 0, shape: tuple[int, ...] = (C, T)) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def put(store: Store, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:
+    values = trace(seed)
+    store.put_decision(decision(name), values, content_hash, quarantined)
+    return values
+
+
+def label(name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION) -> NewLabel:
+    return NewLabel(name, success, source, 0, None, silent)
+
+
+def report(version: int, accepted: bool = True) -> RetrainReport:
+    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
+
+
+# Decisions
+
+
+def test_a_store_satisfies_the_protocol(store: Store) -> None:
+    assert isinstance(store, Store)
+
+
+def test_a_decision_is_found_at_once_and_after_the_flush(store: Store) -> None:
+    values = trace()
+    given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02)
+    store.put_decision(given, values, -(2**63), False)
+    for _ in range(2):
+        found = store.get_decision("a")
+        assert found is not None
+        assert (found.id, found.action, found.predicted, found.audit) == ("a", Action.VERIFY, Action.ACCEPT, True)
+        assert (found.reason, found.model_version, found.content_hash) == (Reason.AUDIT, 3, -(2**63))
+        assert (found.quarantined, found.success, found.source) == (False, None, None)
+        np.testing.assert_array_equal(found.trace, values)
+        store.flush()
+
+
+def test_an_unknown_decision_is_none(store: Store) -> None:
+    assert store.get_decision("nobody") is None
+
+
+def test_the_callers_buffer_may_change_after_put_decision(store: Store) -> None:
+    values = put(store, "a")
+    expected = values.copy()
+    values[:] = 0
+    store.flush()
+    np.testing.assert_array_equal(store.get_decision("a").trace, expected)
+
+
+def test_a_flat_trace_is_stored_as_one_channel(store: Store) -> None:
+    store.put_decision(decision("a"), trace(0, (T,)), 1, False)
+    store.flush()
+    assert store.get_decision("a").trace.shape == (1, T)
+
+
+def test_a_second_decision_of_one_id_is_refused_and_the_first_stands(store: Store) -> None:
+    first = put(store, "a", seed=1)
+    store.flush()
+    with pytest.raises(StoreError, match="'a'"):  # noqa: PT012 - a database notices at its next write
+        put(store, "a", seed=2)
+        with pytest.raises(StoreError):
+            store.flush()
+        store.flush()
+    np.testing.assert_array_equal(store.get_decision("a").trace, first)
+    assert store.status()["decisions"] == 1
+
+
+def test_an_unsigned_hash_is_refused_before_it_is_queued(store: Store) -> None:
+    with pytest.raises(StoreError, match="signed 64 bits"):
+        store.put_decision(decision("a"), trace(), 2**63, False)
+    store.flush()
+
+
+@pytest.mark.parametrize("part", [None, "", "SN-0042", "Stück 7\\0"])
+def test_the_number_of_the_part_returns_before_and_after_the_flush(store: Store, part: str | None) -> None:
+    store.put_decision(decision("a"), trace(), 1, False, part)
+    for _ in range(2):
+        assert store.get_decision("a").part == part
+        store.flush()
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert store.get_decision("a").part == part
+
+
+def test_a_decision_without_a_part_has_none(store: Store) -> None:
+    put(store, "a")
+    store.flush()
+    assert store.get_decision("a").part is None
+
+
+@pytest.mark.parametrize("part", ["SN\0", "\ud800", 42])
+def test_a_part_that_no_database_holds_is_refused_before_it_is_queued(store: Store, part: object) -> None:
+    with pytest.raises(StoreError, match="part's number"):
+        store.put_decision(decision("a"), trace(), 1, False, part)
+    store.flush()
+    assert store.status()["decisions"] == 0
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    values=hnp.arrays(np.float32, st.tuples(st.integers(1, 3), st.integers(1, 40)), elements=st.floats(width=32)),
+    content_hash=st.integers(-(2**63), 2**63 - 1),
+    quarantined=st.booleans(),
+)
+def test_any_trace_returns_bit_for_bit(store: Store, values: np.ndarray, content_hash: int, quarantined: bool) -> None:
+    name = uuid.uuid4().hex
+    store.put_decision(decision(name), values, content_hash, quarantined)
+    store.flush()
+    found = store.get_decision(name)
+    assert found.trace.tobytes() == values.tobytes()
+    assert found.trace.shape == values.shape
+    assert (found.content_hash, found.quarantined) == (content_hash, quarantined)
+
+
+# Labels
+
+
+def test_labels_are_numbered_from_one_in_the_order_of_their_reports(store: Store) -> None:
+    for name in "abc":
+        put(store, name)
+    assert [store.put_label(name, True, Source.VERIFICATION, 0, None) for name in "cab"] == [1, 2, 3]
+
+
+def test_a_label_is_found_on_its_decision(store: Store) -> None:
+    put(store, "a")
+    store.put_label("a", False, Source.STOP, 0, None)
+    found = store.get_decision("a")
+    assert (found.success, found.source) == (False, Source.STOP)
+
+
+def test_a_report_on_an_unknown_decision_names_the_id(store: Store) -> None:
+    with pytest.raises(ReportError, match="'nobody'"):
+        store.put_label("nobody", True, Source.VERIFICATION, 0, None)
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_a_second_report_names_id_first_label_and_source_and_the_first_stands(store: Store, success: bool) -> None:
+    put(store, "a")
+    store.put_label("a", True, Source.CONFIRMED, 0, None)
+    with pytest.raises(ReportError, match="'a': success from confirmed was reported first"):
+        store.put_label("a", success, Source.STOP, 0, None)
+    found = store.get_decision("a")
+    assert (found.success, found.source) == (True, Source.CONFIRMED)
+    put(store, "b")
+    assert store.put_label("b", True, Source.VERIFICATION, 0, None) == 2
+
+
+def test_a_refused_report_loses_no_queued_decision(store: Store) -> None:
+    put(store, "a")
+    with pytest.raises(ReportError):
+        store.put_label("nobody", True, Source.VERIFICATION, 0, None)
+    store.flush()
+    assert store.get_decision("a") is not None
+
+
+def test_labels_in_one_batch_are_numbered_in_the_order_given(store: Store) -> None:
+    for name in "abcd":
+        put(store, name)
+    assert store.put_label("d", True, Source.VERIFICATION, 0, None) == 1
+    point = np.array([0.5, 1.5], dtype=np.float32)
+    batch = [NewLabel("c", False, Source.STOP, 3, point, 4), label("a"), label("b", False)]
+    seqs = store.put_labels(batch)
+    assert (seqs.tolist(), seqs.dtype) == ([2, 3, 4], np.int64)
+    assert store.labelled().labels.tolist() == [1, 0, 1, 0]
+    assert (store.get_decision("c").success, store.get_decision("c").source) == (False, Source.STOP)
+    added = store.points_since(0, 3)
+    assert (added.seq.tolist(), added.points.tolist()) == ([2], [[0.5, 1.5]])
+    assert store.put_labels([]).tolist() == []
+
+
+@pytest.mark.parametrize(
+    ("last", "error"),
+    [("nobody", "'nobody'"), ("done", "'done': success from confirmed was"), ("a", "'a': success from verification was")],
+)
+def test_a_batch_with_one_bad_report_takes_none_of_its_labels(store: Store, last: str, error: str) -> None:
+    for name in ("done", "a", "b"):
+        put(store, name)
+    store.put_label("done", True, Source.CONFIRMED, 0, None)
+    with pytest.raises(ReportError, match=error):
+        store.put_labels([label("a", silent=5), label("b"), label(last, False)])
+    assert store.labelled().seq.tolist() == [1]
+    assert store.get_decision("a").success is None
+    assert store.silent_total() == 0
+    assert store.put_labels([label("b"), label("a")]).tolist() == [2, 3]
+
+
+def test_a_silence_below_minus_one_is_refused(store: Store) -> None:
+    put(store, "a")
+    with pytest.raises(StoreError, match="-1 or more, got -2"):
+        store.put_label("a", True, Source.VERIFICATION, 0, None, silent=-2)
+    assert store.get_decision("a").success is None
+
+
+def test_a_batch_longer_than_a_chunk_is_taken_whole(store: Store) -> None:
+    names = [str(i) for i in range(1203)]
+    for name in names:
+        store.put_decision(decision(name), np.zeros((1, 2), np.float32), int(name), False)
+    assert store.put_labels([label(name, silent=1) for name in names]).tolist() == list(range(1, 1204))
+    assert store.labelled().hashes.tolist() == list(range(1203))
+    assert store.silent_total() == 1203
+
+
+def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: Store) -> None:
+    traces = {name: put(store, name, seed, 100 + seed, name == "c") for seed, name in enumerate("abcde")}
+    for name in "ecbad":
+        store.put_label(name, name != "b", Source.VERIFICATION, 0, None)
+    every = store.labelled()
+    assert every.seq.tolist() == [1, 3, 4, 5]
+    assert every.labels.tolist() == [1, 0, 1, 1]
+    assert every.hashes.tolist() == [104, 101, 100, 103]
+    np.testing.assert_array_equal(every.traces, np.stack([traces[name] for name in "ebad"]))
+    newest = store.labelled(2)
+    assert newest.seq.tolist() == [4, 5]
+    np.testing.assert_array_equal(newest.traces, every.traces[2:])
+    assert [a.dtype for a in (every.seq, every.traces, every.labels, every.hashes)] == ["i8", "f4", "i1", "i8"]
+
+
+@pytest.mark.parametrize("limit", [None, 0, 5])
+def test_an_empty_store_has_empty_arrays(store: Store, limit: int | None) -> None:
+    found = store.labelled(limit)
+    assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
+    assert store.points_since(0, 1).points.shape == (0, 0)
+    assert store.last_version() is None
+    assert store.retrains() == []
+
+
+def test_a_limit_of_zero_returns_nothing(store: Store) -> None:
+    put(store, "a")
+    store.put_label("a", True, Source.AUDIT, 0, None)
+    assert len(store.labelled(0).seq) == 0
+
+
+def test_traces_of_two_shapes_are_an_error_that_names_both(store: Store) -> None:
+    for name, samples in (("a", 10), ("b", 20)):
+        store.put_decision(decision(name), trace(0, (1, samples)), 1, False)
+        store.put_label(name, True, Source.VERIFICATION, 0, None)
+    with pytest.raises(StoreError, match=r"\(1, 10\), \(1, 20\)"):
+        store.labelled()
+    assert store.labelled(1).traces.shape == (1, 1, 20)
+
+
+def test_points_since_a_swap_are_those_of_that_version(store: Store) -> None:
+    point = np.array([0.1, 0.2, 0.3, 0.4], dtype=np.float32)
+    for i, (version, added) in enumerate([(1, point), (2, point + 1), (2, None), (1, point + 2), (2, point + 3)]):
+        put(store, str(i), content_hash=i)
+        store.put_label(str(i), i % 2 == 0, Source.AUDIT, version, added)
+    added = store.points_since(2, 2)
+    assert added.seq.tolist() == [5]
+    np.testing.assert_array_equal(added.points, (point + 3)[None])
+    np.testing.assert_array_equal(store.points_since(0, 2).points, np.stack([point + 1, point + 3]))
+    assert store.points_since(5, 2).points.shape == (0, 0)
+
+
+# Import
+
+
+def test_an_import_is_labelled_and_numbered_after_what_was_there(store: Store) -> None:
+    put(store, "a")
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    traces, hashes, labels = trace(1, (3, C, T)), np.array([5, -5, 6]), np.array([1, 0, 1], dtype=np.int8)
+    seqs = store.put_labelled([decision(name) for name in "bcd"], traces, hashes, labels, Source.VERIFICATION)
+    assert seqs.tolist() == [2, 3, 4]
+    found = store.labelled(3)
+    np.testing.assert_array_equal(found.traces, traces)
+    assert (found.hashes.tolist(), found.labels.tolist()) == ([5, -5, 6], [1, 0, 1])
+    assert store.get_decision("c").success is False
+
+
+def test_an_import_with_a_known_id_adds_nothing(store: Store) -> None:
+    put(store, "b")
+    store.flush()
+    with pytest.raises(StoreError, match="'b'"):
+        store.put_labelled(
+            [decision("a"), decision("b")], trace(0, (2, C, T)), np.arange(2), np.ones(2, np.int8), Source.VERIFICATION
+        )
+    assert store.get_decision("a") is None
+    assert store.status()["labels"] == 0
+    assert store.status()["write_failures"] == 0
+
+
+def test_an_import_whose_parts_differ_in_length_is_refused(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"\(1, 2, 2, 2\)"):
+        store.put_labelled([decision("a")], trace(0, (2, C, T)), np.arange(2), np.ones(2, np.int8), Source.VERIFICATION)
+
+
+def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quarantined(store: Store) -> None:
+    for i, quarantined in enumerate([False, True, False, False]):
+        bounded = replace(decision(str(i)), lower=0.1 * i, upper=0.2 * i)
+        store.put_decision(bounded, trace(i), i, quarantined)
+        store.put_label(str(i), i % 2 == 0, Source.VERIFICATION, 1, None)
+    found = store.evidence_since(1)
+    assert (found.seq.tolist(), found.success.tolist()) == ([3, 4], [True, False])
+    np.testing.assert_array_equal(found.lower, [0.2, 0.1 * 3])
+    np.testing.assert_array_equal(found.upper, [0.4, 0.2 * 3])
+    assert len(store.evidence_since(4).seq) == 0
+
+
+@pytest.mark.parametrize("parts", [None, ["x", None, "z"]])
+def test_an_import_keeps_the_number_of_each_part(store: Store, parts: list[str | None] | None) -> None:
+    traces, hashes, labels = trace(1, (3, C, T)), np.arange(3), np.ones(3, dtype=np.int8)
+    store.put_labelled([decision(name) for name in "abc"], traces, hashes, labels, Source.VERIFICATION, parts)
+    assert [store.get_decision(name).part for name in "abc"] == (parts or [None, None, None])
+
+
+@pytest.mark.parametrize(("parts", "said"), [(["x"], "each of 2 traces, got 1"), (["x", "y\0"], "plain text")])
+def test_an_import_with_bad_parts_adds_nothing(store: Store, parts: list[str], said: str) -> None:
+    with pytest.raises(StoreError, match=said):
+        store.put_labelled(
+            [decision("a"), decision("b")], trace(0, (2, C, T)), np.arange(2), np.ones(2), Source.VERIFICATION, parts
+        )
+    assert (store.get_decision("a"), store.status()["decisions"]) == (None, 0)
+
+
+def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Store) -> None:
+    for name, reason in (("a", Reason.NOVEL), ("b", Reason.CERTAIN), ("c", Reason.NOVEL)):
+        store.put_decision(decision(name, reason=reason), trace(), 1, False)
+    store.put_label("c", True, Source.VERIFICATION, 0, None, silent=2)
+    store.put_labels([label("b", silent=3), label("a")])
+    found = store.evidence_since(0)
+    assert (found.novel.tolist(), found.silent.tolist()) == ([True, False, True], [2, 3, 0])
+    assert (found.novel.dtype, found.silent.dtype) == (np.bool_, np.int64)
+    assert (store.evidence_since(2).novel.tolist(), store.evidence_since(2).silent.tolist()) == ([True], [0])
+    empty = store.evidence_since(3)
+    assert (empty.novel.dtype, empty.silent.dtype, empty.novel.shape) == (np.bool_, np.int64, (0,))
+
+
+# What became of decisions
+
+
+def test_a_new_store_has_heard_of_everything_and_nothing_happened(store: Store) -> None:
+    assert (store.unreported_accepts(), store.silent_total(), store.events()) == ([], 0, [])
+    assert store.outcomes() == Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store) -> None:
+    names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
+    store._clock = iter([5.0, 5.0, 5.0, 7.0, 7.0, 7.0, *range(8, 20)]).__next__
+    for name in names:
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
+    store.put_decision(decision("verified"), trace(), 1, False)
+    store.put_decision(decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
+    assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
+    store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
+    assert store.unreported_accepts() == ["amy", "kim", "ann"]
+    assert sorted(store.decision_ids()) == sorted([*names, "verified", "rejected"])
+
+
+def test_unreported_accepts_are_oldest_first_when_the_clock_went_back(store: Store) -> None:
+    store._clock = iter([3.0, 1.0, 2.0]).__next__
+    for name in "abc":
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    assert store.unreported_accepts() == ["b", "c", "a"]
+
+
+def test_the_silent_total_leaves_out_quarantined_labels(store: Store) -> None:
+    for i, silent in enumerate([3, 0, 4, 5]):
+        put(store, str(i), quarantined=i == 2)
+        store.put_label(str(i), True, Source.VERIFICATION, 0, None, silent=silent)
+    assert store.silent_total() == 8
+    assert store.evidence_since(0).silent.sum() == 8
+
+
+def test_outcomes_count_what_became_of_what_was_certain(store: Store) -> None:
+    for i, (action, predicted, success) in enumerate(
+        [(Action.ACCEPT, Action.ACCEPT, success) for success in (None, None, None, False, False, True)]
+        + [(Action.REJECT, Action.REJECT, None)] * 2
+        + [(Action.VERIFY, Action.ACCEPT, success) for success in (True, True, False, None)]
+        + [(Action.VERIFY, Action.REJECT, success) for success in (True, True, True, False, None)]
+        + [(Action.VERIFY, Action.VERIFY, success) for success in (True, False, None)]
+    ):
+        audit = action != predicted
+        store.put_decision(replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
+        if success is not None:
+            store.put_label(str(i), success, Source.AUDIT, 0, None)
+    assert store.outcomes() == Outcomes(
+        accepted=6,
+        stops=2,
+        confirmed=1,
+        audited_accepts=3,
+        audited_accepts_bad=1,
+        rejected=2,
+        audited_rejects=4,
+        audited_rejects_good=3,
+    )
+
+
+LIVES = st.lists(
+    st.tuples(
+        st.sampled_from(Action), st.booleans(), st.sampled_from([None, False, True]), st.integers(0, 5), st.booleans()
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(lives=LIVES)
+def test_counts_grow_by_what_was_put_and_agree_with_each_other(
+    store: Store, lives: list[tuple[Action, bool, bool | None, int, bool]]
+) -> None:
+    """lives : what the model predicted, audited or not, label or None, silent before it, quarantined or not."""
+    before, silent, waiting = store.outcomes(), store.silent_total(), store.unreported_accepts()
+    names, labels = [uuid.uuid4().hex for _ in lives], []
+    for name, (predicted, audit, success, quiet, quarantined) in zip(names, lives, strict=True):
+        action, audit = (Action.VERIFY, predicted is not Action.VERIFY) if audit else (predicted, False)
+        given = replace(decision(name, action), predicted=predicted, audit=audit)
+        store.put_decision(given, trace(), 1, quarantined)
+        labels += [] if success is None else [label(name, success, quiet)]
+    store.put_labels(labels)
+    accepts = [(name, life) for name, life in zip(names, lives, strict=True) if life[0] is Action.ACCEPT and not life[1]]
+    after = store.outcomes()
+    assert after.accepted - before.accepted == len(accepts)
+    assert after.stops - before.stops == sum(life[2] is False for _, life in accepts)
+    assert after.confirmed - before.confirmed == sum(life[2] is True for _, life in accepts)
+    assert store.unreported_accepts() == waiting + [name for name, life in accepts if life[2] is None and not life[4]]
+    assert store.silent_total() - silent == sum(life[3] for life in lives if life[2] is not None and not life[4])
+    assert 0 <= after.stops + after.confirmed <= after.accepted
+    assert 0 <= after.audited_accepts_bad <= after.audited_accepts
+    assert 0 <= after.audited_rejects_good <= after.audited_rejects
+
+
+# Events
+
+
+def test_events_are_numbered_from_one_and_returned_oldest_first(store: Store) -> None:
+    store._clock = iter([1.5, 2.5, 3.5]).__next__
+    for kind in ("started", "safe_mode", "left"):
+        store.put_event(kind, f"was {kind}: ±")
+    every = store.events()
+    assert every[1] == Event(2, 2.5, "safe_mode", "was safe_mode: ±")
+    assert [event.number for event in every] == [1, 2, 3]
+    assert store.events(2) == every[1:]
+    assert (store.events(0), store.events(9)) == ([], every)
+
+
+def test_an_event_writes_what_every_database_refuses_with_escapes(store: Store) -> None:
+    store.put_event(Reason.MODEL_ERROR, "read \0 and \ud800")
+    (event,) = store.events()
+    assert (event.kind, event.text) == ("model_error", "read \\0 and \\ud800")
+    assert type(event.kind) is str
+
+
+def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store: Store) -> None:
+    assert (store.status()["events"], store.status()["last_label_time"]) == ([], None)
+    store._clock = iter(float(i) for i in range(20)).__next__
+    for i in range(7):
+        store.put_event("note", str(i))
+    assert store.status()["events"] == [{"kind": "note", "text": str(i), "time": float(i)} for i in range(2, 7)]
+    put(store, "a")
+    put(store, "b")
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert store.status()["last_label_time"] == 9.0
+
+
+# Versions and settings
+
+
+def test_the_newest_accepted_version_returns_bit_for_bit(store: Store) -> None:
+    state = {
+        "encoder.stem.weight": trace(3, (4, 1, 5)),
+        "references/0": np.asfortranarray(trace(4, (6, 2))),
+        "labels": np.array([1, 0], dtype=np.int8),
+        "ids": np.array(["a", "bc"]),
+        "file": np.array(2.5),
+        "empty": np.zeros((0, 3), dtype=np.float32),
+    }
+    store.put_version(report(1), 10, {"w": np.zeros(2)})
+    store.put_version(report(2), 20, state)
+    store.put_version(report(2, accepted=False), 30, None)
+    last = store.last_version()
+    assert (last.version, last.last_seq, last.state.keys()) == (2, 20, state.keys())
+    for name, values in state.items():
+        assert last.state[name].dtype == values.dtype
+        np.testing.assert_array_equal(last.state[name], values)
+    assert store.retrains() == [report(1), report(2), report(2, accepted=False)]
+
+
+def test_a_state_with_python_objects_is_refused(store: Store) -> None:
+    with pytest.raises(StoreError, match="'w'"):
+        store.put_version(report(1), 0, {"w": np.array([{}], dtype=object)})
+
+
+def test_an_accepted_version_needs_its_state(store: Store) -> None:
+    with pytest.raises(StoreError, match="version 1"):
+        store.put_version(report(1), 0, None)
+
+
+def test_settings_are_replaced_as_a_whole(store: Store) -> None:
+    assert store.settings() == {}
+    store.save_settings({"recipe": "a = 1\n", "spec": "é"})
+    store.save_settings({"recipe": "a = 2"})
+    assert store.settings() == {"recipe": "a = 2"}
+
+
+def test_status_counts_what_was_put(store: Store) -> None:
+    store.put_decision(decision("a", Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    store.put_decision(decision("b"), trace(), 2, False)
+    store.put_decision(decision("c", Action.VERIFY, Reason.CONSTANT), trace(), 3, True)
+    store.put_label("a", False, Source.STOP, 0, None)
+    store.put_label("c", True, Source.VERIFICATION, 0, None)
+    store.put_version(report(1), 2, {"w": np.zeros(1)})
+    store.put_version(report(1, accepted=False), 2, None)
+    status = store.status()
+    assert (status["decisions"], status["labels"], status["quarantined"]) == (3, 2, 1)
+    assert status["actions"] == {"verify": 2, "accept": 1, "reject": 0}
+    assert (status["reasons"]["certain"], status["reasons"]["constant"], status["reasons"]["audit"]) == (1, 1, 0)
+    assert status["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0}
+    assert (status["retrains"], status["versions"], status["last_version"]) == (2, 1, 1)
+    assert status["first_time"] <= status["last_time"]
+
+
+# Memory
+
+
+def test_memory_forgets_old_unreported_decisions_and_says_so() -> None:
+    class Small(MemoryStore):
+        KEEP_UNLABELLED = 3
+
+    store = Small()
+    put(store, "kept")
+    store.put_label("kept", True, Source.VERIFICATION, 0, None)
+    for name in "abcd":
+        put(store, name)
+    assert store.get_decision("a") is None
+    assert store.get_decision("b") is not None
+    assert store.get_decision("kept") is not None
+    assert store.status()["decisions"] == 5
+    with pytest.raises(ReportError, match="newest 3"):
+        store.put_label("a", True, Source.VERIFICATION, 0, None)
+
+
+def test_memory_counts_the_accepts_that_it_forgot() -> None:
+    class Small(MemoryStore):
+        KEEP_UNLABELLED = 3
+
+    store = Small()
+    for name in "abcde":
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    store.put_label("e", False, Source.STOP, 0, None)
+    assert store.unreported_accepts() == ["c", "d"]
+    assert (store.outcomes().accepted, store.outcomes().stops) == (5, 1)
+
+
+def test_memory_forgets_nothing_of_an_import() -> None:
+    class Small(MemoryStore):
+        KEEP_UNLABELLED = 1
+
+    store = Small()
+    names = [str(i) for i in range(5)]
+    store.put_labelled([decision(n) for n in names], trace(0, (5, C, T)), np.arange(5), np.ones(5), Source.VERIFICATION)
+    assert len(store.labelled().seq) == 5
+
+
+def test_open_store_takes_nothing_a_file_or_a_store(tmp_path: Path) -> None:
+    assert isinstance(open_store(None), MemoryStore)
+    memory = MemoryStore()
+    assert open_store(memory) is memory
+    with open_store(str(tmp_path / "a.db")) as store:
+        assert isinstance(store, SqlStore)
+    with pytest.raises(StoreError, match="got int"):
+        open_store(3)  # type: ignore[arg-type]
+
+
+def test_importing_the_store_does_not_import_sqlalchemy() -> None:
+    code = "import sys, dengine.store; sys.exit('sqlalchemy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# Databases
+
+
+def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        values = put(store, "a")
+        store.save_settings({"k": "v"})
+        store.put_label("a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
+        store.put_version(report(1), 1, {"w": values})
+        store.put_decision(decision("accepted", Action.ACCEPT), trace(), 1, False, "SN-1")
+        store.put_decision(decision("silent"), trace(), 1, False)
+        store.put_label("silent", True, Source.VERIFICATION, 0, None, silent=4)
+        store.put_event("started", "for the first time")
+        put(store, "unreported")
+    with SqlStore(*place) as store:
+        assert store.settings() == {"k": "v"}
+        np.testing.assert_array_equal(store.get_decision("a").trace, values)
+        np.testing.assert_array_equal(store.last_version().state["w"], values)
+        assert store.points_since(0, 1).points.tolist() == [[0.5]]
+        assert store.get_decision("unreported") is not None
+        assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
+        assert store.get_decision("accepted").part == "SN-1"
+        assert [event.text for event in store.events()] == ["for the first time"]
+        store.put_event("started", "again")
+        assert [event.number for event in store.events()] == [1, 2]
+        assert store.put_label("unreported", True, Source.VERIFICATION, 0, None) == 3
+
+
+def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str]) -> None:
+    url, cell_id = place
+    with SqlStore(url, cell_id) as ours, SqlStore(url, cell_id + "-other") as other:
+        put(ours, "a", seed=1)
+        put(other, "a", seed=2)
+        assert ours.put_label("a", True, Source.VERIFICATION, 1, np.zeros(2, np.float32)) == 1
+        assert other.put_label("a", False, Source.STOP, 1, np.ones(2, np.float32)) == 1
+        ours.put_version(report(1), 1, {"w": np.zeros(1)})
+        ours.save_settings({"k": "v"})
+        ours.put_event("note", "ours")
+        ours.put_decision(decision("b", Action.ACCEPT), trace(), 1, False)
+        ours.put_decision(decision("c"), trace(), 1, False)
+        ours.put_label("c", True, Source.VERIFICATION, 0, None, silent=3)
+        assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
+        assert other.outcomes().accepted == 0
+        other.put_event("note", "other's")
+        assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
+        assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
+        assert other.labelled().labels.tolist() == [0]
+        assert other.points_since(0, 1).points.tolist() == [[1.0, 1.0]]
+        assert other.status()["labels"] == 1
+        np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
+
+
+def test_label_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str, str]) -> None:
+    seqs: list[int] = []
+
+    def label(store: SqlStore, prefix: str) -> None:
+        for i in range(15):
+            put(store, f"{prefix}{i}")
+            seqs.append(store.put_label(f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
+
+    with SqlStore(*place) as one, SqlStore(*place) as two:
+        threads = [threading.Thread(target=label, args=pair) for pair in ((one, "x"), (two, "y"))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(seqs) == list(range(1, 31))
+        assert one.labelled().seq.tolist() == list(range(1, 31))
+
+
+def test_event_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str, str]) -> None:
+    def log(store: SqlStore) -> None:
+        for i in range(15):
+            store.put_event("note", str(i))
+
+    with SqlStore(*place) as one, SqlStore(*place) as two:
+        threads = [threading.Thread(target=log, args=(store,)) for store in (one, two)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert [event.number for event in one.events()] == list(range(1, 31))
+
+
+def test_an_event_is_committed_when_it_returns(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store, SqlStore(*place) as other:
+        store.put_event("note", "now")
+        assert [event.text for event in other.events()] == ["now"]
+
+
+def test_the_writer_commits_without_being_asked(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store, SqlStore(*place) as other:
+        put(store, "a")
+        deadline = threading.Event()
+        for _ in range(100):
+            if other.get_decision("a") is not None:
+                break
+            deadline.wait(0.05)
+        assert other.get_decision("a") is not None
+
+
+def test_a_failed_write_is_told_kept_and_written_later(place: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with SqlStore(*place) as store:
+        real = store._database.insert
+
+        def full(connection: sa.Connection, batch: object) -> None:
+            raise sa.exc.OperationalError("INSERT", {}, sqlite3.OperationalError("database or disk is full"))
+
+        monkeypatch.setattr(store._database, "insert", full)
+        put(store, "a")
+        with pytest.raises(StoreError, match=r"disk is full.*Free some space.*1 decisions wait"):
+            store.flush()
+        with pytest.raises(StoreError):
+            store.put_label("a", True, Source.VERIFICATION, 0, None)
+        assert store.get_decision("a") is not None
+        monkeypatch.setattr(store._database, "insert", real)
+        assert store.put_label("a", True, Source.VERIFICATION, 0, None) == 1
+        assert store.status()["write_failures"] >= 2
+        assert store.status()["decisions"] == 1
+
+
+def test_a_commit_whose_answer_was_lost_is_not_written_twice(
+    place: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with SqlStore(*place) as store:
+        with monkeypatch.context() as patch:
+            patch.setattr(store._database, "_forget", lambda batch: None)  # committed, and still queued
+            put(store, "a")
+            store.flush()
+        store._database._doubtful = True
+        store.flush()
+        assert store.status()["decisions"] == 1
+        assert store._database._queue_bytes == 0
+
+
+def test_a_full_queue_is_written_by_put_decision_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sql_queue, "LINGER", 60.0)
+    monkeypatch.setattr(sql_queue, "QUEUE_BYTES", 3 * C * T * 4)
+    with SqlStore(str(tmp_path / "a.db")) as store:
+        for i in range(20):
+            put(store, str(i))
+            assert len(store._database._queue) <= 4
+        store.flush()
+        assert store.status()["decisions"] == 20
+
+
+def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:
+    store = SqlStore(*place)
+    store.close()
+    store.close()
+    for call in (lambda: put(store, "a"), store.settings, store.flush):
+        with pytest.raises(StoreError, match="after close"):
+            call()
+
+
+def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
+    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
+        for query in (
+            sql_queries.newest_query(Scope("cell"), 100),
+            sql_queries.trace_query(Scope("cell"), 5, 10),
+            sql_queries.decision_query("cell", "a"),
+            sql_queries.evidence_query("cell", 5),
+            sql_queries.held_query("cell", ["a", "b"]),
+            sql_queries.silent_query("cell"),
+            sql_queries.event_query("cell", 5),
+        ):
+            text = query.compile(connection, compile_kwargs={"literal_binds": True})
+            plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
+            assert plan
+            assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], plan
+
+
+def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:
+    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
+        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+
+
+# What cannot be opened
+
+
+def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    SqlStore(str(file)).close()
+    with sqlite3.connect(file) as connection:
+        connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
+    connection.close()  # and the last one to close empties the journal into the file
+    before = file.read_bytes()
+    with pytest.raises(StoreError, match="schema 3, found schema 99"):
+        SqlStore(str(file), "another cell")
+    assert file.read_bytes() == before
+
+
+@pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
+def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, table: str) -> None:
+    file = tmp_path / "a.db"
+    with sqlite3.connect(file) as connection:
+        connection.execute(f"CREATE TABLE {table}")
+    before = file.read_bytes()
+    with pytest.raises(StoreError, match="schema 3, found tables of another program"):
+        SqlStore(str(file))
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("not a database\n" * 100)
+    with pytest.raises(StoreError, match="name a new file"):
+        SqlStore(str(file))
+    assert file.read_text() == "not a database\n" * 100
+
+
+@pytest.mark.parametrize("name", ["missing/engine.db", "."])
+def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path: Path, name: str) -> None:
+    with pytest.raises(StoreError, match="Create the directory"):
+        SqlStore(str(tmp_path / name))
+
+
+@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://u:secret@host/db", "nonsense://x", "a://:b:c"])
+def test_a_url_that_is_not_served_is_refused_without_its_password(url: str) -> None:
+    with pytest.raises(StoreError) as caught:
+        SqlStore(url)
+    assert "secret" not in str(caught.value)
+
+
+def test_an_empty_cell_id_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="cell_id"):
+        SqlStore(str(tmp_path / "a.db"), "")
+
+
+def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    with SqlStore(str(file)) as store:
+        store.put_version(report(1), 0, {"w": np.zeros(1)})
+    evil = tmp_path / "evil.npz"
+    np.savez(evil, w=np.array([{}], dtype=object))
+    assert zipfile.is_zipfile(evil)
+    with sqlite3.connect(file) as connection:
+        sum_ = hashlib.sha256(evil.read_bytes()).digest()
+        connection.execute("UPDATE model_version SET state = ?, state_sum = ?", (evil.read_bytes(), sum_))
+    with SqlStore(str(file)) as store:
+        with pytest.raises(StoreError, match="plain arrays"):
+            store.load_version(1)
+        assert store.last_version() is None
+        assert "plain arrays" in store.events()[0].text

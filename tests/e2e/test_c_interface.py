@@ -1,0 +1,107 @@
+"""The sources are written, built and installed; a controller in C finds the package and decides as Python does."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import dengine
+from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript, load_exported
+from dengine.cli.export import export_cpp, make_key
+from dengine.datasets.importing import import_journal
+from dengine.engine.engine import DataEngine
+from dengine.errors import ExportError
+from dengine.export import export_sources
+from dengine.records import ACTIONS, Action
+
+SAMPLES = 80
+
+
+def run(*command: object, **options: object) -> str:
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def installed(programs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    prefix = tmp_path_factory.mktemp("installed") / "prefix"
+    run("cmake", "--install", programs, "--prefix", prefix)
+    return prefix
+
+
+@pytest.fixture(scope="module")
+def consumer(repo: Path, installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    build = tmp_path_factory.mktemp("consumer")
+    run("cmake", "-S", repo / "tests" / "cpp", "-B", build, f"-DCMAKE_PREFIX_PATH={installed}")
+    run("cmake", "--build", build)
+    return build / "consumer"
+
+
+def test_a_controller_in_c_decides_as_python_does_and_its_labels_come_back(
+    consumer: Path, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data, store, key = make_data(400, SAMPLES), str(tmp_path / "engine.db"), tmp_path / "cell.key"
+    assert CliRunner().invoke(make_key, [str(key)]).exit_code == 0
+    recipe = Recipe(
+        reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.3, reject_fraction=0.08
+    )
+    with DataEngine.from_recipe(recipe, store, trace=TraceSpec(SAMPLES, limit=500.0)) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        file = export_torchscript(engine, tmp_path / "model.ts", key=key)
+    X = make_data(120, SAMPLES, seed=9).X
+    X[3, 4], X[5] = np.nan, 1.5
+    X.tofile(tmp_path / "traces.f32")
+    journal = tmp_path / "cell.csv"
+    said = run(consumer, file, tmp_path / "traces.f32", key, journal, env=os.environ | {"LC_ALL": "de_DE.UTF-8"})
+    *lines, last = said.splitlines()
+    expected = load_exported(file, key=key).decide_many(X)
+    for line, decision in zip(lines, expected, strict=True):
+        id_, *words = line.split()
+        assert len(id_.split("-")[0]) == 12
+        reference = [ACTIONS.index(decision.action), decision.reason, decision.n_success, decision.n_failure]
+        assert words == list(map(str, reference))
+    assert {d.action for d in expected} == set(Action)
+    assert last == f"{dengine.__version__} 120 0"
+    report = import_journal(store, journal)
+    stops = sum(d.action is Action.ACCEPT for d in expected[::10])
+    assert report.imported + report.quarantined == stops + sum(d.action is Action.VERIFY for d in expected)
+    assert report.quarantined == 2
+
+
+def test_the_installed_programs_run(installed: Path, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    for name in ("dengine-cell", "dengine-onnx"):
+        done = subprocess.run([installed / "bin" / name], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert done.stderr.startswith(f"usage: {name} MODEL")
+
+
+def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:
+    done = CliRunner().invoke(export_cpp, ["--out", str(tmp_path / "cell")], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert (tmp_path / "cell" / "VERSION").read_text() == f"{dengine.__version__}\n"
+    assert (tmp_path / "cell" / "include" / "dengine.h").is_file()
+    with pytest.raises(ExportError, match="Expected a new or an empty folder"):
+        export_sources(tmp_path / "cell")
+    own = tmp_path / "notes.txt"
+    own.write_text("mine")
+    with pytest.raises(ExportError, match="Expected a new or an empty folder"):
+        export_sources(own)
+    assert own.read_text() == "mine"
+
+
+def test_without_libtorch_the_onnx_program_is_built_alone(tmp_path: Path) -> None:
+    if shutil.which("cmake") is None:
+        pytest.skip("needs cmake")
+    sources = export_sources(tmp_path / "cell")
+    run("cmake", "-S", sources, "-B", tmp_path / "build", "-DDENGINE_TORCH=OFF")
+    targets = run("cmake", "--build", tmp_path / "build", "--target", "help")
+    assert "dengine-onnx" in targets
+    assert "dengine-cell" not in targets

@@ -1,0 +1,363 @@
+"""dengine-cell answers lines: labels that come late, stops that count, nothing acknowledged lost, whatever kills it."""
+
+import random
+import resource
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript
+from dengine.datasets.importing import import_journal
+from dengine.engine.engine import DataEngine
+from dengine.errors import DataError
+from dengine.export import load_exported, make_key
+from dengine.export.cell_journal import read_journal
+from dengine.records import Action
+
+SAMPLES = 100
+N = 160
+
+
+class Learned(NamedTuple):
+    """A store after its engine's first retrain, and the exported file."""
+
+    store: Path
+    file: Path
+    key: Path
+
+
+@pytest.fixture(scope="module", params=["some", "all"])
+def learned(
+    request: pytest.FixtureRequest, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
+) -> Learned:
+    folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=1.5)
+    guarantee = {"some": "local", "all": "pooled"}[request.param]
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.2, guarantee=guarantee, stops=request.param)
+    balls = {"some": {"fraction": 0.3, "reject_fraction": 0.08}, "all": {"fraction": 0.1}}[request.param]
+    recipe = Recipe(reducer="pca", policy=policy, retrain_every=10**6, window=2000, **balls)
+    key = make_key(folder / "cell.key")
+    with DataEngine.from_recipe(recipe, str(folder / "engine.db"), trace=TraceSpec(SAMPLES, limit=500.0), seed=3) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        return Learned(folder / "engine.db", export_torchscript(engine, folder / "model.ts", key=key), key)
+
+
+ONE = pytest.mark.parametrize("learned", ["some"], indirect=True)
+
+
+class Program:
+    """The program, line by line."""
+
+    def __init__(self, programs: Path, *arguments: Any, **options: Any) -> None:
+        command = [str(programs / "dengine-cell"), *map(str, arguments)]
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process = subprocess.Popen(command, text=True, bufsize=1, **pipes, **options)
+
+    def ask(self, line: str) -> str:
+        """The answer to a line; "" where the program is gone."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            self.process.stdin.write(line + "\n")
+        except BrokenPipeError:
+            return ""
+        said = self.process.stdout.readline()
+        return said.rstrip("\n") if said.endswith("\n") else ""
+
+    def end(self) -> tuple[int, str]:
+        _, said = self.process.communicate(timeout=60)
+        return self.process.returncode, said
+
+
+@contextmanager
+def program(programs: Path, *arguments: Any, **options: Any) -> Iterator[Program]:
+    running = Program(programs, *arguments, **options)
+    try:
+        yield running
+    finally:
+        running.process.kill()
+        running.process.communicate()
+
+
+def asked(x: np.ndarray, part: str | None = None) -> str:
+    return f"decide {part + ' ' if part else ''}{','.join(f'{v:.9g}' for v in x)}"
+
+
+def stream(
+    make_data: Callable[..., Dataset], n: int = N
+) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
+    """Traces, labels, parts, and after each trace the indices of the parts whose label comes then: late, or never."""
+    rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=1.5)
+    X = data.X.copy()
+    X[rng.random(n) < 0.04] *= 5.0
+    X[rng.random(n) < 0.03, 3] = np.nan
+    parts = [f"P{rng.integers(n)}" if rng.random() < 0.7 else None for _ in range(n)]
+    due: list[list[int]] = [[] for _ in range(n)]
+    for i in range(n):
+        when = i + (0 if rng.random() < 0.5 else int(rng.integers(1, 12)))
+        if rng.random() < 0.8 and when < n:
+            due[when].append(i)
+    return X, data.y, parts, due
+
+
+def told(decision: Any, label: int, late: bool, stops_all: bool) -> bool:
+    """Whether a label can come: not of a rejected part; of a confirmed one the engine wants none later."""
+    return decision.action is not Action.REJECT and not (stops_all and late and decision.action is Action.ACCEPT)
+
+
+def same(answer: str, decision: Any) -> bool:
+    words = answer.split(",")
+    found = [words[1], words[2], float(words[3]), float(words[4]), int(words[5]), int(words[6])]
+    expected = [str(decision.action), str(decision.reason), *map(pytest.approx, (decision.lower, decision.upper))]
+    return found == [*expected, decision.n_success, decision.n_failure]
+
+
+def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as_its_own(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, y, parts, due = stream(make_data)
+    journal, ids, decisions, told_of = tmp_path / "cell.csv", [], [], 0
+    for name in ("own", "imported"):
+        shutil.copy(learned.store, tmp_path / f"{name}.db")
+    with (
+        DataEngine.open(tmp_path / "own.db", replaying=True) as engine,
+        program(programs, learned.file, "--key", learned.key, "--journal", journal) as cell,
+    ):
+        stops_all = engine.policy.stops == "all"
+        for i, (x, part) in enumerate(zip(X, parts, strict=True)):
+            answer = cell.ask(asked(x, part))
+            decisions.append(engine.decide(x, part))
+            assert same(answer, decisions[-1]), (i, answer, decisions[-1])
+            ids.append(answer.split(",")[0])
+            for k in due[i]:
+                if not told(decisions[k], y[k], k != i, stops_all):
+                    continue
+                engine.report(decisions[k].id, bool(y[k]))
+                stop = decisions[k].action is Action.ACCEPT and not y[k]
+                said = cell.ask(f"stop {ids[k]}" if stop else f"label {ids[k]} {y[k]}")
+                assert said == f"ok {ids[k]}"
+                told_of += k != i
+        assert cell.end() == (0, "")
+    assert told_of > 20
+    assert {d.action for d in decisions} >= {Action.VERIFY, Action.ACCEPT, *([] if stops_all else [Action.REJECT])}
+    report = import_journal(tmp_path / "imported.db", journal)
+    assert report.contradicted == report.cut == report.known == 0
+    found = []
+    for name in ("imported", "own"):
+        with DataEngine.open(tmp_path / f"{name}.db") as engine:
+            known, outcomes = engine.store.evidence_since(400), engine.store.outcomes()
+            rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
+            evidence = [getattr(known, each).tolist() for each in ("lower", "upper", "success", "novel", "silent")]
+            certain = outcomes.stops, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
+            hashes = engine.store.labelled().hashes.tolist()
+            found.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
+    assert found[0] == found[1]
+    with DataEngine.open(tmp_path / "imported.db") as engine:
+        labelled = next(k for k, d in enumerate(decisions) if k in due[k] and d.action is Action.VERIFY)
+        assert engine.store.get_decision(ids[labelled]).success is bool(y[labelled])  # by the id that the cell answered
+
+
+def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_decides_on_as_if_it_had_not_been(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, y, parts, due = stream(make_data, 100)
+    rng, kills, acknowledged = random.Random(4), 0, {}
+    whole = play(partial(program, programs, learned.file), X, y, parts, due)
+    journal = tmp_path / "cell.csv"
+    lines: list[tuple[str, int]] = []  # what is still to be said: a part, or a label of one
+    for i in range(len(X)):
+        lines += [("decide", i), *(("label", k) for k in due[i])]
+    ids: dict[int, str] = {}
+    decided: dict[int, str] = {}
+    done = 0
+    while done < len(lines):
+        with program(programs, learned.file, "--journal", journal) as cell:
+            until = min(len(lines), done + rng.randrange(10, 60))
+            for kind, k in lines[done:until]:
+                if kind == "decide":
+                    answer = cell.ask(asked(X[k], parts[k]))
+                    ids[k], decided[k] = answer.split(",")[0], ",".join(answer.split(",")[1:7])
+                elif not decided[k].startswith("reject"):
+                    assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
+                    acknowledged[ids[k]] = bool(y[k])
+            if until < len(lines):  # in the middle of a label, or of a trace
+                waiting = lines[until]
+                line = asked(X[waiting[1]]) if waiting[0] == "decide" else f"label {ids[waiting[1]]} {y[waiting[1]]}"
+                if waiting[0] == "label":
+                    assert cell.process.stdin is not None
+                    cell.process.stdin.write(line + "\n")  # not acknowledged: said again after the restart
+                cell.process.kill()
+                kills += 1
+            done = until
+    assert kills >= 3
+    assert decided == whole
+    held = read_journal(journal, TraceSpec(SAMPLES)).lines
+    assert acknowledged.items() <= {line.id: line.label for line in held if line.label is not None}.items()
+
+
+def play(start: Any, X: np.ndarray, y: np.ndarray, parts: list[str | None], due: list[list[int]]) -> dict[int, str]:
+    """The decisions of a program that nobody kills."""
+    ids, decided = {}, {}
+    with start() as cell:
+        for i in range(len(X)):
+            answer = cell.ask(asked(X[i], parts[i]))
+            ids[i], decided[i] = answer.split(",")[0], ",".join(answer.split(",")[1:7])
+            for k in due[i]:
+                if not decided[k].startswith("reject"):
+                    assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
+    return decided
+
+
+@ONE
+def test_a_label_is_taken_once_and_never_changed(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X = make_data(60, SAMPLES, seed=9, noise=1.5).X
+    journal, ids = tmp_path / "cell.csv", {}
+    with program(programs, learned.file, "--journal", journal) as cell:
+        for x in X:
+            id_, action = cell.ask(asked(x)).split(",")[:2]
+            ids.setdefault(action, id_)
+        assert set(ids) == {"verify", "accept", "reject"}
+        assert cell.ask(f"label {ids['verify']} 1") == f"ok {ids['verify']}"
+        assert cell.ask(f"stop {ids['accept']}") == f"ok {ids['accept']}"
+        n = journal.read_text().count("\n")
+        for again in (f"label {ids['verify']} 1", f"stop {ids['accept']}", f"label {ids['accept']} 0"):
+            assert cell.ask(again).startswith("ok ")  # an answer that was lost is asked for again
+        wrong = {
+            f"label {ids['verify']} 0": "has the other label already",
+            f"label {ids['reject']} 1": "was rejected",
+            f"stop {ids['verify']}": "was to be verified and cannot stop the system",
+            "label nobody 1": 'expected the id of one of the last 10000 decisions, got "nobody"',
+            f"label {ids['verify']} 100": "expected label ID 0|1",
+            f"label {ids['verify']}": "expected label ID 0|1",
+            "stop": "expected stop ID",
+        }
+        for line, message in wrong.items():
+            answer = cell.ask(line)
+            assert answer.startswith("error ")
+            assert message in answer
+        assert journal.read_text().count("\n") == n
+        assert cell.end()[0] == 1
+    with program(programs, learned.file, "--journal", journal) as cell:  # after a restart, too
+        assert "has the other label already" in cell.ask(f"label {ids['verify']} 0")
+        assert cell.ask(f"label {ids['verify']} 1").startswith("ok ")
+
+
+@ONE
+def test_traces_come_from_files_too(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    x = make_data(1, SAMPLES, seed=9).X[0]
+    x.tofile(tmp_path / "trace.f32")
+    for name, text in (("line.csv", ",".join(map(str, x))), ("column.txt", "\n".join(map(str, x))), ("short.csv", "1,2")):
+        (tmp_path / name).write_text(text + "\n")
+    (tmp_path / "short.f32").write_bytes(x.tobytes()[:-3])
+    with program(programs, learned.file) as cell:
+        answers = [cell.ask(f"decide P1 {tmp_path / name}") for name in ("trace.f32", "line.csv", "column.txt")]
+        assert {answer.split(",", 1)[1].rsplit(",", 1)[0] for answer in answers} == {
+            cell.ask(asked(x, "P1")).split(",", 1)[1].rsplit(",", 1)[0]
+        }
+        for name in ("short.csv", "short.f32", "nothing.f32", "."):
+            assert cell.ask(f"decide {tmp_path / name}").startswith("-,verify,malformed,0,1,0,0,")
+        for line in ("decide", "decide a b c", "decide P1, 1,2", "decide 1;2", "decide P\xa01 1,2"):
+            assert cell.ask(line).startswith("-,verify,malformed,0,1,0,0,")
+        assert cell.end()[0] == 1
+
+
+@ONE
+def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, journal = make_data(60, SAMPLES, seed=9, noise=1.5).X, tmp_path / "cell.csv"
+    limit = 20_000  # bytes that the journal may have
+    acknowledged, refused = [], 0
+
+    def full() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    with program(programs, learned.file, "--journal", journal, preexec_fn=full) as cell:
+        for x in X:
+            id_, action, reason = cell.ask(asked(x)).split(",")[:3]
+            if id_ == "-":
+                assert (action, reason) == ("verify", "journal_error")
+                refused += 1
+            elif action == "verify" and (said := cell.ask(f"label {id_} 1")).startswith("ok"):
+                acknowledged.append(id_)
+            elif action == "verify":
+                assert "cannot be written: File too large" in said
+        assert cell.end()[0] == 1
+    assert refused > 10
+    held = read_journal(journal, TraceSpec(SAMPLES))  # no half line is left
+    assert held.cut == 0
+    assert set(acknowledged) <= {line.id for line in held.lines if line.label}
+    with program(programs, learned.file, "--journal", journal) as cell:  # there is room again
+        assert not cell.ask(asked(X[0])).startswith("-")
+
+
+@ONE
+def test_two_programs_do_not_write_one_journal(programs: Path, learned: Learned, tmp_path: Path) -> None:
+    journal = tmp_path / "cell.csv"
+    with program(programs, learned.file, "--journal", journal) as first:
+        assert first.ask("stop nobody").startswith("error")  # it is there
+        with program(programs, learned.file, "--journal", journal) as second:
+            code, said = second.end()
+    assert code == 1
+    assert "is being written by another program" in said
+
+
+@ONE
+def test_with_a_key_only_what_was_signed_with_it_is_loaded(programs: Path, learned: Learned, tmp_path: Path) -> None:
+    def loads(file: Path, key: Path) -> str:
+        with program(programs, file, "--key", key) as cell:
+            return cell.end()[1]
+
+    assert loads(learned.file, learned.key) == ""
+    for name in ("model.ts", "model.ts.sha256", "model.ts.sig"):
+        shutil.copy(learned.file.with_name(name), tmp_path / name)
+    file, signature = tmp_path / "model.ts", tmp_path / "model.ts.sig"
+    line = signature.read_text()
+    assert "its signature is not one by this key" in loads(file, make_key(tmp_path / "other.key"))
+    short = tmp_path / "short.key"
+    short.write_text("secret\n")
+    assert "is too short for a key" in loads(file, short)
+    signature.write_text(line.replace("model.ts", "other.ts") + line.replace(line[20], "g" if line[20] != "g" else "h"))
+    assert "its signature is not one by this key" in loads(file, learned.key)
+    signature.write_text(line.replace(line[12:76], "0" * 64) + line)  # while a file is being replaced there are two
+    assert loads(file, learned.key) == ""
+    signature.unlink()
+    assert "the file is not signed" in loads(file, learned.key)
+    total = tmp_path / "model.ts.sha256"
+    total.write_text(f"{'0' * 64}  model.ts\n{total.read_text()}")
+    with program(programs, file) as cell:
+        assert cell.end() == (0, "")
+    assert load_exported(file).metadata["references"] == 400
+    total.write_text(total.read_text().replace("  model.ts", "  other.ts"))  # neither line is about this file
+    with program(programs, file) as cell:
+        assert "holds no SHA-256 sum of it" in cell.end()[1]
+
+
+@ONE
+def test_a_journal_of_another_stores_model_is_refused(
+    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    journal = tmp_path / "cell.csv"
+    with program(programs, learned.file, "--journal", journal) as cell:
+        for x in make_data(20, SAMPLES, seed=9, noise=1.5).X:
+            id_, action = cell.ask(asked(x)).split(",")[:2]
+            if action == "verify":
+                cell.ask(f"label {id_} 1")
+    foreign = tmp_path / "foreign.csv"
+    foreign.write_text(journal.read_text().replace(journal.read_text()[12:76], "0" * 64))
+    store = shutil.copy(learned.store, tmp_path / "engine.db")
+    with pytest.raises(DataError, match="which is none of its exports; name the store that it came from"):
+        import_journal(store, foreign)
+    assert import_journal(store, foreign, any_model=True).imported == import_journal(store, journal).known > 0

@@ -1,0 +1,174 @@
+"""The verbs that put things right: correct, forget, rollback, set-policy, retrain. Real commands on a small store."""
+
+import getpass
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from dengine import DataEngine, Dataset, Policy
+from dengine.cli import correct as correcting
+from dengine.cli import main
+from dengine.datasets.importing import import_labelled
+from dengine.decision.intervals import INTERVALS as EVERY_INTERVAL
+
+
+def dengine(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def said(*words: object) -> str:
+    result = dengine(*words)
+    assert result.exit_code == 0, result.output
+    return " ".join(result.stdout.split())
+
+
+def document(*words: object) -> dict:
+    result = dengine(*words, "--json")
+    assert result.exit_code == 0, result.output
+    assert result.stderr == ""
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def used(make_data, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with 60 labels and two versions."""
+    data: Dataset = make_data(60)
+    path = tmp_path_factory.mktemp("used") / "engine.db"
+    import_labelled(path, data, "pca", 0)
+    with DataEngine.open(path) as engine:
+        engine.retrain()
+        engine.retrain()
+    return path
+
+
+@pytest.fixture
+def store(used: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(used, tmp_path / "engine.db"))
+
+
+def ids(store: Path) -> list[str]:
+    """Of the decisions, in the order of their labels."""
+    with DataEngine.open(store) as engine, engine.store._database.transaction(write=False) as connection:
+        return list(connection.exec_driver_sql("SELECT decision_id FROM label ORDER BY seq").scalars())
+
+
+def labels(store: Path) -> dict[int, int]:
+    with DataEngine.open(store) as engine:
+        found = engine.store.labelled()
+    return dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True))
+
+
+def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None:
+    first, before = ids(store)[0], labels(store)[1]
+    now = "bad" if before else "good"
+    line = said("correct", store, first, now, "--author", "kim")
+    assert line.startswith(f"Decision {first} counts as a {'failure' if before else 'success'}, was a ")
+    assert line.endswith("Event 1, by kim.")
+    assert labels(store)[1] == 1 - before
+    assert "already; nothing changed." in said("correct", store, first, now)
+
+
+def test_who_did_it_is_by_default_the_login_name(store: Path) -> None:
+    first = ids(store)[0]
+    found = document("forget", store, first, "--reason", "wrong part")
+    assert (found["author"], found["event"], found["kind"], found["changed"]) == (getpass.getuser(), 1, "forget", True)
+    with DataEngine.open(store) as engine:
+        (event,) = engine.store.events()
+    assert (event.author, event.data["reason"]) == (getpass.getuser(), "wrong part")
+
+
+def test_several_are_forgotten_at_once_or_none(store: Path) -> None:
+    names = ids(store)
+    failed = dengine("forget", store, names[0], "nobody")
+    assert (failed.exit_code, len(labels(store))) == (1, 60)
+    assert "'nobody'" in failed.stderr
+    assert said("forget", store, names[0], names[1]).startswith(
+        f"The labels of {names[0]}, {names[1]} are forgotten. Event 1,"
+    )
+    assert sorted(labels(store)) == list(range(3, 61))
+    assert "0 labels corrected, 2 more forgotten" in said("status", store)
+
+
+def test_an_earlier_version_answers_again(store: Path) -> None:
+    assert (
+        said("rollback", store, 1, "--author", "kim") == "Version 1 answers again, as version 3 after 2. Event 1, by kim."
+    )
+    assert document("status", store)["last_version"] == 3
+    failed = dengine("rollback", store, 9)
+    assert failed.exit_code == 1
+    assert "load one of these: 1, 2, 3" in " ".join(failed.stderr.split())
+
+
+def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path) -> None:
+    found = document("set-policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
+    assert found["policy"] == document("set-policy", store, "--alpha", 0.2)["policy"]
+    with DataEngine.open(store) as engine:
+        assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
+        assert engine.certificate().alpha == 0.2
+    assert "alpha 0.2, LB 80 %" in said("status", store)
+    line = said("set-policy", store, "--interval", "jeffreys")
+    assert line.startswith("The policy's interval wilson -> jeffreys. Event 2, by")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("set-policy", "STORE"),
+        ("set-policy", "STORE", "--alpha", 2),
+        ("set-policy", "STORE", "--interval", "none"),
+        ("correct", "STORE", "x", "maybe"),
+        ("forget", "STORE"),
+        ("rollback", "STORE", "two"),
+    ],
+)
+def test_a_wrong_call_ends_with_2_and_changes_nothing(words: tuple, store: Path) -> None:
+    before = labels(store)
+    assert dengine(*(store if word == "STORE" else word for word in words)).exit_code == 2
+    assert labels(store) == before
+    assert document("status", store)["events"] == []
+
+
+def test_every_interval_can_be_chosen() -> None:
+    assert sorted(correcting.INTERVALS) == sorted(EVERY_INTERVAL)
+
+
+def test_a_retrain_by_hand_learns_what_was_corrected(store: Path) -> None:
+    first, before = ids(store)[0], labels(store)[1]
+    said("correct", store, first, "bad" if before else "good")
+    assert said("retrain", store).startswith("Version 3 answers. 1 retrain, the worst in ")
+    found = document("retrain", store, "--author", "kim")
+    assert (found["retrain"]["version"], found["retrain"]["accepted"], found["author"]) == (4, True, "kim")
+    with DataEngine.open(store) as engine:
+        assert engine.store.last_version().state["labels"][0] == 1 - before
+        assert engine.store.events(1)[0].kind == "retrain"
+
+
+def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path: Path) -> None:
+    one_class = make_data(40, failures=0.0)
+    import_labelled(tmp_path / "a.db", one_class, "conv", 0)
+    failed = dengine("retrain", tmp_path / "a.db")
+    assert failed.exit_code == 1
+    assert "No version answers yet." in failed.stdout
+    assert "dropped" in failed.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("correct", "x", "good"),
+        ("forget", "x"),
+        ("rollback", 1),
+        ("set-policy", "--alpha", 0.1),
+        ("shadow", "on"),
+        ("retrain",),
+    ],
+)
+def test_a_store_that_is_not_there_is_one_line_and_is_not_made(words: tuple, tmp_path: Path) -> None:
+    verb, *rest = words
+    failed = dengine(verb, tmp_path / "none.db", *rest)
+    assert failed.exit_code == 1
+    assert "found no file" in failed.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,476 @@
+"""The cell program without Python decides as the engine does, learns, and refuses what it must not use."""
+
+import hashlib
+import hmac
+import shutil
+import subprocess
+import time
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from dengine import (
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    TraceSpec,
+    WilsonRadiusClassifier,
+    export_torchscript,
+    load_exported,
+)
+from dengine.datasets.importing import import_journal
+from dengine.engine.engine import DataEngine
+from dengine.export import ExportedModel, read_metadata
+from dengine.records import Action, Reason
+
+SAMPLES = 100
+
+
+@pytest.fixture(scope="module")
+def engine(make_data: Callable[..., Dataset]) -> Iterator[DataEngine]:
+    data = make_data(400, SAMPLES)
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.3)
+    recipe = Recipe(reducer="pca", policy=policy, retrain_every=1000, window=2000, fraction=0.3, reject_fraction=0.08)
+    with DataEngine.from_recipe(recipe, trace=TraceSpec(SAMPLES, limit=500.0), seed=3, replaying=True) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def file(engine: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export_torchscript(engine, tmp_path_factory.mktemp("cell") / "model.ts")
+
+
+@pytest.fixture(scope="module")
+def many(make_data: Callable[..., Dataset]) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    known = make_data(300, SAMPLES, seed=9).X
+    wild = rng.normal(size=(200, SAMPLES)) * 10.0 ** rng.uniform(-3, 6, (200, 1))
+    bad = known[:4].copy()
+    bad[0, 3], bad[1, 5], bad[2, 0], bad[3] = np.nan, -np.inf, 1e30, 2.5
+    return np.concatenate([known, wild, bad]).astype(np.float32)
+
+
+def cell(programs: Path, *arguments: Any, stdin: bytes = b"", fails: bool = False) -> tuple[list[list[str]], str]:
+    """The program's lines, split at commas, and what it said on stderr."""
+    command = [str(programs / "dengine-cell"), *map(str, arguments)]
+    start = partial(subprocess.run, command, input=stdin, capture_output=True, check=False, timeout=120)
+    try:
+        done = start()
+    except OSError as error:  # once in a CI run, between two tests that had started it: what it does is tested here
+        warnings.warn(f"the program did not start ({error}); tried again", stacklevel=2)
+        time.sleep(1.0)
+        done = start()
+    assert done.returncode == (1 if fails else 0), done.stderr.decode()
+    return [line.split(",") for line in done.stdout.decode().splitlines()], done.stderr.decode()
+
+
+def csv(X: np.ndarray, labels: Any = None, parts: Any = None) -> bytes:
+    rows = [",".join(f"{value:.9g}" for value in x.ravel()) for x in X]
+    for column in (labels, parts):
+        if column is not None:
+            rows = [f"{word},{row}" for word, row in zip(column, rows, strict=True)]
+    return "\n".join(rows).encode() + b"\n"
+
+
+def assert_equal(lines: list[list[str]], decisions: list[Any], width: int) -> None:
+    assert len(lines) == len(decisions)
+    for line, decision in zip(lines, decisions, strict=True):
+        assert len(line) == 6 + width + 1
+        assert line[:2] == [str(decision.action), str(decision.reason)]
+        assert [float(line[2]), float(line[3])] == pytest.approx([decision.lower, decision.upper], abs=1e-6)
+        assert [int(line[4]), int(line[5])] == [decision.n_success, decision.n_failure]
+        assert float(line[-1]) > 0.0
+
+
+def test_the_sum_is_that_of_the_standard(programs: Path) -> None:
+    rng = np.random.default_rng(0)
+    for size in (0, 1, 3, 55, 56, 63, 64, 65, 119, 120, 1000, 100_000):
+        content = rng.bytes(size)
+        done = subprocess.run([programs / "sha256sum_check"], input=content, capture_output=True, check=True)
+        assert done.stdout.decode().strip() == hashlib.sha256(content).hexdigest()
+        key = "k" * max(1, min(size, 130))  # shorter than a block, a block, longer
+        done = subprocess.run([programs / "sha256sum_check", key], input=content, capture_output=True, check=True)
+        assert done.stdout.decode().strip() == hmac.new(key.encode(), content, hashlib.sha256).hexdigest()
+
+
+def test_csv_lines_get_the_engines_decisions(programs: Path, engine: DataEngine, file: Path, many: np.ndarray) -> None:
+    lines, _ = cell(programs, file, stdin=csv(many))
+    decisions = [engine.decide(x) for x in many]
+    assert_equal(lines, decisions, 2)
+    assert {d.action for d in decisions} == set(Action)
+    assert {d.reason for d in decisions} >= {Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
+
+
+def test_binary_blocks_get_what_python_says(programs: Path, file: Path, many: np.ndarray) -> None:
+    lines, _ = cell(programs, file, "--binary", stdin=many.tobytes())
+    decisions = load_exported(file).decide_many(many)
+    assert_equal(lines, decisions, 2)
+    found = np.array([line[6:8] for line in lines], dtype=np.float32)
+    expected = np.array([d.embedding[0] for d in decisions])
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_several_channels_come_one_after_the_other(
+    programs: Path, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data = make_data(150, 40, 3)
+    model = ModelPrediction("pca", WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9)).fit(data.X, data.y)
+    path = export_torchscript(model, tmp_path / "model.ts")
+    lines, _ = cell(programs, path, stdin=csv(data.X))
+    assert_equal(lines, load_exported(path).decide_many(data.X), 2)
+
+
+@pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
+def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_the_journal(
+    programs: Path, make_data: Callable[..., Dataset], tmp_path: Path, fit: str
+) -> None:
+    data, store, journal = make_data(200, SAMPLES), tmp_path / "engine.db", tmp_path / "cell.csv"
+    recipe = Recipe(reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.1)
+    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, fit=fit)) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        path = export_torchscript(engine, tmp_path / "model.ts")
+    lengths = [98, 100, 103, 60, 150, 30, 230, 1] * 5
+    grown = make_data(40, 240, seed=4).X
+    traces = [np.ascontiguousarray(x[:n]) for x, n in zip(grown, lengths, strict=True)]
+    exported, expected = load_exported(path), []
+    for x in traces:
+        expected.append(exported.decide(x))
+        if expected[-1].action is Action.VERIFY:
+            exported.learn(x, True)
+    stdin = b"".join(csv(x[None], [1]) for x in traces)
+    for part in (stdin[: stdin.index(b"\n") + 1], stdin[stdin.index(b"\n") + 1 :]):  # the second run reads the journal
+        lines, _ = cell(programs, path, "--learn", "--journal", journal, stdin=part)
+        assert_equal(lines, expected[: len(lines)], 2)
+        expected = expected[len(lines) :]
+    assert expected == []
+    report = import_journal(store, journal)
+    assert report.quarantined == 5 * {"cut": 4, "pad": 3, "resample": 3}[fit]
+
+
+class Live(NamedTuple):
+    """What comes in at a cell, and what the exported file in Python makes of it, told as the program tells it."""
+
+    lines: list[bytes]
+    decisions: list[Any]
+    written: list[int]  # journal lines after each trace
+    exported: ExportedModel
+
+
+def live(file: Path, X: np.ndarray, labels: list[str], parts: list[str] | None = None) -> Live:
+    exported, decisions, written = load_exported(file), [], []
+    numbers = [None] * len(X) if parts is None else [part or None for part in parts]
+    for x, label, part in zip(X, labels, numbers, strict=True):
+        decision = exported.decide(x, part)
+        accepted = decision.action is Action.ACCEPT
+        if accepted and label == "0":
+            exported.stop(x, part)
+        elif label and decision.action is not Action.REJECT:
+            exported.learn(x, label == "1", part)
+        counted = accepted or (label != "" and decision.action is Action.VERIFY)
+        written.append((written[-1] if written else 0) + counted)
+        decisions.append(decision)
+    return Live(csv(X, labels, parts).splitlines(keepends=True), decisions, written, exported)
+
+
+def a_live_stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, list[str], list[str]]:
+    """Traces, labels and parts: noisy, novel and bad ones, parts that come again, labels that are missing."""
+    rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=3.0)
+    X = data.X.copy()
+    X[rng.random(n) < 0.04] *= 5.0
+    X[rng.random(n) < 0.02, 3] = np.nan
+    parts = [f"P{rng.integers(2 * n)}" if rng.random() < 0.7 else "" for _ in range(n)]
+    y = data.y ^ ((np.arange(n) > 0.75 * n) & (rng.random(n) < 0.5))  # at last the world is another one
+    heard = np.where(y == 0, 0.95, 0.6)
+    return X, [str(label) if rng.random() < p else "" for label, p in zip(y, heard, strict=True)], parts
+
+
+@pytest.fixture(scope="module", params=["local-some", "pooled-some", "pooled-all"])
+def learning(
+    request: pytest.FixtureRequest, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
+    """A store after its engine's first retrain, and the exported file."""
+    guarantee, stops = request.param.split("-")
+    folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=3.0)
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.2, guarantee=guarantee, stops=stops)
+    recipe = Recipe(reducer="pca", policy=policy, retrain_every=10**6, window=2000, fraction=0.1)
+    store = folder / "engine.db"
+    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, limit=500.0), seed=3) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        return store, export_torchscript(engine, folder / "model.ts")
+
+
+def test_the_cell_learns_stops_and_silence_as_python_does(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, labels, parts = a_live_stream(make_data, 800)
+    expected = live(learning[1], X, labels, parts)
+    options = ["--parts", "--learn", "--journal", tmp_path / "cell.csv"]
+    lines, _ = cell(programs, learning[1], *options, stdin=b"".join(expected.lines))
+    assert_equal(lines, expected.decisions, 2)
+    head, *journal = (tmp_path / "cell.csv").read_text().splitlines()
+    assert head == f"# dengine 3 {hashlib.sha256(learning[1].read_bytes()).hexdigest()}"
+    assert len(journal) == expected.written[-1]
+    kinds = Counter((line.split(",")[2], line.split(",")[4]) for line in journal)
+    assert kinds.keys() == {("1", "verify"), ("0", "verify"), ("1", "accept"), ("0", "accept"), ("", "accept")}
+    reasons = {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CERTAIN, Reason.UNCERTAIN}
+    stops_all = read_metadata(learning[1])["stops"] == "all"
+    assert {d.reason for d in expected.decisions} >= reasons | ({Reason.SAFE_MODE} if stops_all else set())
+
+
+BOTH = pytest.mark.parametrize("learning", ["local-some", "pooled-all"], indirect=True)  # both of either setting
+
+
+@BOTH
+def test_a_killed_cell_goes_on_as_if_nothing_had_happened(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, labels, parts = a_live_stream(make_data, 500)
+    expected, journal = live(learning[1], X, labels, parts), tmp_path / "cell.csv"
+    waiting = next(i for i in range(150, 350) if not labels[i] and expected.decisions[i].action is Action.ACCEPT)
+    command = [programs / "dengine-cell", learning[1], "--parts", "--learn", "--journal", journal]
+    found: list[list[str]] = []
+    for end in (1, waiting + 1, 499):
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            for line in expected.lines[len(found) : end]:
+                process.stdin.write(line)
+                process.stdin.flush()
+                found.append(process.stdout.readline().decode().strip().split(","))
+            until = time.monotonic() + 60.0  # the answer comes first, then what is known of the part is written
+            while journal.read_bytes().count(b"\n") < 1 + expected.written[end - 1] and time.monotonic() < until:
+                time.sleep(0.001)
+            process.kill()
+    rest, _ = cell(programs, *command[1:], stdin=expected.lines[-1])
+    assert_equal(found + rest, expected.decisions, 2)
+    assert journal.read_bytes().count(b"\n") == 1 + expected.written[-1]
+
+
+def test_a_journal_is_worth_what_the_engine_would_have_seen_itself(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    store, file = learning
+    X, labels, parts = a_live_stream(make_data, 800)
+    journal, found = tmp_path / "cell.csv", []
+    cell(programs, file, "--parts", "--learn", "--journal", journal, stdin=csv(X, labels, parts))
+    for name in ("imported", "own"):
+        shutil.copy(store, tmp_path / f"{name}.db")
+    import_journal(tmp_path / "imported.db", journal)
+    with DataEngine.open(tmp_path / "own.db", replaying=True) as engine:
+        for x, label, part in zip(X, labels, parts, strict=True):
+            decision = engine.decide(x, part or None)
+            if label and decision.action is not Action.REJECT:
+                engine.report(decision.id, label == "1")
+    for name in ("imported", "own"):
+        with DataEngine.open(tmp_path / f"{name}.db") as engine:
+            known, outcomes = engine.store.evidence_since(400), engine.store.outcomes()
+            rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
+            sources, hashes = engine.store.status()["sources"], engine.store.labelled().hashes.tolist()
+            evidence = [getattr(known, each).tolist() for each in ("lower", "upper", "success", "novel", "silent")]
+            certain = outcomes.stops, outcomes.confirmed, outcomes.audited_accepts, outcomes.audited_accepts_bad
+            accepted = outcomes.accepted if engine.policy.stops == "some" else 0
+            found.append([evidence, rule, sources, hashes, certain, accepted, outcomes.audited_rejects])
+    assert found[0] == found[1]
+
+
+@BOTH
+def test_without_labels_silence_counts_for_nothing(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset]
+) -> None:
+    X = make_data(200, SAMPLES, seed=6, noise=3.0).X
+    exported, decisions = load_exported(learning[1]), []
+    for x in X:
+        decisions.append(exported.decide(x))
+        exported.module.drop()
+    assert_equal(cell(programs, learning[1], stdin=csv(X))[0], decisions, 2)
+    assert_equal(cell(programs, learning[1], "--binary", stdin=X.tobytes())[0], decisions, 2)
+
+
+def test_a_part_has_the_same_hash_in_both_languages(programs: Path, file: Path, many: np.ndarray) -> None:
+    parts = ["P1", "0", "", "007", "Ω-17", "a b", "P1"]  # one that comes again has no vote on itself
+    X = np.concatenate([many[:6], many[:1]])
+    expected = live(file, X, ["1"] * 7, parts)
+    assert_equal(cell(programs, file, "--parts", "--learn", stdin=b"".join(expected.lines))[0], expected.decisions, 2)
+    plain = live(file, X, ["1"] * 7)
+    assert [d[2:6] for d in plain.decisions[:6]] == [d[2:6] for d in expected.decisions[:6]]
+
+
+def test_a_journal_of_another_export_is_not_counted_again(programs: Path, file: Path, tmp_path: Path) -> None:
+    journal = tmp_path / "cell.csv"
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    for head in (f"# dengine 2 {'0' * 64}", f"# dengine {digest}", "1,2,3"):
+        journal.write_text(head + "\n")
+        _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
+        assert "belongs to another export, or to an older program; take it in with dengine import-labels" in said
+
+
+@pytest.fixture(scope="module")
+def written(programs: Path, file: Path, many: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A journal of two parts."""
+    journal = tmp_path_factory.mktemp("written") / "cell.csv"
+    cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:2], [1, 0]))
+    return journal.read_text()
+
+
+def with_crc(line: str) -> str:
+    return f"{line},{zlib.crc32(line.encode()):08x}"
+
+
+@pytest.mark.parametrize(
+    "kind", ["shorter", "a flipped digit", "no label", "another action", "another reason", "a NUL", "plain"]
+)
+def test_a_journal_line_that_cannot_be_read_is_named(
+    programs: Path, file: Path, written: str, tmp_path: Path, kind: str
+) -> None:
+    journal = tmp_path / "cell.csv"
+    head, first, second = written.splitlines()
+    words = second.rsplit(",", 1)[0].split(",")
+    wrong = {
+        "shorter": second[:-1],
+        "a flipped digit": second[:-30] + str((int(second[-30]) + 1) % 10 if second[-30].isdigit() else 1) + second[-29:],
+        "no label": with_crc(",".join([*words[:2], *words[3:]])),
+        "another action": with_crc(",".join([*words[:4], "think", *words[5:]])),
+        "another reason": with_crc(",".join([*words[:6], "because", *words[7:]])),
+        "a NUL": second[:-30] + "\0" + second[-29:],
+        "plain": second.split(",", 2)[2].rsplit(",", 1)[0],  # of the earlier form, which has no checksum
+    }
+    journal.write_text("\n".join([head, first, wrong[kind], second, ""]))
+    _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
+    assert "is damaged in line 3; take its earlier lines in" in said
+
+
+def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
+    programs: Path, file: Path, written: str, many: np.ndarray, tmp_path: Path
+) -> None:
+    journal = tmp_path / "cell.csv"
+    first = written.rindex("\n", 0, -1) + 1
+    for end in (first + 1, first + 40, len(written) - 12, len(written) - 1, 5, 0):  # within the line, then within the head
+        journal.write_text(written[:end])
+        _, said = cell(programs, file, "--learn", "--journal", journal, stdin=csv(many[:1], [1]))
+        kept = written[:first] if end >= first else written[: written.index("\n") + 1]
+        assert ("the last line was cut while it was written" in said) == (end > 0)
+        assert journal.read_text().startswith(kept)
+        assert journal.read_text().count("\n") == kept.count("\n") + 1
+
+
+def test_a_file_that_is_no_journal_is_left_as_it_is(programs: Path, file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "notes.txt"
+    for text in ("no line end", "# dengine 3 0123", "one\ntwo"):
+        other.write_text(text)
+        _, said = cell(programs, file, "--learn", "--journal", other, fails=True)
+        assert "belongs to another export" in said
+        assert other.read_text() == text
+
+
+def test_a_journal_of_the_earlier_program_is_gone_on_with_and_imported(
+    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    store, file = learning
+    X, labels, parts = a_live_stream(make_data, 120)
+    expected, whole = live(file, X, labels, parts), tmp_path / "whole.csv"
+    cell(programs, file, "--parts", "--learn", "--journal", whole, stdin=b"".join(expected.lines))
+    head, *lines = whole.read_text().splitlines()
+    half, earlier = len(lines) // 2, tmp_path / "earlier.csv"
+    end = next(i for i, n in enumerate(expected.written) if n == half) + 1
+    old = [line.split(",", 2)[2].rsplit(",", 1)[0] for line in lines[:half]]
+    earlier.write_text("\n".join([head.replace("3", "2", 1), *old, ""]))
+    found, _ = cell(programs, file, "--parts", "--learn", "--journal", earlier, stdin=b"".join(expected.lines[end:]))
+    assert_equal(found, expected.decisions[end:], 2)
+    reports = []
+    for journal in (whole, earlier):
+        shutil.copy(store, tmp_path / "engine.db")
+        reports.append(import_journal(tmp_path / "engine.db", journal))
+    assert reports[0] == reports[1]
+
+
+def test_a_file_of_an_older_schema_is_refused(programs: Path, repo: Path) -> None:
+    _, said = cell(programs, repo / "tests" / "golden" / "model.ts", fails=True)
+    assert "it was written by an older dengine" in said
+    assert "export it anew" in said
+
+
+def test_a_malformed_line_is_verified_and_the_cell_goes_on(programs: Path, file: Path, many: np.ndarray) -> None:
+    good = csv(many[:1]).decode().strip()
+    wrong = {
+        good.rsplit(",", 1)[0]: "expected 100 samples, got 99",
+        good + ",1": "expected 100 samples, got 101",
+        good.replace(",", ";"): "expected a number in column 1",
+        good.rsplit(",", 1)[0] + ",12N": 'expected a number in column 100, got "12N"',
+        good.rsplit(",", 1)[0] + ",": 'expected a number in column 100, got ""',
+    }
+    stdin = "\n".join([*wrong, "", "  ", good + "\r"]).encode()
+    lines, said = cell(programs, file, stdin=stdin, fails=True)
+    assert [line[:6] for line in lines[:-1]] == [["verify", "malformed", "0", "1", "0", "0"]] * len(wrong)
+    assert_equal(lines[-1:], [load_exported(file).decide(many[0])], 2)
+    for number, expected in enumerate(wrong.values(), start=1):
+        assert f"trace {number} is malformed: {expected}" in said
+
+
+def test_a_label_that_is_none_is_malformed(programs: Path, file: Path, many: np.ndarray) -> None:
+    lines, said = cell(programs, file, "--learn", stdin=csv(many[:2], ["yes", 1]), fails=True)
+    assert [line[1] == "malformed" for line in lines] == [True, False]
+    assert 'expected a label of 1, 0 or nothing, got "yes"' in said
+
+
+def test_a_cut_binary_block_is_malformed(programs: Path, file: Path, many: np.ndarray) -> None:
+    lines, said = cell(programs, file, "--binary", stdin=many[:2].tobytes()[:-5], fails=True)
+    assert [line[1] == "malformed" for line in lines] == [False, True]
+    assert "expected 400 bytes, got 395" in said
+
+
+@pytest.mark.parametrize("kind", ["flip", "truncated", "empty", "no sum", "not a sum", "missing", "garbage", "foreign"])
+def test_a_file_that_must_not_be_used_is_refused(programs: Path, file: Path, tmp_path: Path, kind: str) -> None:
+    path, content = tmp_path / "model.ts", file.read_bytes()
+    middle = len(content) // 2
+    path.write_bytes(
+        {
+            "flip": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+            "truncated": content[:middle],
+            "empty": b"",
+            "garbage": b"garbage" * 1000,
+        }.get(kind, content)
+    )
+    if kind == "foreign":
+        torch.jit.save(torch.jit.script(torch.nn.ReLU()), str(path))
+    signed = path if kind in ("garbage", "foreign") else file
+    digest = "nothing" if kind == "not a sum" else hashlib.sha256(signed.read_bytes()).hexdigest()
+    path.with_name("model.ts.sha256").write_text(digest)
+    if kind in ("no sum", "missing"):
+        (path.with_name("model.ts.sha256") if kind == "no sum" else path).unlink()
+    lines, said = cell(programs, path, stdin=csv(np.ones((1, SAMPLES))), fails=True)
+    expected = {
+        "flip": "it is damaged or truncated",
+        "truncated": "it is damaged or truncated",
+        "empty": "it is damaged or truncated",
+        "no sum": "cannot read",
+        "missing": "cannot read",
+        "not a sum": "holds no SHA-256 sum",
+        "garbage": "no loadable TorchScript",
+        "foreign": "it is not a dengine export",
+    }
+    assert lines == []
+    assert expected[kind] in said
+
+
+def test_wrong_arguments_show_the_usage(programs: Path, file: Path) -> None:
+    wrong = ([], ["--fast"], ["--learn", "--binary"], ["--parts", "--binary"], ["--parts", "--journal", "x"], ["--key"])
+    for arguments in ([str(file)] * bool(each) + each for each in wrong):
+        done = subprocess.run([programs / "dengine-cell", *arguments], capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert done.stderr.startswith("usage: dengine-cell MODEL")

@@ -1,0 +1,193 @@
+"""`dengine data`, and the other verbs on recordings as people have them."""
+
+import json
+import runpy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from click.testing import CliRunner, Result
+
+from dengine import DataEngine, Dataset
+from dengine.cli import main
+from dengine.cli.output import WIDE
+from dengine.datasets import Fault
+from dengine.experiments.figures import save
+from dengine.experiments.pictures import data_picture
+from dengine.experiments.survey import Spread, survey
+
+
+def dengine(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def succeed(*words: object) -> Result:
+    result = dengine(*words)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, repo: Path) -> Path:
+    """80 recordings as UR cells make them, three of them broken."""
+    path = tmp_path_factory.mktemp("recordings") / "cell_3"
+    runpy.run_path(str(repo / "training" / "make_recordings.py"))["write_recordings"](path, 80, 3, 0)
+    return path
+
+
+def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
+    result = succeed("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
+    said = " ".join(result.stdout.replace("│", " ").split())
+    for words in (
+        "77, 3 left out",
+        "2 channels (FZ_Base, FX_Base)",
+        "pad, to",
+        "500 Hz each, by the timestamps",
+        "bad traces none",
+        "duplicates none",
+        "good by tenths",
+        "FX_Base by tenths",
+        "Left out, 3:",
+        "Expected a header and rows, it is empty",
+        "Expected 13 columns, got 12",
+        "Expected a column FZ_Base",
+    ):
+        assert words in said, words
+    assert result.stderr == ""
+    assert max(map(len, result.stdout.splitlines())) <= max(WIDE, len(f"Wrote {tmp_path / 'out' / 'data.png'}"))
+    assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
+
+
+def test_data_as_json_is_one_document(folder: Path) -> None:
+    found = json.loads(succeed("data", folder, "--json").stdout)["survey"]
+    assert (found["traces"], len(found["faults"]), found["rate_hz"], found["fit"]) == (77, 3, 500.0, "pad")
+    assert found["good"] + found["bad"] == 77
+    assert found["lengths"]["low"] < found["lengths"]["high"]
+    assert {fault["line"] for fault in found["faults"]} >= {0, 1}
+    assert [len(each["tenths"]) for each in found["drift"]] == [10, 10]
+
+
+def test_replay_says_once_what_was_left_out(folder: Path) -> None:
+    words = ("replay", "--data", folder, "--channel", "FZ_Base", "--reducer", "pca", "--cycles", 60, "--repeats", 1)
+    result = succeed(*words)
+    assert "pca on cell_3" in result.stdout
+    assert result.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
+    assert result.stderr.count(".csv") == 3
+
+
+def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(folder: Path, tmp_path: Path) -> None:
+    store = tmp_path / "engine.db"
+    result = succeed("train", "--data", folder, "--store", store, "--reducer", "pca")
+    assert "Imported 77 labelled traces" in result.stdout
+    again = succeed("train", "--data", folder, "--store", store)
+    assert "all 77 traces were there from an earlier import" in again.stdout
+    with DataEngine.open(store) as engine:
+        assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
+        files = [path for path in sorted(folder.iterdir()) if len(path.read_bytes()) > 10**5][:3]
+        lengths = set()
+        for path in files:
+            frame = pd.read_csv(path)
+            lengths.add(len(frame))
+            assert engine.decide(frame).embedding is not None
+        assert len(lengths) > 1
+    other = dengine("train", "--data", folder, "--channel", "FX_Base", "--store", store)
+    assert other.exit_code == 1
+    assert "Expected the channels FZ_Base, got FX_Base" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--channel", "FQ_Base"), "Expected a column FQ_Base"),
+        (("--fit", "strict"), "Expected recordings of one length"),
+        (("--label", "(("), "regular expression"),
+        (("--labels", "nowhere.csv"), "Cannot read the labels"),
+    ],
+)
+def test_an_option_that_does_not_fit_is_one_line(folder: Path, options: tuple[str, ...], words: str) -> None:
+    result = dengine("data", folder, *options)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert words in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(20, samples=30)
+    frame = pd.DataFrame(data.X, columns=[f"x{i}" for i in range(30)]).assign(y=data.y)
+    frame.to_csv(tmp_path / "wide.csv", index=False)
+    lines = (tmp_path / "wide.csv").read_text().splitlines()
+    lines[3:16] = [line + ",1" for line in lines[3:16]]
+    (tmp_path / "wide.csv").write_text("\n".join(lines))
+    said = succeed("data", tmp_path / "wide.csv").stdout
+    assert said.count("- wide.csv, line ") == 10
+    assert "and 3 more." in said
+
+
+# ------------------------------------------------------------------------------------------------------- the survey
+
+
+def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
+    data = make_data(120, samples=60)
+    X, y = data.X.copy(), data.y.copy()
+    X[3, 5], X[4] = np.nan, 2.0
+    X[50], y[50] = X[10], y[10]
+    X[51], y[51] = X[11], 1 - y[11]
+    X[52:60] = X[20:28] + np.float32(1e-3)
+    found = survey(replace(data, X=X, y=y, faults=(Fault("a.csv", 3, "it is torn"),)))
+    assert (found.not_finite, found.constant) == (1, 1)
+    assert (found.duplicates, found.contradicting) == (2, 1)
+    assert 14 <= found.near_repeats <= 20
+    assert found.looked_at == 118
+    assert (found.good + found.bad, found.lengths, found.rates, found.parts) == (120, None, None, None)
+    assert survey(make_data(120, samples=60)).near_repeats <= 3
+
+
+def test_drift_is_seen_where_there_is_some_and_only_there(make_data: Callable[..., Dataset]) -> None:
+    data = make_data(300, samples=60)
+    still = {each.name: each for each in survey(data).drift}
+    assert still["good"].p > 0.01
+    assert still["channel 1"].p > 0.01
+    rng = np.random.default_rng(1)
+    y = (rng.random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
+    moved = {each.name: each for each in survey(replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)).drift}
+    assert moved["good"].p < 1e-4 > moved["channel 1"].p
+    assert moved["good"].rho < -0.2 < 0.3 < moved["channel 1"].rho
+    assert np.all(np.diff(moved["channel 1"].tenths)[[0, -1]] > -3)
+    flat = survey(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
+    assert np.isnan([flat.rho, flat.p]).all()
+    assert flat.tenths == (1.0,) * 10
+
+
+def test_lengths_and_rates_are_those_of_the_recordings(make_data: Callable[..., Dataset]) -> None:
+    data = make_data(5, samples=60)
+    found = survey(replace(data, lengths=np.array([58, 60, 61, 66, 60]), rates=np.array([499.0, 500, np.nan, 501, 500])))
+    assert (found.lengths, found.rates) == (Spread(58, 60, 66), Spread(499, 500, 501))
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+@pytest.mark.parametrize("n", [1, 6, 60])
+def test_a_picture_is_drawn_of_any_data(make_data: Callable[..., Dataset], tmp_path: Path, n: int, channels: int) -> None:
+    data = make_data(n, samples=40, channels=channels)
+    data.X[0, ..., 3] = np.nan
+    figure = data_picture(data, "x")
+    assert len(figure.axes) == min(channels, 3) + 2
+    assert save(figure, tmp_path / "data.png").stat().st_size > 5_000
+
+
+def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_path: Path) -> None:
+    names, some = sorted(folder.iterdir(), key=lambda path: path.stat().st_size), tmp_path / "some"
+    some.mkdir()
+    for path in names[50:]:  # the longer ones first: the median falls when the others come
+        (some / path.name).write_bytes(path.read_bytes())
+    first = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--reducer", "pca", "--json").stdout)
+    for path in names[:50]:
+        (some / path.name).write_bytes(path.read_bytes())
+    again = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--json").stdout)
+    assert (first["import"]["imported"], again["import"]["known"]) == (30, 30)
+    assert again["import"]["imported"] == 47
+    wrong = dengine("train", "--data", some, "--store", tmp_path / "a.db", "--samples", 900)
+    assert wrong.exit_code == 1
+    assert "samples=" in wrong.output

@@ -1,0 +1,247 @@
+"""The container file and the service: every file, option and name in them is there. No image is built and none is run."""
+
+import http.server
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+import tomllib
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+import pytest
+
+from dengine.cli import main
+from dengine.errors import SettingError
+
+REPO = Path(__file__).resolve().parents[2]
+DEPLOY = REPO / "deploy"
+CONTAINER, UNIT, OPTIONS = (
+    (DEPLOY / name).read_text(encoding="utf-8") for name in ("Containerfile", "dengine.service", "dengine.env")
+)
+PROJECT = tomllib.loads((REPO / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def steps(name: str) -> list[str]:
+    """What a kind of step of the container file says, continued lines in one, without comments."""
+    lines = "\n".join(line for line in CONTAINER.splitlines() if not line.startswith("#")).replace("\\\n", " ")
+    return [line.split(maxsplit=1)[1].strip() for line in lines.splitlines() if line.split(maxsplit=1)[:1] == [name]]
+
+
+def settings(name: str) -> list[str]:
+    """The values of a setting of the unit, in order."""
+    return re.findall(rf"^{name}=(.*)$", UNIT, flags=re.M)
+
+
+def parse(words: list[str]) -> click.Context:
+    """`dengine serve ...` as the command line reads it; UsageError for an option that does not exist."""
+    if "serve" not in main.commands:
+        pytest.skip("`dengine serve` is not there yet")
+    with click.Context(main, **main.context_settings) as parent:
+        return main.commands[words[0]].make_context(words[0], list(words[1:]), parent=parent)
+
+
+# ------------------------------------------------------------------------------------------------------- the container
+
+
+def test_what_the_container_copies_is_there_and_goes_to_the_builder() -> None:
+    copied = [path for step in steps("COPY") for path in step.split()[:-1]]
+    assert {"constraints.txt", "pyproject.toml", "dengine"} <= set(copied)
+    assert [path for path in copied if not (REPO / path).exists()] == []
+    kept = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="utf-8").splitlines()
+    assert "*" in kept
+    assert sorted(line[1:] for line in kept if line.startswith("!")) == sorted(copied)
+    for key in ("readme", "license-files"):
+        named = PROJECT[key] if isinstance(PROJECT[key], list) else [PROJECT[key]]
+        assert set(named) <= set(copied)  # or the package cannot be built in it
+
+
+def test_the_container_takes_its_pins_from_the_constraints_and_its_parts_from_an_extra() -> None:
+    (install,) = [step for step in steps("RUN") if "pip install" in step]
+    assert "--constraint constraints.txt" in install
+    assert "==" not in re.sub(r"assert .*", "", install)  # no pin of its own that could disagree
+    assert re.search(r"^torch==", (REPO / "constraints.txt").read_text(encoding="utf-8"), flags=re.M)
+    (extras,) = re.findall(r'"\.\[([\w,]+)\]"', install)
+    assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
+
+
+def test_the_image_is_of_a_python_that_the_package_takes() -> None:
+    (base,) = steps("FROM")
+    version = re.search(r"python:(3)\.(\d+)-slim$", base)
+    assert version is not None
+    low, high = re.findall(r"3\.(\d+)", PROJECT["requires-python"])
+    assert int(low) <= int(version[2]) < int(high)
+
+
+def test_the_container_runs_as_nobody_special_with_its_store_in_the_volume() -> None:
+    (volume,) = steps("VOLUME")
+    (user,) = steps("USER")
+    assert user not in ("root", "0")
+    assert any("useradd --system --uid 990 --user-group" in step and user in step for step in steps("RUN"))
+    (command,) = steps("CMD")
+    words = json.loads(command)
+    assert words[words.index("--store") + 1].startswith(f"{volume}/")
+    assert CONTAINER.index("USER ") > CONTAINER.index("pip install")
+
+
+def test_what_the_container_starts_is_an_option_each_of_serve() -> None:
+    (command,) = steps("CMD")
+    assert json.loads(steps("ENTRYPOINT")[0]) == ["dengine"]
+    words = json.loads(command)
+    assert words[words.index("--port") + 1] in steps("EXPOSE")
+    given = parse(words).params
+    assert given["store"].startswith("/var/lib/dengine/")
+    assert given["port"] == 8000
+
+
+@contextmanager
+def answering(status: int) -> Iterator[int]:
+    """A server that answers every request with one status; its port."""
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status if self.path == "/healthz" else 404)
+            self.end_headers()
+
+        def log_message(self, *said: object) -> None:
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server.server_address[1]
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(("status", "healthy"), [(200, True), (503, False), (404, False)])
+def test_the_health_check_asks_healthz_and_knows_well_from_ill(status: int, healthy: bool) -> None:
+    (check,) = steps("HEALTHCHECK")
+    program, *words = json.loads(check.split("CMD", 1)[1])
+    assert program == "python"
+    with answering(status) as port:
+        asked = [word.replace(":8000/", f":{port}/") for word in words]
+        assert asked != words
+        done = subprocess.run([sys.executable, *asked], capture_output=True, timeout=60, check=False)
+    assert (done.returncode == 0) is healthy
+
+
+@pytest.mark.skipif(os.name == "nt", reason="SIGTERM is no signal there")
+def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengine[serve]'")
+    for package in ("starlette", "msgpack", "prometheus_client"):
+        pytest.importorskip(package)
+    token = tmp_path / "token"
+    token.write_text("a-token-of-24-characters", encoding="ascii")
+    token.chmod(0o400)
+    changed = {"/var/lib/dengine/cell.db": str(tmp_path / "cell.db"), "/run/secrets/dengine_token": str(token), "8000": "0"}
+    words = [changed.get(word, word) for word in json.loads(steps("CMD")[0])]
+    command = [sys.executable, "-m", "dengine", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
+        try:
+            assert server.stdout is not None
+            line = server.stdout.readline()
+            found = re.search(r":(\d+)", line)
+            assert found is not None, line
+            _, *check = json.loads(steps("HEALTHCHECK")[0].split("CMD", 1)[1])
+            asked = [word.replace(":8000/", f":{found[1]}/") for word in check]
+            assert subprocess.run([sys.executable, *asked], timeout=60, check=False).returncode == 0
+            with pytest.raises(urllib.error.HTTPError, match="401"):
+                urllib.request.urlopen(f"http://127.0.0.1:{found[1]}/status", timeout=30)
+        finally:
+            server.terminate()  # as the container's end does
+        assert server.wait(60) == 0
+    assert (tmp_path / "cell.db").is_file()
+
+
+# --------------------------------------------------------------------------------------------------------- the service
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such modes")
+@pytest.mark.parametrize(("mode", "handed", "taken"), [
+    (0o440, True, True), (0o440, False, False), (0o444, True, False), (0o460, True, False), (0o400, False, True)
+])  # fmt: skip
+def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_right_of_the_group(
+    mode: int, handed: bool, taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("starlette", reason="needs the extra serve: pip install 'dengine[serve]'")
+    from dengine.serve.auth import read_token
+
+    if handed:
+        monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    token = tmp_path / "token"
+    token.write_text("a-token-of-24-characters\n", encoding="ascii")
+    token.chmod(mode)
+    if taken:
+        assert read_token(token) == "a-token-of-24-characters"
+    else:
+        with pytest.raises(SettingError, match="its owner's alone"):
+            read_token(token)
+
+
+def test_what_the_unit_starts_is_an_option_each_of_serve_with_those_of_its_file_behind() -> None:
+    (line,) = settings("ExecStart")
+    (behind,) = re.findall(r"^DENGINE_OPTIONS=(.*)$", OPTIONS, flags=re.M)
+    program, *words = shlex.split(line.replace("$DENGINE_OPTIONS", behind))
+    assert Path(program).name == "dengine"
+    assert settings("EnvironmentFile") == ["/etc/dengine/dengine.env"]
+    given = parse(words).params
+    assert given["store"].startswith(f"/var/lib/{settings('StateDirectory')[0]}/")
+    assert given["host"] == "127.0.0.1"
+    assert given["shadow"] is True
+
+
+def test_the_token_is_a_credential_and_in_no_file_or_option() -> None:
+    assert settings("LoadCredential") == ["token:/etc/dengine/token"]
+    assert "${CREDENTIALS_DIRECTORY}/token" in settings("ExecStart")[0]
+    assert "token" not in OPTIONS
+
+
+def test_the_unit_starts_again_after_a_failure_and_is_given_time_to_end() -> None:
+    assert settings("Restart") == ["on-failure"]
+    assert settings("StartLimitIntervalSec") == ["0"]
+    assert settings("KillMode") == ["mixed"]  # the process that trains is ended by the server, not beside it
+    assert float(settings("TimeoutStopSec")[0]) >= 10
+
+
+def test_what_the_unit_keeps_is_written_where_it_may_write() -> None:
+    assert settings("ProtectSystem") == ["strict"]
+    caches = re.findall(r"_(?:CACHE_)?DIR=(\S+)|MPLCONFIGDIR=(\S+)", settings("Environment")[0])
+    assert caches
+    assert {path for pair in caches for path in pair if path} == {f"/var/cache/{settings('CacheDirectory')[0]}"}
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """The unit with a program that is here in the place of the one that it would start."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not here")
+    path = tmp_path / "dengine.service"
+    path.write_text(UNIT.replace(settings("ExecStart")[0].split()[0], sys.executable), encoding="utf-8")
+    return path
+
+
+def analyze(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["systemd-analyze", *map(str, words)], capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(unit: Path) -> None:
+    done = analyze("verify", "--man=no", unit)
+    assert (done.returncode, done.stderr) == (0, "")
+    unit.write_text(unit.read_text(encoding="utf-8") + "\nNoSuchThing=yes\n", encoding="utf-8")
+    assert "NoSuchThing" in analyze("verify", "--man=no", unit).stderr  # or it would say nothing of anything
+
+
+def test_systemd_rates_the_unit_as_little_exposed(unit: Path) -> None:
+    if "--offline" not in analyze("--help").stdout:
+        pytest.skip("this systemd-analyze rates no file that is not installed")
+    done = analyze("security", "--offline=yes", "--threshold=20", "--no-pager", unit)
+    assert done.returncode == 0, done.stdout[-300:]

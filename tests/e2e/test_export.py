@@ -1,0 +1,621 @@
+"""The exported file decides as the engine does, goes on learning honestly, and is refused where it must not be used."""
+
+import hashlib
+import json
+import subprocess
+import sys
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from dengine import (
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    TraceSpec,
+    WilsonRadiusClassifier,
+    export_torchscript,
+    load_exported,
+)
+from dengine.decision.rule import SAFE_MODE, DecisionRule
+from dengine.engine.engine import DataEngine
+from dengine.errors import ExportError, TraceError
+from dengine.export import ExportedModel, read_metadata
+from dengine.folds import content_fold, part_hash
+from dengine.records import ACTIONS, REASONS, Action, Reason
+from dengine.reducers import Reducer
+
+SAMPLES = 100
+LIMIT = 500.0
+
+
+def recipe(audit_rate: float = 0.0, retrain_every: int = 300, **settings: Any) -> Recipe:
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=audit_rate)
+    return Recipe(**{"reducer": "pca", "policy": policy, "retrain_every": retrain_every, "window": 2000} | settings)
+
+
+def trained_engine(data: Dataset, recipe: Recipe) -> DataEngine:
+    """An engine that saw every label and retrained on all of them."""
+    engine = DataEngine.from_recipe(recipe, trace=TraceSpec(data.X.shape[-1], limit=LIMIT), seed=3, replaying=True)
+    for x, y in zip(data.X, data.y, strict=True):
+        decision = engine.decide(x)
+        if decision.action is Action.VERIFY:
+            engine.report(decision.id, bool(y))
+    engine.retrain()
+    return engine
+
+
+def bad_traces(x: np.ndarray) -> list[np.ndarray]:
+    """Not finite, dead and saturated, each in more than one way."""
+    nan, inf, both, beyond = x.copy(), x.copy(), x.copy(), x.copy()
+    nan[3], inf[5], both[7], both[8], beyond[0] = np.nan, -np.inf, np.inf, np.nan, 1e30
+    return [nan, inf, both, beyond, np.full_like(x, 2.5), np.zeros_like(x), np.full_like(x, np.nan)]
+
+
+@pytest.fixture(scope="module")
+def many(make_data: Callable[..., Dataset]) -> np.ndarray:
+    """Several hundred traces: like those seen, random ones of every size, and bad ones."""
+    rng = np.random.default_rng(5)
+    known = make_data(300, SAMPLES, seed=9).X
+    wild = rng.normal(size=(200, SAMPLES)) * 10.0 ** rng.uniform(-3, 6, (200, 1))
+    return np.concatenate([known, wild, np.array(bad_traces(known[0]))]).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def audited(make_data: Callable[..., Dataset]) -> Iterator[DataEngine]:
+    with trained_engine(make_data(400, SAMPLES), recipe(audit_rate=0.3)) as engine:
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export_torchscript(audited, tmp_path_factory.mktemp("export") / "model.ts")
+
+
+def row(decision: Any) -> tuple[Any, ...]:
+    return (
+        str(decision.action),
+        str(decision.reason),
+        decision.lower,
+        decision.upper,
+        decision.n_success,
+        decision.n_failure,
+    )
+
+
+# ------------------------------------------------------------------------------------------------- parity
+
+
+@pytest.mark.parametrize("neighbourhood", [{}, {"fraction": 0.1}, {"fraction": 0.3, "reject_fraction": 0.08}])
+def test_the_file_decides_exactly_as_the_engine(
+    make_data: Callable[..., Dataset], many: np.ndarray, tmp_path: Path, neighbourhood: dict[str, float]
+) -> None:
+    with trained_engine(make_data(400, SAMPLES), recipe(audit_rate=0.3, **neighbourhood)) as engine:
+        exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
+        decisions = [engine.decide(x) for x in many]
+    found = exported.decide_many(many)
+    assert [row(d) for d in found] == [row(d) for d in decisions]
+    for ours, theirs in zip(found, decisions, strict=True):
+        if theirs.embedding is None:
+            assert np.isnan(ours.embedding).all()
+        else:
+            np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
+    reasons = {d.reason for d in found}
+    assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
+    assert {d.action for d in found} == set(Action)
+
+
+def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[tuple[np.ndarray, bool, str | int | None]]:
+    """Traces, labels and parts' numbers: parts that come again, bad traces, novel ones, and a world that changes."""
+    rng, data = np.random.default_rng(seed), make_data(n, SAMPLES, seed=seed, noise=3.0)
+    for i, (x, y) in enumerate(zip(data.X.copy(), data.y, strict=True)):
+        part = (None, f"P{i}", i)[i % 3]
+        if i > 5 and rng.random() < 0.1:
+            part = int(rng.integers(i))
+        kind = rng.random()
+        if kind < 0.04:
+            x = bad_traces(x)[i % 5]
+        elif kind < 0.08:
+            x = x * 5.0
+        if 0.85 * n < i < 0.9 * n:
+            x = np.ascontiguousarray(x[::-1] + 30.0 * np.sin(np.arange(SAMPLES, dtype=np.float32)))
+        changed = 0.6 * n < i < 0.75 * n and rng.random() < 0.4
+        yield x, bool(y) != changed, part
+
+
+@pytest.mark.parametrize("guarantee", ["local", "pooled"])
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
+    make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
+) -> None:
+    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.1, guarantee=guarantee, stops=stops)
+    settings = recipe(policy=policy, retrain_every=10**6, fraction=0.1)
+    engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
+    rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
+    with engine:
+        for x, y, part in a_stream(make_data, 500, 1):
+            engine.report(engine.decide(x, part).id, y)
+        engine.retrain()
+        exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
+        for i, (x, y, part) in enumerate(a_stream(make_data, 1500, 2)):
+            known, found = engine.decide(x, part), exported.decide(x, part)
+            assert row(found) == row(known)
+            if known.embedding is not None:
+                np.testing.assert_array_equal(found.embedding, np.array(known.embedding, dtype=np.float32))
+            heard = False
+            if known.action is Action.VERIFY and rng.random() < 0.9:
+                heard = exported.learn(x, y, part) > 0
+            elif known.action is Action.ACCEPT and not y and (stops == "all" or rng.random() < 0.5):
+                heard = exported.stop(x, part) > 0
+            elif known.action is Action.ACCEPT and y and rng.random() < 0.1:
+                heard = exported.learn(x, True, part) > 0
+            if heard:
+                engine.report(known.id, y)
+            happened[f"{known.action}, {'heard' if heard else 'silent'}"] += 1
+            happened[known.reason] += 1
+            assert exported.safe_mode == engine.safe_mode
+            modes.add(engine.safe_mode)
+            if i > 600 and not saved and known.action is Action.ACCEPT and not heard:  # one that waits
+                exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
+        model = engine.model
+        mine = {f"ring.{name}": t for name, t in model.index.ring.state_dict().items()}
+        mine |= {f"rule.{name}": t for name, t in model.rule.state_dict().items()}
+        kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
+        for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
+            torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
+        assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
+        assert type(model.rule) is DecisionRule or {"rule.members", "rule.watch", "rule.open"} <= kept.keys()
+    assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
+    assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED)) > 0
+    assert len(modes) > 1 or stops == "some"
+    assert saved
+
+
+def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
+    new, held = make_data(6, SAMPLES, seed=4).X, 300
+    assert exported.decide(new[0]).action is Action.ACCEPT
+    assert exported.learn(new[1], False) == held + 1  # not the one that waits
+    exported.decide(new[2])
+    assert exported.module.n_references() == held + 2  # the first one is confirmed
+    exported.module.drop()
+    exported.decide(new[3])
+    assert exported.module.n_references() == held + 2
+    assert exported.stop(new[3]) == held + 3
+    assert not exported.module.settle()
+
+
+def test_a_restored_decision_waits_as_if_it_were_of_now(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    path = export_torchscript(lenient_engine(make_data), tmp_path / "model.ts")
+    one, two = load_exported(path), load_exported(path)
+    for i, x in enumerate(make_data(20, SAMPLES, seed=4).X):
+        found = one.decide(x, i // 2)
+        action, reason = ACTIONS.index(found.action), REASONS.index(found.reason)
+        two.module.restore(torch.from_numpy(x), part_hash(str(i // 2)), action, reason, found.lower, found.upper)
+    assert two.module.n_references() == one.module.n_references() == 300 + 19
+    for mine, other in zip(one.module.named_buffers(), two.module.named_buffers(), strict=True):
+        assert mine[0] == other[0]
+        torch.testing.assert_close(mine[1], other[1], rtol=0, atol=0)
+
+
+def lenient_engine(make_data: Callable[..., Dataset]) -> DataEngine:
+    """Accepts whatever comes, and silence confirms it: 300 references."""
+    data = make_data(300, SAMPLES, failures=0.02)
+    policy = Policy(alpha=0.1, lower_bound=0.6, stops="all")
+    engine = DataEngine.from_recipe(recipe(policy=policy, fraction=0.9, novelty=0.0, retrain_every=10**6), replaying=True)
+    for x, y in zip(data.X, data.y, strict=True):
+        engine.report(engine.decide(x).id, bool(y))
+    engine.retrain()
+    return engine
+
+
+def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    exported = load_exported(export_torchscript(lenient_engine(make_data), tmp_path / "model.ts"))
+    golden = exported.metadata["golden"]["trace"]
+    assert not exported.module.settle()
+    assert exported.decide(golden).action is Action.ACCEPT  # and so it could have been confirmed
+    assert exported.module.n_references() == 300
+
+
+def test_a_part_may_be_left_out_after_loading(file: Path, many: np.ndarray) -> None:
+    module = load_exported(file).module
+    x = torch.from_numpy(many[0])
+    assert module.decide(x)[:6] == module.decide(x, 0)[:6]
+    assert module.learn(x, True) == module.stop(x) - 1
+    assert module.safe_mode() == 0
+
+
+def test_a_file_of_schema_1_goes_on_as_it_did(repo: Path, tmp_path: Path) -> None:
+    exported = load_exported(repo / "tests" / "golden" / "model.ts")
+    assert exported.metadata["schema"] == 1
+    x, held = exported.metadata["golden"]["trace"], exported.metadata["references"]
+    found = exported.decide(x, "P1")
+    assert row(found) == row(exported.decide(x))
+    assert exported.learn(x, True, "P1") == held + 1
+    assert exported.stop(x) == held + 2
+    assert exported.safe_mode == ""
+    again = load_exported(exported.save(tmp_path / "later.ts"))
+    assert again.metadata["references"] == held + 2
+    assert row(again.decide(x)) == row(exported.decide(x))
+
+
+def test_a_fresh_process_decides_the_same(file: Path, many: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "traces.npy", many)
+    program = (
+        "import sys, json, numpy as np; from dengine import load_exported\n"
+        "found = load_exported(sys.argv[1]).decide_many(np.load(sys.argv[2]))\n"
+        "print(json.dumps([[str(d.action), str(d.reason), *d[2:6]] for d in found]))"
+    )
+    command = [sys.executable, "-W", "ignore", "-c", program, str(file), str(tmp_path / "traces.npy")]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert [tuple(found) for found in json.loads(printed)] == [row(d) for d in load_exported(file).decide_many(many)]
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16])
+def test_any_real_dtype_is_cast(file: Path, many: np.ndarray, dtype: Any) -> None:
+    whole = np.round(many[:20])
+    exported = load_exported(file)
+    assert [row(exported.decide(x.astype(dtype))) for x in whole] == [row(exported.decide(x)) for x in whole]
+
+
+def test_one_trace_a_batch_and_a_batch_with_channels_agree(file: Path, many: np.ndarray) -> None:
+    exported = load_exported(file)
+    with torch.inference_mode():
+        flat = exported.module(torch.from_numpy(many))
+        deep = exported.module(torch.from_numpy(many[:, None, :]))
+        single = exported.module(torch.from_numpy(many[0]))
+    for one, two, first in zip(flat, deep, single, strict=True):
+        torch.testing.assert_close(one, two, rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(one[:1], first, rtol=0, atol=0, equal_nan=True)
+    decided = exported.decide_many(many)
+    actions, reasons = exported.metadata["actions"], exported.metadata["reasons"]
+    assert [actions[i] for i in flat[0]] == [d.action for d in decided]
+    assert [reasons[i] for i in flat[1]] == [d.reason for d in decided]
+    assert flat[2].tolist() == [d.lower for d in decided]
+
+
+def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(150, 40, 3)
+    model = fitted(data)
+    exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
+    assert exported.trace.channels == 3
+    new = make_data(100, 40, 3, seed=1).X  # a reference that is asked about itself has no vote in the file
+    known = model.predict_many(new)
+    assert [d[2:6] for d in exported.decide_many(new)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+
+
+def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
+    exported = load_exported(file)
+    with pytest.raises(TraceError, match=f"Expected {SAMPLES} samples, got 98"):
+        exported.decide(np.ones(98))
+    with pytest.raises(torch.jit.Error, match=f"1 x {SAMPLES} samples"):
+        exported.module.decide(torch.ones(98))
+
+
+# ------------------------------------------------------------------------------------------------- the file
+
+
+def test_the_file_says_what_it_is_without_being_loaded(
+    audited: DataEngine, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
+    metadata = read_metadata(file)
+    assert metadata["schema"] == 2
+    assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == ("local", "some", audited.recipe.novelty)
+    assert metadata["safe_modes"] == list(SAFE_MODE)
+    assert metadata["trace"] == asdict(TraceSpec(SAMPLES, limit=LIMIT)) | {"columns": []}
+    assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
+    assert metadata["model_version"] == audited.version
+    assert metadata["references"] == len(audited.model.index)
+    assert Recipe.from_toml(metadata["recipe"]) == audited.recipe
+    assert metadata["torch"] == torch.__version__
+    assert len(metadata["references_sha256"]) == 64
+    assert set(metadata) >= {"dengine", "created", "golden", "fields"}
+
+
+def test_1503_references_of_1000_samples_stay_under_a_megabyte(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    path = export_torchscript(fitted(make_data(1503, 1000)), tmp_path / "model.ts")
+    assert read_metadata(path)["references"] == 1503
+    assert path.stat().st_size < 1_000_000
+
+
+def test_the_checksum_is_what_sha256sum_reads(file: Path) -> None:
+    content = file.with_name("model.ts.sha256").read_text()
+    assert content == f"{hashlib.sha256(file.read_bytes()).hexdigest()}  model.ts\n"
+
+
+def test_nothing_is_left_of_an_export_that_cannot_be_written(audited: DataEngine, tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="choose a folder that exists"):
+        export_torchscript(audited, tmp_path / "nowhere" / "model.ts")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_loading_unpickles_nothing_in_python(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pickle
+
+    for name in ("load", "loads", "Unpickler"):
+        monkeypatch.setattr(pickle, name, lambda *a, **k: pytest.fail("a pickle was read"))
+    monkeypatch.setattr(torch, "load", lambda *a, **k: pytest.fail("a pickle was read"))
+    load_exported(file)
+
+
+# ------------------------------------------------------------------------------------------------- damage
+
+
+def sum_anew(path: Path) -> None:
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    path.with_name(path.name + ".sha256").write_text(f"{digest}  {path.name}\n")
+
+
+@pytest.fixture
+def copy(file: Path, tmp_path: Path) -> Path:
+    target = tmp_path / "model.ts"
+    target.write_bytes(file.read_bytes())
+    sum_anew(target)
+    return target
+
+
+def damaged(content: bytes, kind: str, rng: np.random.Generator) -> bytes:
+    """One flipped bit, a cut end, or two blocks of 512 bytes exchanged."""
+    if kind == "flip":
+        at = int(rng.integers(len(content)))
+        return content[:at] + bytes([content[at] ^ (1 << int(rng.integers(8)))]) + content[at + 1 :]
+    if kind == "truncation":
+        return content[: int(rng.integers(len(content)))]
+    blocks = [content[i : i + 512] for i in range(0, len(content), 512)]
+    while b"".join(blocks) == content:
+        i, j = rng.integers(len(blocks), size=2)
+        blocks[i], blocks[j] = blocks[j], blocks[i]
+    return b"".join(blocks)
+
+
+@pytest.mark.parametrize("kind", ["flip", "truncation", "swap"])
+def test_every_damaged_file_is_refused(copy: Path, kind: str) -> None:
+    content, rng = copy.read_bytes(), np.random.default_rng(1)
+    for _ in range(20):
+        copy.write_bytes(damaged(content, kind, rng))
+        with pytest.raises(ExportError, match="is damaged or truncated: its SHA-256 is"):
+            load_exported(copy)
+
+
+def test_plain_garbage_with_its_sum_is_refused(copy: Path) -> None:
+    copy.write_bytes(b"no model at all" * 1000)
+    sum_anew(copy)
+    with pytest.raises(ExportError, match=r"is not a dengine export: it holds no dengine\.json"):
+        load_exported(copy)
+
+
+def test_another_zip_with_its_sum_is_refused(copy: Path) -> None:
+    with zipfile.ZipFile(copy, "w") as archive:
+        archive.writestr("holiday.txt", "sand")
+    sum_anew(copy)
+    with pytest.raises(ExportError, match="is not a dengine export"):
+        load_exported(copy)
+
+
+def test_another_torchscript_with_its_sum_is_refused(copy: Path) -> None:
+    torch.jit.save(torch.jit.script(torch.nn.ReLU()), str(copy))
+    sum_anew(copy)
+    with pytest.raises(ExportError, match="is not a dengine export"):
+        load_exported(copy)
+
+
+def test_a_description_without_a_module_is_refused(copy: Path) -> None:
+    description = json.dumps(read_metadata(copy))
+    with zipfile.ZipFile(copy, "w") as archive:
+        archive.writestr("model/extra/dengine.json", description)
+    sum_anew(copy)
+    with pytest.raises(ExportError, match="is no loadable TorchScript"):
+        load_exported(copy)
+
+
+def with_metadata(path: Path, **changes: Any) -> None:
+    """The same module under another description, with its sum."""
+    exported = load_exported(path)
+    torch.jit.save(exported.module, str(path), {"dengine.json": json.dumps(exported.metadata | changes).encode()})
+    sum_anew(path)
+
+
+def test_a_newer_schema_is_refused(copy: Path) -> None:
+    with_metadata(copy, schema=3, dengine="9.0")
+    with pytest.raises(ExportError, match=r"schema 3, written by dengine 9\.0; this one reads up to 2: upgrade"):
+        load_exported(copy)
+
+
+@pytest.mark.parametrize("trace", [{"samples": SAMPLES, "colour": "red"}, {"samples": 99}, None])
+def test_a_description_that_does_not_fit_is_refused(copy: Path, trace: Any) -> None:
+    with_metadata(copy, trace=trace)
+    with pytest.raises(ExportError, match="description"):
+        load_exported(copy)
+
+
+def test_a_machine_that_computes_otherwise_is_told(copy: Path) -> None:
+    golden = read_metadata(copy)["golden"]
+    with_metadata(copy, golden=golden | {"embedding": (np.array(golden["embedding"]) + 0.01).tolist()})
+    with pytest.raises(ExportError, match="does not reproduce its golden embedding"):
+        load_exported(copy)
+
+
+def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
+    with pytest.raises(ExportError, match=r"other\.ts is missing"):
+        load_exported(copy.with_name("other.ts"))
+    copy.with_name("model.ts.sha256").unlink()
+    with pytest.raises(ExportError, match=r"model\.ts\.sha256 is missing"):
+        load_exported(copy)
+
+
+@pytest.mark.parametrize("content", ["", "0" * 64, "not a sum\n"])
+def test_the_sum_of_something_else_is_refused(copy: Path, content: str) -> None:
+    copy.with_name("model.ts.sha256").write_text(content)
+    with pytest.raises(ExportError, match=r"holds no SHA-256 sum|is damaged"):
+        load_exported(copy)
+
+
+# ------------------------------------------------------------------------------------------------- what cannot be exported
+
+
+def fitted(data: Dataset, reducer: Any = "pca", **settings: Any) -> ModelPrediction:
+    classifier = WilsonRadiusClassifier(**{"alpha": 0.1, "lower_bound": 0.9} | settings)
+    return ModelPrediction(reducer, classifier).fit(data.X, data.y)
+
+
+def test_a_reducer_without_a_module_names_the_alternative(data: Dataset, tmp_path: Path) -> None:
+    from sklearn.decomposition import PCA
+
+    with pytest.raises(ExportError, match=r"PCA cannot be scripted: it has no module; use conv, pca"):
+        export_torchscript(fitted(data, PCA(2)), tmp_path / "model.ts")
+
+
+@pytest.mark.parametrize("interval", ["jeffreys", "clopper_pearson"])
+def test_an_interval_without_a_script_names_the_alternative(data: Dataset, tmp_path: Path, interval: str) -> None:
+    with pytest.raises(ExportError, match="use wilson or binomial"):
+        export_torchscript(fitted(data, interval=interval), tmp_path / "model.ts")
+
+
+def test_a_rule_that_missed_a_part_is_not_exported(data: Dataset, tmp_path: Path) -> None:
+    model = fitted(data)
+    model.untold = True
+    with pytest.raises(ExportError, match="missed what became of a part"):
+        export_torchscript(model, tmp_path / "model.ts")
+
+
+def test_nothing_trained_is_nothing_to_export(tmp_path: Path) -> None:
+    with DataEngine("pca") as engine, pytest.raises(ExportError, match="Nothing was trained yet"):
+        export_torchscript(engine, tmp_path / "model.ts")
+    with pytest.raises(ExportError, match="Nothing was trained yet"):
+        export_torchscript(ModelPrediction("pca"), tmp_path / "model.ts")
+    with pytest.raises(ExportError, match="a rival method stays in Python"):
+        export_torchscript(type("Thing", (), {"model": object()})(), tmp_path / "model.ts")
+
+
+# ------------------------------------------------------------------------------------------------- learning in the cell
+
+
+class TwoSpaces(torch.nn.Module):
+    """Mean and height of a trace, in two spaces that differ."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        flat = x.flatten(1)
+        z = torch.stack([flat.mean(1), flat[:, -20:].mean(1)], 1)
+        return torch.stack([z, z.flip(1) * 0.5 + 1.0], 1)
+
+
+class TwoSpacesReducer(Reducer):
+    """A reducer that cross-fits by itself, as the conv reducer does; labels tell it nothing."""
+
+    n_spaces = 2
+
+    def fit(self, X: np.ndarray, y: Any = None) -> "TwoSpacesReducer":
+        return self
+
+    def transform(self, X: np.ndarray) -> np.ndarray:
+        return self.embed(X).mean(axis=1)
+
+    def embed(self, X: np.ndarray) -> np.ndarray:
+        with torch.inference_mode():
+            return self.module()(torch.from_numpy(X)).numpy()
+
+    def module(self) -> torch.nn.Module:
+        return TwoSpaces()
+
+
+def ring_of(exported: ExportedModel) -> dict[str, np.ndarray]:
+    """The references that a module holds."""
+    buffers = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
+    return {
+        "total": buffers["total"],
+        "labels": buffers["labels"],
+        "spaces": buffers["spaces"],
+        "points": buffers["points"],
+    }
+
+
+def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data, new = make_data(120, SAMPLES), make_data(60, SAMPLES, seed=1)
+    model = fitted(data, TwoSpacesReducer())
+    exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
+    for i, (x, y) in enumerate(zip(new.X, new.y, strict=True)):
+        assert exported.learn(x, bool(y)) == 121 + i
+        model.add(x, y)
+    ring = ring_of(exported)
+    np.testing.assert_array_equal(ring["spaces"][120:180], content_fold(new.X, 2))
+    assert set(ring["spaces"][120:180]) == {0, 1}
+    for name, mine in ring.items():
+        np.testing.assert_array_equal(mine, getattr(model.index.ring, name).numpy())
+    other = make_data(100, SAMPLES, seed=2).X
+    known = model.predict_many(other)
+    assert [d[2:6] for d in exported.decide_many(other)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+
+
+def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path: Path) -> None:
+    exported = load_exported(file)
+    before = exported.metadata["references"]
+    for i, x in enumerate(many[:80]):
+        exported.learn(x, i % 3 > 0)
+    again = load_exported(exported.save(tmp_path / "later.ts"))
+    assert again.metadata["references"] == before + 80
+    assert again.metadata["references_sha256"] is None
+    assert [row(d) for d in again.decide_many(many)] == [row(d) for d in exported.decide_many(many)]
+    assert again.learn(many[80], True) == before + 81
+
+
+def test_the_oldest_reference_leaves_first_whatever_its_label(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(30, SAMPLES)
+    orders = []
+    for flip in (0, 1):  # the same traces under opposite labels: the same references must be left
+        model = fitted(Dataset(data.X, data.y ^ flip), capacity=40)
+        exported = load_exported(export_torchscript(model, tmp_path / f"{flip}.ts"))
+        for x, y in zip(make_data(25, SAMPLES, seed=2).X, make_data(25, SAMPLES, seed=2).y, strict=True):
+            held = exported.learn(x, bool(y ^ flip))
+        assert held == 40
+        ring = ring_of(exported)
+        assert int(ring["total"]) == 55
+        orders.append(ring)
+        points = model.index.ring.points.numpy()
+        np.testing.assert_array_equal(ring["points"][:, 15:30], points[:, 15:30])  # the newest of the first ones stay
+        assert (ring["points"][:, :15] != points[:, :15]).any(axis=0).all()  # the oldest fifteen have left
+    np.testing.assert_array_equal(orders[0]["points"], orders[1]["points"])
+    np.testing.assert_array_equal(orders[0]["labels"][1], 1 - orders[1]["labels"][1])
+
+
+def test_a_faulty_trace_is_not_learned_from(file: Path, many: np.ndarray) -> None:
+    exported = load_exported(file)
+    before = exported.metadata["references"]
+    for x in bad_traces(many[0]):
+        assert exported.learn(x, True) == before
+
+
+def test_a_replay_through_the_file_gives_the_engines_decisions_until_its_next_retrain(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data = make_data(900, SAMPLES, noise=20.0)
+    engine = DataEngine.from_recipe(recipe(retrain_every=120, fraction=0.3), seed=3, replaying=True)
+    exported, compared, learned = None, 0, 0
+    with engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            decision = engine.decide(x)
+            if exported is not None:
+                assert row(exported.decide(x)) == row(decision)
+                compared += 1
+            if decision.action is not Action.VERIFY:
+                continue
+            retrained = engine.report(decision.id, bool(y))
+            if exported is not None:
+                if retrained:
+                    break
+                exported.learn(x, bool(y))
+                learned += 1
+            elif retrained:
+                exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
+    assert learned > 50
+    assert compared > learned + 50

@@ -1,0 +1,242 @@
+"""`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from dengine import DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
+from dengine.cli import main
+from dengine.cli.history import WIDEST
+from dengine.cli.output import WIDE
+from dengine.decision.intervals import wilson_interval
+from dengine.history.status import bad_accepts, course, standing
+from dengine.store.records import Outcomes
+
+NOTHING = Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def dengine(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def succeed(*words: object) -> str:
+    result = dengine(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def document(*words: object) -> dict:
+    return json.loads(succeed(*words, "--json"))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine into safe mode."""
+    rng = np.random.default_rng(1)
+    y = rng.random(700) < 0.6
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (700, 40))
+    X[300:400] = 2 * X[300:400] + 8 * np.sin(2 * np.arange(40))
+    X[650, 3] = np.nan
+    y[rng.random(700) < 0.02] ^= True
+    path = tmp_path_factory.mktemp("store") / "engine.db"
+    policy = Policy(alpha=0.2, lower_bound=0.8, guarantee="pooled", stops="all", audit_rate=0.05)
+    part = np.array([f"part-number-{i:05d}" for i in range(700)])
+    data = Dataset(X.astype(np.float32), y.astype(np.int8), name="changing", part=part)
+    with DataEngine("pca", policy, store=str(path), replaying=True) as engine:
+        for _ in engine.run(ReplayCell(data), 700):
+            pass
+    return path
+
+
+# --------------------------------------------------------------------------------------------------------------- history
+
+
+def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(store: Path) -> None:
+    shown = succeed("history", store, "--last", 400, "--events").splitlines()
+    assert max(map(len, shown)) <= WIDEST == 120
+    newest = document("history", store, "--last", 1)["decisions"][0]
+    assert newest["id"] in shown[-1]
+    assert sum("  * retrain to version" in line for line in shown) >= 5
+    assert any("  * safe mode: ended" in line for line in shown)
+    assert len([line for line in shown if newest["id"][:12] in line]) == 400
+
+
+def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
+    for option, value in (("--action", "accept"), ("--reason", "novel"), ("--label", "bad")):
+        found = document("history", store, "--last", 1000, option, value)["decisions"]
+        assert found
+        assert {each[option[2:]] for each in found} == {value}
+    found = document("history", store, "--last", 1000, "--model", "accept", "--action", "verify")["decisions"]
+    assert found
+    assert {(each["predicted"], each["action"]) for each in found} == {("accept", "verify")}
+    assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
+    assert document("history", store, "--since", "2100-01-01")["decisions"] == []
+    assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"
+    assert document("history", store, "--until", "2001-01-01T10:00")["decisions"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--since", "yesterday"], "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'"),
+        (["--action", "pass"], "'pass' is not one of"),
+        (["--reason", "why"], "'why' is not one of"),
+        (["--last", "0"], "0 is not in the range"),
+    ],
+)
+def test_a_wrong_filter_is_a_wrong_call(words: list[str], said: str, store: Path) -> None:
+    result = dengine("history", store, *words)
+    assert result.exit_code == 2
+    assert said in result.stderr
+
+
+# --------------------------------------------------------------------------------------------------------------- explain
+
+
+def ids(store: Path) -> dict[str, str]:
+    """The newest decision of each reason."""
+    return {each["reason"]: each["id"] for each in document("history", store, "--last", 1000)["decisions"]}
+
+
+def test_every_reason_is_explained_in_80_columns_with_a_picture(store: Path, tmp_path: Path) -> None:
+    known = ids(store)
+    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(known)
+    for reason, id_ in known.items():
+        out = tmp_path / f"{reason}.png"
+        shown = succeed("explain", store, id_, "--out", out)
+        assert max(map(len, shown.replace(str(out), "").splitlines())) <= WIDE
+        assert "\u2026" not in shown
+        assert id_ in shown
+        assert out.read_bytes().startswith(b"\x89PNG")
+        assert out.stat().st_size > 20_000
+
+
+def test_an_explanations_document_is_its_record(store: Path) -> None:
+    found = document("explain", store, ids(store)["certain"], "--neighbours", 4)
+    assert found["decision"]["id"] == ids(store)["certain"]
+    assert len(found["neighbours"]) == 4
+    assert all(each["decision_id"] and "trace" not in each for each in found["neighbours"])
+    assert found["bound"]["n_success"] == found["decision"]["n_success"]
+    assert found["envelope"]["largest"] is None or found["envelope"]["largest"] in found["envelope"]["excesses"]
+    assert found["said"][0].endswith("the bound meets the policy.")
+    newest = document("history", store, "--last", 1)["decisions"][0]
+    assert document("explain", store, "last")["decision"] | {"label": newest["label"]} == newest
+
+
+def test_an_unknown_decision_is_one_line_that_says_where_the_ids_are(store: Path) -> None:
+    result = dengine("explain", store, "nonsense")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("Error: Expected the id of a decision of cell 'cell', got 'nonsense'")
+    assert "dengine history" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+# ---------------------------------------------------------------------------------------------------------------- status
+
+
+def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
+    found = document("status", store, "--last", 200)
+    newest, ever = found["doing"]["newest"], found["doing"]["ever"]
+    decisions = document("history", store, "--last", 1000)["decisions"]
+    for span, some in ((newest, decisions[-200:]), (ever, decisions)):
+        assert span["decisions"] == len(some)
+        for name in ("accept", "reject"):
+            assert span[f"{name}ed"] == sum(each["action"] == name for each in some)
+        assert span["verified"] == sum(each["action"] == "verify" for each in some)
+        assert span["novel"] == sum(each["reason"] == "novel" for each in some)
+        assert span["audits"] == sum(each["audit"] for each in some)
+        accepted = [each["label"] for each in some if each["action"] == "accept"]
+        bad, good = accepted.count("bad"), accepted.count("good")
+        lower, upper = wilson_interval(good, bad, 0.2)
+        assert (span["bad_accepts"]["known"], span["bad_accepts"]["bad"]) == (good + bad, bad)
+        assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx((1 - upper, 1 - lower))
+    assert newest["quarantined"] == ever["quarantined"] == 1
+    assert newest["retrains"] < ever["retrains"] == found["retrains"]
+    assert found["doing"]["last"] == 200
+    assert set(found["doing"]["watch"]) == {"accepts", "rejects", "novelty"}
+    assert 0 <= found["waiting"]["new_labels"] <= found["waiting"]["retrain_every"] == 50
+
+
+def test_status_is_a_table_of_80_columns_and_a_picture(store: Path, tmp_path: Path) -> None:
+    out = tmp_path / "status.png"
+    shown = succeed("status", store, "--last", 200, "--out", out)
+    assert max(map(len, shown.replace(str(out), "").splitlines())) <= WIDE
+    for said in ("last 200", "since birth", "labels waiting", "way to an alarm", "of them bad"):
+        assert said in shown
+    assert out.read_bytes().startswith(b"\x89PNG")
+    opened = open_store(store)
+    drawn = course(opened, Recipe.from_toml(opened.settings()["recipe"]), 200)
+    opened.close()
+    assert sum(each.n for each in drawn.stretches) == 700
+    assert len(drawn.modes) >= 2
+
+
+def test_a_store_with_no_decision_yet_is_shown_and_drawn_too(tmp_path: Path) -> None:
+    DataEngine("pca", store=str(tmp_path / "new.db")).close()
+    assert "none was accepted" in succeed("status", tmp_path / "new.db", "--out", tmp_path / "new.png")
+    assert document("status", tmp_path / "new.db")["doing"]["ever"]["verified_share"] is None
+    assert dengine("explain", tmp_path / "new.db", "last").exit_code == 1
+
+
+def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
+    some, every = Policy(alpha=0.1, lower_bound=0.9), Policy(alpha=0.1, lower_bound=0.9, stops="all")
+    silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
+    assert (bad_accepts(silent, some).by, bad_accepts(silent, some).upper, bad_accepts(silent, some).stops) == ("", 1.0, 3)
+    confirmed = Outcomes(50, 3, 47, 0, 0, 0, 0, 0)
+    assert bad_accepts(confirmed, some) == bad_accepts(confirmed, every)
+    assert (bad_accepts(confirmed, every).known, bad_accepts(confirmed, every).bad) == (50, 3)
+    audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
+    assert (bad_accepts(audited, some).by, bad_accepts(audited, some).known) == ("audits", 40)
+    assert bad_accepts(audited, some).verdict == "kept"
+    assert bad_accepts(Outcomes(50, 30, 20, 0, 0, 0, 0, 0), every).verdict == "broken"
+    assert bad_accepts(Outcomes(10, 1, 9, 0, 0, 0, 0, 0), every).verdict == "open"
+    assert bad_accepts(NOTHING, every).upper == 1.0
+
+
+def test_dropped_retrains_are_counted_with_their_reasons(tmp_path: Path) -> None:
+    with DataEngine("pca", store=str(tmp_path / "engine.db")) as engine:
+        engine.decide(np.arange(30.0))
+        engine.flush()
+        engine.retrain()
+        engine.retrain()
+        found = standing(engine.store, engine.recipe)
+        assert found.ever.dropped == {engine.store.retrains()[0].reason: 2}
+        assert found.waiting.verified == 1
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is another signal there")
+def test_watch_redraws_until_ctrl_c_and_ends_cleanly(store: Path) -> None:
+    command = [sys.executable, "-m", "dengine", "status", str(store), "--watch", "0.2"]
+    env = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env) as process:
+        assert process.stdout is not None
+        seen = ""
+        while seen.count("how it is doing") < 2:
+            line = process.stdout.readline()
+            assert line, process.communicate()
+            seen += line
+        process.send_signal(signal.SIGINT)
+        rest, error = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert error == ""
+    assert re.search(r"worst retrain", seen + rest)
+
+
+def test_a_password_is_never_shown() -> None:
+    url = "postgresql+psycopg://me:secret%40x@host:5432/cells"
+    for words in (("history", url), ("explain", url, "last"), ("status", url)):
+        result = dengine(*(word.replace("host:5432", "127.0.0.1:1") for word in words))
+        assert result.exit_code == 1
+        assert "secret" not in result.output + result.stderr
+
+
+def test_watch_and_json_exclude_each_other(store: Path) -> None:
+    assert dengine("status", store, "--watch", "--json").exit_code == 2

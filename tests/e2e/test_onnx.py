@@ -1,0 +1,137 @@
+"""The ONNX twin decides as the model does, says what it cannot carry, and is refused where it must not be used."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+
+from dengine import (  # after the skips
+    Dataset,
+    ModelPrediction,
+    Policy,
+    Recipe,
+    TraceSpec,
+    WilsonRadiusClassifier,
+    export_torchscript,
+)
+from dengine.decision.rule import DecisionRule
+from dengine.engine.engine import DataEngine
+from dengine.errors import ExportError, TraceError
+from dengine.export.onnx import export_onnx, load_onnx
+from dengine.export.torchscript import load_exported
+from dengine.records import Action, Reason
+
+SPEC = TraceSpec(100, limit=500.0)
+BALLS: list[dict[str, Any]] = [
+    {},
+    {"interval": "binomial", "fraction": 0.3},
+    {"fraction": 0.3, "reject_fraction": 0.08},
+]
+
+
+def fitted(data: Dataset, **settings: Any) -> ModelPrediction:
+    classifier = WilsonRadiusClassifier(**{"alpha": 0.1, "lower_bound": 0.9} | settings)
+    return ModelPrediction("pca", classifier).fit(data.X, data.y)
+
+
+@pytest.fixture(scope="module")
+def file(make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export_onnx(fitted(make_data(300)), tmp_path_factory.mktemp("onnx") / "model.onnx", trace=SPEC)
+
+
+@pytest.mark.parametrize("ball", BALLS)
+def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: Path, ball: dict[str, Any]) -> None:
+    model = fitted(make_data(300), **ball)
+    one = load_onnx(export_onnx(model, tmp_path / "model.onnx", trace=SPEC))
+    two = load_exported(export_torchscript(model, tmp_path / "model.ts", trace=SPEC))
+    bad = make_data(5, seed=1).X
+    bad[0, 3], bad[1, 5], bad[2, 0], bad[3], bad[4] = np.nan, -np.inf, 1e30, 2.5, np.nan
+    novel = 3.0 * make_data(50, seed=8).X
+    X = np.concatenate([make_data(200, seed=9).X, make_data(50, seed=7, noise=3.0).X, novel, bad])
+    for found, expected in zip(one.decide_many(X), two.decide_many(X), strict=True):
+        assert found[:2] == expected[:2]
+        assert found[2:4] == pytest.approx(expected[2:4], abs=1e-6)
+        assert found[4:6] == expected[4:6]
+        np.testing.assert_allclose(found.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
+    assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {d.reason for d in one.decide_many(bad)}
+    assert {d.reason for d in one.decide_many(novel)} == {Reason.NOVEL}
+    assert Action.ACCEPT in {d.action for d in one.decide_many(X)}
+
+
+def test_audits_are_refused_with_the_reason(data: Dataset, tmp_path: Path) -> None:
+    recipe = Recipe(reducer="pca", policy=Policy(audit_rate=0.1), retrain_every=1000)
+    with DataEngine.from_recipe(recipe, replaying=True) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+        with pytest.raises(ExportError, match="ONNX carries no audits"):
+            export_onnx(engine, tmp_path / "model.onnx")
+
+
+class OwnRule(DecisionRule):
+    """A rule of the user's own; the twin cannot know what it does."""
+
+
+@pytest.mark.parametrize(
+    ("rule", "name"),
+    [
+        (Policy(guarantee="pooled").rule(), "PooledRule"),
+        (Policy(stops="all").rule(), "WatchedRule"),
+        (OwnRule(0.1, 0.9), "OwnRule"),
+    ],
+)
+def test_a_rule_that_learns_is_refused(data: Dataset, tmp_path: Path, rule: DecisionRule, name: str) -> None:
+    model = ModelPrediction("pca", rule=rule).fit(data.X, data.y)
+    with pytest.raises(ExportError, match=f"ONNX carries no {name}, a rule that learns; export torchscript"):
+        export_onnx(model, tmp_path / "model.onnx")
+
+
+def test_parts_that_came_again_are_refused(data: Dataset, tmp_path: Path) -> None:
+    hashes = np.arange(1, len(data) + 1)
+    hashes[7] = hashes[3]
+    model = ModelPrediction("pca").fit(data.X, data.y, hashes=hashes)
+    with pytest.raises(ExportError, match="ONNX carries no votes: 1 of the references"):
+        export_onnx(model, tmp_path / "model.onnx")
+
+
+def test_an_interval_without_a_module_is_refused(data: Dataset, tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="use wilson or binomial"):
+        export_onnx(fitted(data, interval="jeffreys"), tmp_path / "model.onnx")
+
+
+def test_a_missing_package_names_the_extra(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object())
+    with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
+        export_onnx(fitted(data), tmp_path / "model.onnx")
+
+
+def test_the_file_says_what_it_is(file: Path) -> None:
+    metadata = load_onnx(file).metadata
+    assert metadata["format"] == "onnx"
+    assert metadata["learns"] is False
+    assert metadata["references"] == 300
+
+
+def test_a_damaged_file_and_a_foreign_one_are_refused(file: Path, tmp_path: Path) -> None:
+    copy, content = tmp_path / "model.onnx", file.read_bytes()
+    total = copy.with_name("model.onnx.sha256")
+    total.write_text(hashlib.sha256(content).hexdigest())
+    copy.write_bytes(content[:-9])
+    with pytest.raises(ExportError, match="is damaged or truncated"):
+        load_onnx(copy)
+    total.write_text(hashlib.sha256(b"garbage").hexdigest())
+    copy.write_bytes(b"garbage")
+    with pytest.raises(ExportError, match="is not a dengine export in ONNX"):
+        load_onnx(copy)
+
+
+def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
+    with pytest.raises(TraceError, match="Expected 100 samples, got 98"):
+        load_onnx(file).decide(np.ones(98))

@@ -1,0 +1,120 @@
+"""dengine-onnx decides by files in ONNX as Python does, without libtorch, and refuses what it must not use."""
+
+import os
+import shutil
+import subprocess
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnxscript")
+
+from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dataset  # after the skips
+from dengine.export import export_onnx, load_onnx, make_key
+from dengine.records import Action, Reason
+
+
+def library() -> Path:
+    """onnxruntime's shared library, as its package for Python brings it."""
+    found = find_spec("onnxruntime")
+    assert found is not None
+    assert found.origin is not None
+    names = sorted((Path(found.origin).parent / "capi").glob("libonnxruntime.so*"))
+    if not names:
+        pytest.skip("this onnxruntime brings no shared library of its own")
+    return names[0]
+
+
+@pytest.fixture(scope="module")
+def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A model of the bundled data, and the key that it was signed with."""
+    data, folder = load_dataset("insertion"), tmp_path_factory.mktemp("onnx")
+    classifier = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9, fraction=0.05)
+    model = ModelPrediction("pca", classifier).fit(data.X[:700], data.y[:700])
+    key = make_key(folder / "cell.key")
+    return export_onnx(model, folder / "model.onnx", trace=TraceSpec(1000, limit=500.0), key=key), key
+
+
+def decide(
+    programs: Path, *arguments: Any, stdin: bytes = b"", code: int = 0, runtime: Any = None
+) -> tuple[list[list[str]], str]:
+    env = os.environ | {"DENGINE_ONNXRUNTIME": str(library() if runtime is None else runtime)}
+    command = [str(programs / "dengine-onnx"), *map(str, arguments)]
+    done = subprocess.run(command, input=stdin, capture_output=True, check=False, env=env, timeout=120)
+    assert done.returncode == code, done.stderr
+    return [line.split(",") for line in done.stdout.decode().splitlines()], done.stderr.decode()
+
+
+def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_ones(
+    programs: Path, signed: tuple[Path, Path]
+) -> None:
+    file, key = signed
+    X = load_dataset("insertion").X[700:1000].copy()
+    X[0, 3], X[1, 5], X[2, 0], X[3], X[4] = np.nan, -np.inf, 1e30, 2.5, X[4] * 9.0
+    expected = load_onnx(file, key=key).decide_many(X)
+    lines = [f"decide P{i} {','.join(map(str, x))}" for i, x in enumerate(X)]
+    asked, _ = decide(programs, file, "--key", key, stdin="\n".join(lines).encode())
+    plain, _ = decide(programs, file, "--binary", stdin=X.astype(np.float32).tobytes())
+    assert [words[0] for words in asked] == ["-"] * len(X)  # no label of it can come
+    for found in ([words[1:] for words in asked], plain):
+        for words, decision in zip(found, expected, strict=True):
+            assert words[:2] == [str(decision.action), str(decision.reason)]
+            assert list(map(float, words[2:4])) == pytest.approx([decision.lower, decision.upper], abs=1e-12)
+            assert list(map(int, words[4:6])) == [decision.n_success, decision.n_failure]
+            np.testing.assert_allclose(list(map(float, words[6:8])), decision.embedding[0], rtol=1e-6)
+    assert {d.action for d in expected} >= {Action.ACCEPT, Action.VERIFY}
+    bad = {Reason.NOT_FINITE, Reason.SATURATED, Reason.CONSTANT}
+    assert bad <= {d.reason for d in expected}
+
+
+def test_it_learns_nothing_and_says_so(programs: Path, signed: tuple[Path, Path], tmp_path: Path) -> None:
+    found, _ = decide(programs, signed[0], stdin=b"label x-1 1\nstop x-1\ndecide 1,2\n", code=1)
+    assert found[0] == ["error a model in ONNX learns nothing; export TorchScript"] == found[1]
+    assert found[2][:3] == ["-", "verify", "malformed"]
+    assert "learns nothing" in decide(programs, signed[0], "--journal", tmp_path / "cell.csv", code=1)[1]
+    assert "learns nothing" in decide(programs, signed[0], "--learn", code=1)[1]
+
+
+@pytest.mark.parametrize("kind", ["flip", "foreign", "no sum", "unsigned", "another key", "no library", "no onnxruntime"])
+def test_what_must_not_be_used_is_refused(programs: Path, signed: tuple[Path, Path], tmp_path: Path, kind: str) -> None:
+    for name in ("model.onnx", "model.onnx.sha256", "model.onnx.sig"):
+        shutil.copy(signed[0].with_name(name), tmp_path / name)
+    file, key, runtime = tmp_path / "model.onnx", signed[1], None
+    if kind == "flip":
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+    elif kind == "foreign":
+        from dengine.export.bundle import write_export
+        from dengine.files import ONNX
+
+        write_export(file, b"garbage", ONNX, key=key)
+    elif kind == "no sum":
+        file.with_name("model.onnx.sha256").unlink()
+    elif kind == "unsigned":
+        file.with_name("model.onnx.sig").unlink()
+    elif kind == "another key":
+        key = make_key(tmp_path / "other.key")
+    elif kind == "no library":
+        runtime = tmp_path / "nothing.so"
+    else:
+        runtime = "libm.so.6"
+    expected = {
+        "flip": "its signature is not one by this key",
+        "foreign": "no loadable ONNX",
+        "no sum": "copied together",
+        "unsigned": "the file is not signed",
+        "another key": "its signature is not one by this key",
+        "no library": "name it in DENGINE_ONNXRUNTIME",
+        "no onnxruntime": "is no onnxruntime",
+    }
+    lines, said = decide(programs, file, "--key", key, stdin=b"decide 1,2\n", code=1, runtime=runtime)
+    assert lines == []
+    assert expected[kind] in said
+    if kind == "flip":  # by its sum as well
+        assert "it is damaged or truncated" in decide(programs, file, code=1)[1]

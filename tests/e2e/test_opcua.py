@@ -1,0 +1,519 @@
+"""OPC UA by a real client: what a PLC calls, what a SCADA reads, and what strangers get."""
+
+import asyncio
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.errors import SettingError
+from dengine.serve.service import CellService
+
+pytest.importorskip("asyncua", reason="OPC UA needs the extra `opcua`")
+Client, ua = (getattr(pytest.importorskip("asyncua"), name) for name in ("Client", "ua"))
+opcua = pytest.importorskip("dengine.serve.opcua")
+limits = pytest.importorskip("dengine.serve.opcua")
+from asyncua.common.connection import SecureConnection, TransportLimits  # not before it is known to be there
+from asyncua.crypto.security_policies import SecurityPolicyNone
+from asyncua.ua.ua_binary import struct_to_binary
+
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
+VERIFY, ACCEPT = 0, 1
+FLOAT, TEXT, COUNT = ua.VariantType.Float, ua.VariantType.String, ua.VariantType.UInt32
+
+
+@pytest.fixture(scope="module")
+def stream(make_data) -> Dataset:
+    return make_data(120, samples=60, seed=3)
+
+
+@pytest.fixture(scope="module")
+def loop() -> Iterator[asyncio.AbstractEventLoop]:
+    with asyncio.Runner() as runner:
+        yield runner.get_loop()
+
+
+class Plant:
+    """A cell, its OPC UA server, and a PLC that is connected to it."""
+
+    def __init__(self, service: CellService, server: Any, client: Any) -> None:
+        self.service, self.server, self.client = service, server, client
+
+    async def look(self) -> None:
+        self.index = await self.client.get_namespace_index(opcua.NAMESPACE)
+        self.cell = self.node("Cell")
+
+    def node(self, name: str) -> Any:
+        return self.client.get_node(ua.NodeId(name, self.index))
+
+    async def value(self, name: str) -> Any:
+        return (await self.read(name)).Value.Value
+
+    async def read(self, name: str) -> Any:
+        return await self.node(f"Cell.{name}").read_data_value(raise_on_bad_status=False)
+
+    async def decisions(self) -> int:
+        await self.service.ask(lambda engine: engine.flush())
+        return self.service.reading.status()["decisions"]
+
+    async def until(self, name: str, fits: Callable[[Any], bool]) -> Any:
+        async with asyncio.timeout(60):
+            while not fits(value := await self.value(name)):
+                await asyncio.sleep(0.05)
+        return value
+
+    async def decide(self, trace: np.ndarray, request: str = "", part: str = "", channels: int = 1) -> list[Any]:
+        arguments = (trace.ravel().tolist(), FLOAT), (channels, COUNT), (request, TEXT), (part, TEXT)
+        return await self.call("Decide", *(ua.Variant(*each) for each in arguments))
+
+    async def learn(self, data: Dataset) -> None:
+        """Have a version answer, whichever test came before."""
+        for i in range(len(data)):
+            if self.service.engine.version:
+                return
+            action, id_, *_ = await self.decide(data.X[i], f"learn-{i}")
+            if action == VERIFY:
+                await self.report(id_, bool(data.y[i]))
+
+    async def report(self, id_: str, success: bool) -> bool:
+        return await self.call("Report", ua.Variant(id_, TEXT), ua.Variant(success))
+
+    async def call(self, name: str, *arguments: Any) -> Any:
+        return await self.cell.call_method(self.node(f"Cell.{name}").nodeid, *arguments)
+
+
+@asynccontextmanager
+async def running(service: CellService, **options: Any) -> AsyncIterator[Plant]:
+    async with (
+        opcua.opcua_server(service, port=0, **options) as server,
+        Client(f"opc.tcp://127.0.0.1:{server.port}/dengine") as client,
+    ):
+        plant = Plant(service, server, client)
+        await plant.look()
+        yield plant
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellService]:
+    file = tmp_path_factory.mktemp("cell") / "cell.db"
+    made = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def plant(service: CellService, stream: Dataset, loop: asyncio.AbstractEventLoop) -> Iterator[Plant]:
+    made = running(service)
+    plant = loop.run_until_complete(made.__aenter__())
+    yield plant
+    loop.run_until_complete(made.__aexit__(None, None, None))
+
+
+@pytest.fixture
+def run(loop: asyncio.AbstractEventLoop) -> Callable[[Coroutine[Any, Any, Any]], Any]:
+    return loop.run_until_complete
+
+
+def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, stream: Dataset, run) -> None:
+    async def cell() -> None:
+        actions = []
+        for i, (x, good) in enumerate(zip(stream.X, stream.y, strict=True)):
+            action, id_, _, lower, upper, version = await plant.decide(x, f"order-{i}", f"P{i}")
+            assert (id_, 0.0 <= lower <= upper <= 1.0) == (f"order-{i}", True)
+            actions.append(action)
+            if action == VERIFY:
+                assert await plant.report(id_, bool(good)) is True
+        assert ACCEPT in actions
+        assert await plant.until("Decisions", lambda n: n == len(actions)) == len(actions)
+        assert await plant.value("Accepted") == actions.count(ACCEPT)
+        assert await plant.value("ModelVersion") == version >= 1
+        assert await plant.value("VerifiedShare") == actions.count(VERIFY) / len(actions)
+        assert (await plant.value("SafeMode"), await plant.value("Shadow")) == (False, False)
+        known = await plant.service.find("order-7")
+        assert (known.part, np.array_equal(known.trace[0], stream.X[7])) == ("P7", True)
+
+    run(cell())
+
+
+def test_the_variables_are_of_their_types_described_and_read_only(plant: Plant, run) -> None:
+    async def scada() -> None:
+        for name, (type_, _, text) in opcua.VARIABLES.items():
+            node = plant.node(f"Cell.{name}")
+            assert await node.read_data_type_as_variant_type() is type_, name
+            assert (await node.read_data_value()).Value.VariantType is type_, name
+            assert (await node.read_description()).Text == text
+            with pytest.raises(ua.UaStatusCodeError):
+                await node.write_value(await node.read_value())
+        with pytest.raises(ua.UaStatusCodeError):
+            await plant.client.nodes.objects.add_folder(plant.index, "mine")
+
+    run(scada())
+
+
+def test_the_methods_say_what_they_take_and_give(plant: Plant, run) -> None:
+    async def plc() -> None:
+        for method, (taken, given) in (("Decide", opcua.DECIDE), ("Report", opcua.REPORT)):
+            for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
+                node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
+                said = [(each.Name, each.DataType.Identifier, each.ValueRank) for each in await node.read_value()]
+                assert said == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
+
+    run(plc())
+
+
+def test_a_request_that_is_asked_again_has_the_same_answer(plant: Plant, stream: Dataset, run) -> None:
+    async def plc() -> None:
+        first = await plant.decide(stream.X[0], "again")
+        assert await plant.decide(stream.X[0], "again") == first
+        with pytest.raises(ua.uaerrors.BadInvalidArgument):
+            await plant.decide(stream.X[1], "again")
+        assert "got another" in await plant.value("LastRefused")
+        assert await plant.report("unheard of", True) is False
+        assert await plant.report("", True) is False  # as the id of a decision that was not recorded
+
+    run(plc())
+
+
+def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
+    trace, one, none = ua.Variant([1.0] * 60, FLOAT), ua.Variant(1, COUNT), ua.Variant("", TEXT)
+    bad, few, many = ua.uaerrors.BadInvalidArgument, ua.uaerrors.BadArgumentsMissing, ua.uaerrors.BadTooManyArguments
+    return [
+        ("Decide", (), few),
+        ("Decide", (trace, one, none), few),
+        ("Decide", (trace, one, none, none, none), many),
+        ("Decide", (ua.Variant([1.0] * 60, ua.VariantType.Double), one, none, none), bad),
+        ("Decide", (ua.Variant(1.0, FLOAT), one, none, none), bad),
+        ("Decide", (ua.Variant(["1"], TEXT), one, none, none), bad),
+        ("Decide", (ua.Variant([], FLOAT, is_array=True), one, none, none), bad),
+        ("Decide", (trace, ua.Variant(0, COUNT), none, none), bad),
+        ("Decide", (trace, ua.Variant(7, COUNT), none, none), bad),
+        ("Decide", (trace, ua.Variant(2, COUNT), none, none), bad),  # two channels of a cell of one
+        ("Decide", (ua.Variant([1.0] * 10, FLOAT), one, none, none), bad),
+        ("Decide", (trace, one, ua.Variant("a\nb", TEXT), none), bad),
+        ("Decide", (trace, one, none, ua.Variant("x" * 500, TEXT)), bad),
+        ("Report", (ua.Variant("a\nb", TEXT), ua.Variant(True)), bad),
+        ("Report", (ua.Variant("order-1", TEXT), ua.Variant(1, ua.VariantType.Int32)), bad),
+        ("Report", (ua.Variant("order-1", TEXT),), few),
+    ]
+
+
+@pytest.mark.parametrize(("method", "arguments", "status"), wrong_calls(), ids=range(16))
+def test_a_wrong_call_is_a_bad_status_and_says_why(
+    plant: Plant, run, method: str, arguments: tuple[Any, ...], status: type
+) -> None:
+    async def plc() -> None:
+        before = await plant.decisions()
+        with pytest.raises(status):
+            await plant.call(method, *arguments)
+        assert (await plant.value("LastRefused")).startswith("Expected ")
+        assert await plant.decisions() == before
+
+    run(plc())
+
+
+def test_bad_samples_are_verified_and_not_refused(plant: Plant, stream: Dataset, run) -> None:
+    async def plc() -> None:
+        for i, odd in enumerate((float("nan"), float("inf"))):
+            action, _, reason, *_ = await plant.decide(np.r_[odd, stream.X[0][1:]], f"odd-{i}")
+            assert (action, reason) == (VERIFY, "not_finite")
+
+    run(plc())
+
+
+def test_what_fails_in_the_server_says_nothing_of_it(plant: Plant, stream: Dataset, run, monkeypatch) -> None:
+    def broken(*args: object) -> None:
+        raise KeyError("secret")
+
+    async def plc() -> None:
+        with pytest.raises(ua.uaerrors.BadInternalError):
+            await plant.decide(stream.X[0])
+        assert "secret" not in await plant.value("LastRefused")
+
+    monkeypatch.setattr(plant.service, "decide", broken)
+    run(plc())
+
+
+def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset, run, monkeypatch) -> None:
+    heard: asyncio.Queue[Any] = asyncio.Queue()
+
+    class Listener:
+        def event_notification(self, event: Any) -> None:
+            heard.put_nowait(event)
+
+    async def scada() -> None:
+        subscription = await plant.client.create_subscription(50, Listener())
+        await subscription.subscribe_events()
+        await plant.service.ask(lambda engine: engine.set_shadow(True, "the operator"))
+        assert await plant.until("Shadow", bool)
+        await plant.service.ask(lambda engine: engine.set_shadow(False, "the operator"))
+        assert not await plant.until("Shadow", lambda on: not on)
+        await plant.learn(stream)
+        monkeypatch.setattr(plant.service.engine._versions.answering, "predict_one", None)
+        await plant.decide(-stream.X[0])
+        assert await plant.until("Alarm", bool)
+        event = await asyncio.wait_for(heard.get(), 60)
+        assert (event.Severity, event.SourceName) == (opcua.ALARM, "Cell")
+        assert event.Message.Text == await plant.value("AlarmText") == "The model failed on 1 of the newest decisions."
+
+    run(scada())
+
+
+def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(plant: Plant, run, monkeypatch) -> None:
+    async def scada() -> None:
+        before = await plant.value("Decisions")
+        monkeypatch.setattr(opcua, "overview", away)
+        await status(ua.StatusCodes.UncertainLastUsableValue)
+        assert await plant.value("Decisions") == before
+        monkeypatch.undo()
+        await status(ua.StatusCodes.Good)
+        assert await plant.value("Decisions") == before
+
+    async def status(wanted: int) -> None:
+        async with asyncio.timeout(60):
+            while (await plant.read("Decisions")).StatusCode.value != wanted:
+                await plant.service.ask(lambda engine: None)
+                await asyncio.sleep(0.05)
+
+    async def away(service: CellService) -> None:
+        raise RuntimeError("the store is away")
+
+    run(scada())
+
+
+def message(body: bytes, kind: bytes = b"MSGF") -> bytes:
+    return kind + struct.pack("<I", len(body) + 8) + body
+
+
+HELLO = message(struct.pack("<5I", 0, 65535, 65535, 0, 0) + struct.pack("<i", 20) + b"opc.tcp://x/dengine/", b"HELF")
+
+
+CODES = ua.StatusCodes
+REFUSED = {  # what is sent, and why the server hangs up
+    "HTTP": (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", CODES.BadTcpMessageTypeInvalid),
+    "nulls": (b"\0" * 5000, CODES.BadTcpMessageTypeInvalid),
+    "one byte": (b"\x16", CODES.BadTcpMessageTypeInvalid),
+    "an answer's type": (message(b"x" * 20, b"ACKF"), CODES.BadTcpMessageTypeInvalid),
+    "a part of hello": (HELLO.replace(b"HELF", b"HELC"), CODES.BadTcpMessageTypeInvalid),
+    "a long hello": (b"HELF" + struct.pack("<I", 2**32 - 1) + b"x" * 100, CODES.BadTcpMessageTooLarge),
+    "a long message": (b"MSGF" + struct.pack("<I", 2**31) + b"x" * 100, CODES.BadTcpMessageTooLarge),
+    "a message of more than is taken": (HELLO + message(b"x" * limits.CHUNK), CODES.BadTcpMessageTooLarge),
+    "a length that is none": (HELLO + b"OPNF" + struct.pack("<3I", 4, 0, 0), CODES.BadDecodingError),
+    "an empty message": (HELLO + message(b"1234"), CODES.BadDecodingError),
+    "an empty hello": (message(b"", b"HELF"), CODES.BadDecodingError),
+    "half a hello": (HELLO[:20], CODES.BadTimeout),
+    "half a head": (HELLO + b"OPN", CODES.BadTimeout),
+    "hello alone": (HELLO, CODES.BadTimeout),
+    "no buffer": (message(struct.pack("<5Ii", 0, 100, 65535, 0, 0, -1), b"HELF"), CODES.BadInvalidArgument),
+    "half of hello's fields": (message(b"1234", b"HELF"), CODES.BadDecodingError),
+    "no channel's opening": (HELLO + message(b"\x01" * 200, b"OPNF"), CODES.BadDecodingError),
+    "no security": (HELLO + message(b"\xff" * 200, b"OPNF"), CODES.BadSecurityChecksFailed),
+    "no channel": (HELLO + message(bytes(200)), CODES.BadTcpSecureChannelUnknown),
+    "no channel to close": (HELLO + message(bytes(200), b"CLOF"), CODES.BadTcpSecureChannelUnknown),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_message_is_told_why_and_ends_its_connection_and_no_other(
+    plant: Plant, run, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    sent, code = REFUSED[name]
+    monkeypatch.setattr(limits, "GREETING", 0.2)
+    monkeypatch.setattr(plant.server.iserver, "max_pending_activation_seconds", 0.3)
+
+    async def stranger() -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", plant.server.port)
+        writer.write(sent)
+        said = b""
+        async with asyncio.timeout(60):
+            while piece := await reader.read(1000):
+                said += piece
+        writer.close()
+        assert told(said) == (code, ua.StatusCode(code).doc)
+        assert await plant.value("ModelVersion") == plant.service.engine.version
+
+    run(stranger())
+
+
+def told(said: bytes) -> tuple[int, str]:
+    """The code and the reason of the ERR message that is the last of what was said, as OPC UA Part 6, 7.1.2.5, has it."""
+    error = said[said.index(b"ERRF") :]
+    size, code, length = struct.unpack("<IIi", error[4:16])
+    assert (size, length) == (len(error), len(error) - 16)
+    return code, error[16:].decode()
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ((0, b"MSGC"), CODES.BadTimeout),  # a part, and no other follows
+        ((8, b"\xff" * 4), CODES.BadTcpSecureChannelUnknown),
+        ((12, b"\xff" * 4), CODES.BadSecurityChecksFailed),  # the channel's token
+        ((16, b"\xff" * 4), CODES.BadSecurityChecksFailed),  # the sequence's number
+        ((24, b"\x09"), CODES.BadDecodingError),  # what the message is, as a number of no kind
+        ((28, b"\x03" * 4), CODES.BadDecodingError),  # whose session, as a text that goes on beyond the message
+    ],
+    ids=["a part", "the channel", "the token", "the sequence", "the kind", "the session"],
+)
+def test_what_does_not_fit_its_channel_is_told_so(
+    plant: Plant, run, monkeypatch: pytest.MonkeyPatch, change: tuple[int, bytes], code: int
+) -> None:
+    monkeypatch.setattr(limits, "GREETING", 0.2)
+    at, bytes_ = change
+
+    async def stranger() -> None:
+        async with channel(plant.server.port) as (said, reader, writer):
+            asked = said.message_to_binary(struct_to_binary(ua.GetEndpointsRequest()), request_id=2)
+            writer.write(asked[:at] + bytes_ + asked[at + len(bytes_) :])
+            assert told(await reader.read())[0] == code
+
+    run(stranger())
+
+
+def test_a_message_of_too_many_parts_is_told_so(plant: Plant, run) -> None:
+    async def stranger() -> None:
+        async with channel(plant.server.port) as (said, reader, writer):
+            writer.write(said.message_to_binary(bytes(limits.MOST + 1), request_id=2))
+            assert told(await reader.read())[0] == CODES.BadRequestTooLarge
+
+    run(stranger())
+
+
+@asynccontextmanager
+async def channel(port: int) -> AsyncIterator[tuple[Any, asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A channel without security: what makes its messages, and the connection."""
+    made = SecureConnection(SecurityPolicyNone(), TransportLimits())
+    opening = ua.OpenSecureChannelRequest()
+    opening.Parameters.SecurityMode = ua.MessageSecurityMode.None_
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with asyncio.timeout(60):
+        writer.write(HELLO + made.message_to_binary(struct_to_binary(opening), ua.MessageType.SecureOpen, 1))
+        for _ in range(2):  # an acknowledgement, and the channel
+            head = await reader.readexactly(8)
+            rest = await reader.readexactly(int.from_bytes(head[4:], "little") - 8)
+        made.security_token.ChannelId, made.security_token.TokenId = int.from_bytes(rest[:4], "little"), 13
+        yield made, reader, writer
+    writer.close()
+
+
+def test_one_connection_too_many_is_told_so(plant: Plant, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plant.server.iserver, "max_connections", 1)
+
+    async def stranger() -> bytes:
+        reader, writer = await asyncio.open_connection("127.0.0.1", plant.server.port)
+        async with asyncio.timeout(60):
+            said = await reader.read()
+        writer.close()
+        return said
+
+    assert told(run(stranger()))[0] == CODES.BadTcpNotEnoughResources
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        struct.pack("<Bi", 0x80, 2**31 - 1),  # nulls
+        struct.pack("<Bii", 0x80 | 12, 2**31 - 1, -4),  # texts of a length that goes back
+        struct.pack("<Bi", 0x80 | 24, 2**31 - 1),  # variants
+        struct.pack("<Bi", 0x80 | 10, 2**31 - 1),  # floats
+        struct.pack("<Bi", 0x80 | 10, -7),
+    ],
+    ids=["nulls", "texts", "variants", "floats", "fewer than none"],
+)
+def test_a_short_message_cannot_ask_for_much(value: bytes) -> None:
+    from asyncua.common.utils import Buffer
+    from asyncua.ua.ua_binary import variant_from_binary
+
+    limits.harden()
+    with pytest.raises((ua.UaError, struct.error)):
+        variant_from_binary(Buffer(value))
+
+
+def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService, run) -> None:
+    async def serve(**options: Any) -> None:
+        async with opcua.opcua_server(service, port=0, **options):
+            raise AssertionError("it must not be served")
+
+    for options in ({}, {"token": "a token"}, {"cert": "c.pem", "key": "k.pem"}):
+        with pytest.raises(SettingError, match="a token, a certificate and a key"):
+            run(serve(host="0.0.0.0", **options))
+
+
+def test_the_page_lists_every_variable_as_it_is() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    for name, (type_, _, text) in opcua.VARIABLES.items():
+        assert f"| `Cell.{name}` | {type_.name} | {text} |" in page
+
+
+def test_a_port_in_use_is_an_error(service: CellService, run) -> None:
+    async def serve(port: int) -> None:
+        async with opcua.opcua_server(service, port=port):
+            raise AssertionError("it must not be served")
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(OSError, match="address already in use"):
+            run(serve(taken.getsockname()[1]))
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import rsa
+
+    key = rsa.generate_private_key(65537, 2048)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "dengine")])
+    now = datetime.now(UTC)
+    made = x509.CertificateBuilder(name, name, key.public_key(), 1, now - timedelta(days=1), now + timedelta(days=2))
+    others = [x509.UniformResourceIdentifier("urn:dengine:server"), x509.DNSName("localhost")]
+    signed = made.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(key, hashes.SHA256())
+    folder = tmp_path_factory.mktemp("certificate")
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    (folder / "cert.pem").write_bytes(signed.public_bytes(pem))
+    (folder / "key.pem").write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    return folder / "cert.pem", folder / "key.pem"
+
+
+def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
+    service: CellService, certificate: tuple[Path, Path], run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cert, key = certificate
+    encrypted = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
+
+    async def connect(port: int, security: str | None, user: str, password: str) -> int:
+        client = Client(f"opc.tcp://127.0.0.1:{port}/dengine")
+        client.application_uri = "urn:dengine:server"
+        if security:
+            await client.set_security_string(security)
+        if user:
+            client.set_user(user)
+            client.set_password(password)
+        async with client:
+            index = await client.get_namespace_index(opcua.NAMESPACE)
+            return await client.get_node(ua.NodeId("Cell.ModelVersion", index)).read_value()
+
+    async def visitors() -> None:
+        async with opcua.opcua_server(service, 0, "127.0.0.1", "s3cret", cert, key) as server:
+            assert await connect(server.port, encrypted, "dengine", "s3cret") == service.engine.version
+            for security, user, password in (
+                (encrypted, "dengine", "wrong"),
+                (encrypted, "admin", "s3cret"),
+                (encrypted, "", ""),
+                (None, "dengine", "s3cret"),
+            ):
+                with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
+                    await connect(server.port, security, user, password)
+            # A client that does not care for what the server's endpoints are gets no session either.
+            monkeypatch.setattr(Client, "find_endpoint", staticmethod(lambda endpoints, *wanted: endpoints[0]))
+            with pytest.raises(ua.uaerrors.BadUserAccessDenied):
+                await connect(server.port, None, "dengine", "s3cret")
+
+    run(visitors())

@@ -1,0 +1,589 @@
+"""The server over HTTP, by a real uvicorn and a real client: what it takes, what it refuses, what it remembers."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
+for name in ("starlette", "prometheus_client", "defusedxml", "jinja2", "sse_starlette"):
+    pytest.importorskip(name)
+httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not installed: pip install httpx")
+msgpack = pytest.importorskip("msgpack")
+jsonschema = pytest.importorskip("jsonschema")
+
+import uvicorn  # not before it is known to be there
+
+from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.cli import main
+from dengine.errors import SettingError
+from dengine.serve import http as http_routes
+from dengine.serve.auth import Access
+from dengine.serve.connections import limited
+from dengine.serve.http import create_app
+from dengine.serve.server import CellServer, Serving, uvicorn_options
+from dengine.serve.service import CellService
+
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
+TOKEN = "correct-horse-battery-staple"
+RAW, MSGPACK, PROBLEM = "application/octet-stream", "application/msgpack", "application/problem+json"
+SAMPLES = 60
+REPO = Path(__file__).resolve().parents[2]
+Client = Any
+
+
+@contextmanager
+def running(
+    service: CellService, access: Access | None = None, interfaces: tuple[str, ...] = ("http",), **limits: Any
+) -> Iterator[Client]:
+    """A client of a server in front of this service."""
+    app, begun = create_app(service, access or Access(rate=0.0), interfaces), threading.Event()
+    options = uvicorn_options(Serving()) | {"http": limited(**{"connections": 100} | limits)}
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        server = CellServer(uvicorn.Config(app, **options), service, begun.set)
+        thread = threading.Thread(target=server.run, args=([listening],))
+        thread.start()
+        assert begun.wait(60)
+        try:
+            with httpx.Client(
+                base_url=f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=60, trust_env=False
+            ) as client:
+                yield client
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+@contextmanager
+def serving(
+    access: Access | None = None, most: int = 32, deadline: float = 60.0, file: Path | None = None, **limits: Any
+) -> Iterator[tuple[CellService, Client]]:
+    """A service of its own, in memory or in a file, and a client of it."""
+    service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline, most)
+    try:
+        with running(service, access, **limits) as client:
+            yield service, client
+    finally:
+        service.close()
+
+
+@pytest.fixture(scope="module")
+def stream(make_data: Callable[..., Dataset]) -> Dataset:
+    return make_data(200, samples=SAMPLES, seed=3)
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellService]:
+    file = tmp_path_factory.mktemp("serve") / "cell.db"
+    made = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=60.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def client(service: CellService) -> Iterator[Client]:
+    with running(service) as client:
+        yield client
+
+
+def validate(value: Any, schema: str, client: Client) -> None:
+    """Hold an answer to the document that the server itself gives."""
+    document = client.get("/openapi.json").json()
+    jsonschema.validate(value, {"$ref": f"#/components/schemas/{schema}", "components": document["components"]})
+
+
+def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
+    """A problem as RFC 9457 has it, with what the cell does all the same, and nothing of the server's inside."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == PROBLEM
+    said: dict[str, Any] = answer.json()
+    assert set(said) == {"type", "title", "status", "detail", "action"}
+    assert (said["status"], said["action"]) == (status, "verify")
+    assert "Traceback" not in answer.text
+    assert said["detail"].isprintable()
+    return said
+
+
+# What it answers
+
+
+def test_an_interface_that_there_is_not_is_an_error_and_not_a_silence(service: CellService) -> None:
+    with pytest.raises(SettingError, match="among http, xmlrpc, page, got 'xmlrcp'"):
+        create_app(service, interfaces=("http", "xmlrcp"))
+
+
+def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset) -> None:
+    with DataEngine(recipe=RECIPE) as engine:
+        for i in range(60):
+            here, there = engine.decide(stream.X[i]), client.post("/decide", json={"trace": stream.X[i].tolist()}).json()
+            assert (there["action"], there["n_success"], there["n_failure"]) == (
+                here.action,
+                here.n_success,
+                here.n_failure,
+            )
+            if here.action == "verify":
+                engine.report(here.id, bool(stream.y[i]))
+                told = client.post("/report", json={"id": there["id"], "success": bool(stream.y[i])})
+                assert told.json()["success"] is bool(stream.y[i])
+        assert engine.version == client.get("/status").json()["version"] == 1
+
+
+def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
+    """The same trace as each form has it."""
+    raw, said = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
+    packed = {"content-type": MSGPACK}
+    return {
+        "JSON": {"json": {"trace": trace.tolist(), **said}},
+        "float32": {
+            "content": raw,
+            "params": said | {"channels": len(np.atleast_2d(trace))},
+            "headers": {"content-type": RAW},
+        },
+        "MessagePack": {"content": msgpack.packb({"trace": trace.tolist(), **said}), "headers": packed},
+        "MessagePack of float32": {
+            "content": msgpack.packb({"trace": trace[None][0].tobytes(), **said}),
+            "headers": packed,
+        },
+    }
+
+
+@pytest.mark.parametrize("form", ["JSON", "float32", "MessagePack", "MessagePack of float32"])
+def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService, stream: Dataset, form: str) -> None:
+    answer = client.post("/decide", **forms(stream.X[7], f"form {form}")[form])
+    assert answer.status_code == 200, answer.text
+    validate(answer.json(), "Answer", client)
+    known = asyncio.run(service.find(f"form {form}"))
+    assert np.array_equal(known.trace[0], stream.X[7])
+    assert known.part == "P1"
+
+
+def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(client: Client, stream: Dataset) -> None:
+    trace = [*stream.X[8].tolist()[:-1], None]
+    answer = client.post("/decide", json={"trace": trace, "request": "missing/sample ?"}).json()
+    assert (answer["action"], answer["reason"]) == ("verify", "not_finite")
+    shown = client.get("/decisions/missing%2Fsample%20%3F", params={"trace": "true"}).json()
+    validate(shown, "Decision", client)
+    assert shown["trace"][0][-1] is None
+
+
+def test_asked_again_it_answers_the_same(client: Client, stream: Dataset) -> None:
+    first = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
+    for form in forms(stream.X[0], "order-0").values():
+        again = client.post("/decide", **form).json()
+        assert again | {"seconds": 0} == first | {"seconds": 0}
+    problem = must_be_problem(client.post("/decide", **forms(stream.X[1], "order-0")["JSON"]), 409)
+    assert "got another; give it an id of its own" in problem["detail"]
+
+
+def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Dataset) -> None:
+    client.post("/decide", **forms(stream.X[2] * 9, "label-0")["JSON"])
+    assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
+    for repeated in (False, True):
+        told = client.post("/report", json={"id": "label-0", "success": True}).json()
+        validate(told, "Told", client)
+        assert told["repeated"] is repeated
+    must_be_problem(client.post("/report", json={"id": "label-0", "success": False}), 409)
+    must_be_problem(client.post("/report", json={"id": "nobody", "success": True}), 404)
+    must_be_problem(client.post("/report", json={"id": "label-0", "success": "OK"}), 422)
+    must_be_problem(client.post("/report", json={"id": "", "success": True}), 422)
+    assert "label-0" not in [each["id"] for each in client.get("/decisions?open=true").json()["decisions"]]
+    assert client.get("/decisions/label-0").json()["source"] == "verification"
+    packed = msgpack.packb({"id": "label-0", "success": True})
+    assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()["repeated"]
+
+
+def test_what_can_be_looked_at_is_as_the_document_says(client: Client) -> None:
+    validate(client.get("/status").json(), "Status", client)
+    validate(client.get("/healthz").json(), "Health", client)
+    listed = client.get("/decisions", params={"limit": 3}).json()
+    validate(listed, "Decisions", client)
+    assert len(listed["decisions"]) == 3
+    times = [each["time"] for each in listed["decisions"]]
+    assert times == sorted(times, reverse=True)
+    must_be_problem(client.get("/decisions/nobody"), 404)
+    for query in ("limit=0", "limit=x", "limit=9999", "open=yes"):
+        must_be_problem(client.get(f"/decisions?{query}"), 422)
+
+
+def test_the_document_names_every_route_and_every_example_is_served(service: CellService, client: Client) -> None:
+    document = client.get("/openapi.json").json()
+    routes = {(each.path.replace(":path", ""), m) for each in http_routes.routes(service) for m in each.methods - {"HEAD"}}
+    assert routes == {(path, m.upper()) for path, methods in document["paths"].items() for m in methods}
+    for path, methods in document["paths"].items():
+        for content in methods.get("post", {}).get("requestBody", {}).get("content", {}).values():
+            for example in content.get("examples", {}).values():
+                jsonschema.validate(example["value"], {**content["schema"], "components": document["components"]})
+                answer = client.post(path, json=example["value"])
+                assert answer.status_code in (200, 404, 422), answer.text  # of another contract, or unknown here
+                assert "unknown" in answer.text or "samples" in answer.text or "channel" in answer.text
+    page = client.get("/docs")
+    assert page.headers["content-type"].startswith("text/html")
+    assert all(f"{m.upper()} {path}" in page.text for path, methods in document["paths"].items() for m in methods)
+    assert "http" not in page.text.replace("/https", "")  # nothing is fetched
+
+
+def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
+    from prometheus_client.parser import text_string_to_metric_families
+
+    with serving() as (_, client):
+        for i in range(3):
+            client.post("/decide", **forms(stream.X[i], f"m-{i}")["JSON"])
+        client.post("/report", json={"id": "m-0", "success": True})
+        text = client.get("/metrics").text
+    found = {(s.name, *sorted(s.labels.values())): s.value for f in text_string_to_metric_families(text) for s in f.samples}
+    assert found["dengine_decisions_total", "no_model", "verify"] == 3
+    assert found["dengine_reports_total", "false", "true"] == 1
+    assert (found["dengine_decide_seconds_count",], found["dengine_new_labels",]) == (3, 1)
+    assert found["dengine_late_total",] == found["dengine_safe_mode",] == found["dengine_store_fault",] == 0
+
+
+# What it refuses
+
+TWO, ONE = {"trace": [[1.0] * SAMPLES, [1.0]]}, {"trace": [1.0] * SAMPLES}
+REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
+    "no type": (415, {"content": b"1"}),
+    "another type": (415, {"content": b"1", "headers": {"content-type": "text/csv"}}),
+    "nothing": (400, {"content": b"", "headers": {"content-type": "application/json"}}),
+    "no JSON": (400, {"content": b"{", "headers": {"content-type": "application/json"}}),
+    "no UTF-8": (400, {"content": b'"\xff"', "headers": {"content-type": "application/json"}}),
+    "NaN": (400, {"content": b'{"trace": [NaN]}', "headers": {"content-type": "application/json"}}),
+    "a name twice": (400, {"content": b'{"trace": [1], "trace": [2]}', "headers": {"content-type": "application/json"}}),
+    "too deep": (400, {"content": b"[" * 100_000, "headers": {"content-type": "application/json"}}),
+    "digits": (400, {"content": b'{"trace": [' + b"1" * 5000 + b"]}", "headers": {"content-type": "application/json"}}),
+    "a huge number": (422, {"json": {"trace": [10**400]}}),
+    "a list": (422, {"json": [1.0]}),
+    "no trace": (422, {"json": {"request": "a"}}),
+    "an unknown name": (422, {"json": ONE | {"reqest": "a"}}),
+    "an empty trace": (422, {"json": {"trace": []}}),
+    "a bool among numbers": (422, {"json": {"trace": [1.0, True]}}),
+    "a text among numbers": (422, {"json": {"trace": [1.0, "2"]}}),
+    "unequal channels": (422, {"json": TWO}),
+    "another length": (422, {"json": {"trace": [1.0] * (SAMPLES - 1)}}),
+    "a request that is a number": (422, {"json": ONE | {"request": 7}}),
+    "a request of no characters": (422, {"json": ONE | {"request": ""}}),
+    "a request that ends a line": (422, {"json": ONE | {"request": "a\nb"}}),
+    "a request too long": (422, {"json": ONE | {"request": "a" * 201}}),
+    "a part that is a bool": (422, {"json": ONE | {"part": True}}),
+    "half a float": (422, {"content": b"12345", "headers": {"content-type": RAW}}),
+    "no channels": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"channels": "0"}}),
+    "channels in words": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"channels": "one"}}),
+    "an unknown query": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"path": "/etc"}}),
+    "a query twice": (
+        422,
+        {"content": b"1234", "headers": {"content-type": RAW}, "params": [("part", "1"), ("part", "2")]},
+    ),
+    "no MessagePack": (400, {"content": b"\xc1", "headers": {"content-type": MSGPACK}}),
+    "half of MessagePack": (400, {"content": b"\x93\x01", "headers": {"content-type": MSGPACK}}),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_trace_is_refused_and_leaves_nothing(client: Client, stream: Dataset, name: str) -> None:
+    client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "the contract"})
+    before = client.get("/status").json()["store"]["decisions"]
+    status, request = REFUSED[name]
+    must_be_problem(client.post("/decide", **request), status)
+    assert client.get("/status").json()["store"]["decisions"] == before
+
+
+def test_paths_and_methods_that_there_are_not(client: Client) -> None:
+    must_be_problem(client.get("/nothing"), 404)
+    must_be_problem(client.get("/decisions/../../etc/passwd"), 404)
+    must_be_problem(client.get("/decide"), 405)
+    must_be_problem(client.delete("/decisions"), 405)
+
+
+def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None:
+    free, begun = threading.Event(), threading.Event()
+    with serving(most=1) as (service, client):
+        hold = lambda engine: (begun.set(), free.wait(60))  # noqa: E731
+        for _ in range(2):  # one is under way, one in line
+            threading.Thread(target=asyncio.run, args=(service.ask(hold),)).start()
+            begun.wait(60)
+        while service.waiting < 1:
+            threading.Event().wait(0.01)
+        answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"])
+        must_be_problem(answer, 503)
+        assert int(answer.headers["retry-after"]) >= 1
+        free.set()
+    assert service.busy == 1
+
+
+def test_an_answer_that_would_be_late_is_verify_and_recorded_so(tmp_path: Path, stream: Dataset) -> None:
+    free, begun = threading.Event(), threading.Event()
+    with serving(deadline=0.05, file=tmp_path / "cell.db") as (service, client):
+        threading.Thread(target=asyncio.run, args=(service.ask(lambda engine: (begun.set(), free.wait(60))),)).start()
+        begun.wait(60)
+        answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
+        assert (answer["action"], answer["late"], answer["reason"]) == ("verify", True, "late")
+        free.set()
+        service.deadline = 60.0
+        again = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
+        assert again | {"seconds": 0} == answer | {"seconds": 0}
+
+
+# Who may ask
+
+
+def test_a_token_is_asked_for_and_compared(stream: Dataset) -> None:
+    with serving(Access(TOKEN)) as (_, client):
+        for headers in (
+            {},
+            {"authorization": "Bearer other"},
+            {"authorization": "Basic !"},
+            {"authorization": f"Bearer {TOKEN}x"},
+        ):
+            refused = client.get("/status", headers=headers)
+            must_be_problem(refused, 401)
+            assert refused.headers["www-authenticate"].startswith("Bearer")
+        assert client.get("/status", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+        assert client.get("/status", auth=("anybody", TOKEN)).status_code == 200
+        assert client.get("/healthz").status_code == 200
+        must_be_problem(client.get("/status", params={"token": TOKEN}), 401)  # that is for /RPC2 alone
+        must_be_problem(client.get("/RPC2", params={"token": "other"}), 401)
+        must_be_problem(client.get("/RPC2", params={"token": TOKEN}), 404)  # let in; the interface is off here
+        must_be_problem(client.get(f"/RPC2/{TOKEN}"), 404)
+        must_be_problem(client.get(f"/RPC2/{TOKEN}/status"), 401)
+
+
+def test_pages_of_other_sites_are_not_served(client: Client, stream: Dataset) -> None:
+    here, body = str(client.base_url).rstrip("/"), {"json": {"trace": stream.X[0].tolist()}}
+    for headers in ({"origin": "http://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
+        must_be_problem(client.post("/decide", headers=headers, **body), 403)
+    for headers in ({"origin": here}, {"sec-fetch-site": "same-origin"}, {"sec-fetch-site": "none"}):
+        assert client.post("/decide", headers=headers, **body).status_code == 200
+    for host in ("evil.example", "127.0.0.1.evil.example", "a@b", "localhost:x"):
+        must_be_problem(client.get("/healthz", headers={"host": host}), 421)
+    for host in ("localhost", "localhost:8000", "[::1]:8000", "192.168.0.7"):
+        assert client.get("/healthz", headers={"host": host}).status_code == 200
+
+
+def test_every_answer_tells_a_browser_what_it_may_do(client: Client) -> None:
+    for path in ("/healthz", "/docs", "/nothing"):
+        headers = client.get(path).headers
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["content-security-policy"].startswith("default-src 'self'")
+        assert "server" not in headers
+
+
+def test_sizes_times_and_rates_are_limited(stream: Dataset) -> None:
+    access = Access(largest=4000, body_seconds=0.2, rate=0.01, burst=20)
+    with serving(access, connections=3, head_seconds=0.3) as (_, client):
+        host, port = client.base_url.host, client.base_url.port
+        must_be_problem(client.post("/decide", content=b"0" * 4001, headers={"content-type": RAW}), 413)
+        must_be_problem(client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}), 413)
+        for text, status in (
+            (
+                "POST /decide HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 9\r\n\r\n{",
+                408,
+            ),
+            ("GET /healthz HTTP/1.1\r\nhost: loc", 408),
+            ("GET /healthz HTTP/1.1\r\nhost: localhost\r\nx: " + "y" * 100_000, 400),
+            ("\x16\x03\x01 no HTTP\r\n\r\n", 400),
+        ):
+            with socket.create_connection((host, port), timeout=60) as raw:
+                raw.sendall(text.encode("latin-1"))
+                said = read_all(raw)
+            assert said.startswith(f"HTTP/1.1 {status} ".encode()), said
+            assert json.loads(said.partition(b"\r\n\r\n")[2])["action"] == "verify"
+        idle = [socket.create_connection((host, port), timeout=60) for _ in range(4)]
+        fulls = [read_all(each) for each in idle]
+        assert fulls[-1].startswith(b"HTTP/1.1 503 ")
+        while (answer := client.get("/healthz")).status_code == 200:
+            pass
+        must_be_problem(answer, 429)
+        assert answer.headers["retry-after"] == "1"
+
+
+def half(head: str, body: str = "") -> bytes:
+    return f"{head} HTTP/1.1\r\nhost: localhost\r\n{body}".encode("latin-1")
+
+
+NINE = "content-type: {}\r\ncontent-length: 9\r\n\r\n{{"
+CHUNKED = f"content-type: {RAW}\r\ntransfer-encoding: chunked\r\n\r\n"
+WELL = half("GET /healthz", "\r\n")
+HALVES = {  # what is sent; the statuses of what comes
+    "a method": (b"G", [408]),
+    "a line": (b"GET /healthz HT", [408]),
+    "a head": (half("GET /healthz"), [408]),
+    "no HTTP, without an end": (b"\xfe\xff\x80" * 30, [408]),
+    "a trace": (half("POST /decide", NINE.format("application/json")), [408]),
+    "a report": (half("POST /report", NINE.format(MSGPACK)), [408]),
+    "a call": (half("POST /RPC2", NINE.format("text/xml")), [408]),
+    "a piece": (half("POST /decide", f"{CHUNKED}9\r\n1"), [408]),
+    "a piece of no length": (half("POST /decide", f"{CHUNKED}x\r\n"), [400]),
+    "the end of a line": (b"\r\n", [400]),
+    "the next": (WELL + half("GET /healthz"), [200, 408]),
+    "the next, no HTTP": (WELL + b"\0", [200, 400]),
+}
+
+
+@pytest.fixture(scope="module")
+def hasty(service: CellService) -> Iterator[Client]:
+    """A client of a server that gives little time, over every interface."""
+    pytest.importorskip("defusedxml")
+    access = Access(rate=0.0, body_seconds=0.2)
+    with running(service, access, ("http", "xmlrpc", "page"), head_seconds=0.3) as client:
+        yield client
+
+
+@pytest.mark.parametrize("ended", [False, True], ids=["left open", "ended"])
+@pytest.mark.parametrize("name", HALVES)
+def test_half_a_request_is_answered_before_its_connection_is_closed(hasty: Client, name: str, ended: bool) -> None:
+    sent, wanted = HALVES[name]
+    with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
+        raw.sendall(sent)
+        if len(wanted) > 1:
+            assert raw.recv(1, socket.MSG_PEEK)  # the whole one is answered; now there is but the half
+        if ended:  # then no more comes, and nobody waits for it
+            raw.shutdown(socket.SHUT_WR)
+            wanted = [400 if status == 408 else status for status in wanted]
+        said = read_all(raw)
+    assert [int(status) for status in re.findall(rb"HTTP/1\.1 (\d{3}) ", said)] == wanted, said
+    head, _, body = said[said.rindex(b"HTTP/1.1 " + str(wanted[-1]).encode()) :].partition(b"\r\n\r\n")
+    assert b"connection: close" in head
+    assert set(json.loads(body)) == {"type", "title", "status", "detail", "action"}
+
+
+@pytest.mark.parametrize("path", ["/nothing", "/acts/retrain"])
+def test_what_is_refused_by_its_head_is_refused_before_its_body_has_come(hasty: Client, path: str) -> None:
+    with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
+        raw.sendall(half(f"POST {path}", NINE.format(RAW)))
+        assert raw.recv(10) == b"HTTP/1.1 4"
+
+
+def read_all(connection: socket.socket) -> bytes:
+    """What comes until the other side closes."""
+    found = b""
+    with connection:
+        while piece := connection.recv(65536):
+            found += piece
+    return found
+
+
+# What it remembers
+
+
+def test_a_controller_that_died_finds_its_open_decision_after_a_restart(tmp_path: Path, stream: Dataset) -> None:
+    answers = []
+    for _ in range(2):
+        with serving(file=tmp_path / "cell.db") as (_, client):
+            answers.append(client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json() | {"seconds": 0})
+            assert [each["id"] for each in client.get("/decisions?open=true").json()["decisions"]] == ["order-0"]
+    assert answers[0] == answers[1]
+
+
+# The process
+
+
+def start(folder: Path, *words: str) -> tuple["subprocess.Popen[str]", str]:
+    """`dengine serve` as it is typed, and the port that it says it listens at."""
+    command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--reducer", "pca", *words]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, cwd=folder, env=os.environ | {"PYTHONPATH": str(REPO)}, **pipes)
+    assert process.stdout is not None
+    return process, process.stdout.readline().rstrip(".\n").rpartition(":")[2]
+
+
+def certificate(folder: Path) -> None:
+    """Files for TLS by the name of localhost: cert.pem, key.pem, and locked.pem with a password; and a token."""
+    x509 = pytest.importorskip("cryptography.x509", reason="the test's certificate needs cryptography")
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
+    made = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(1))
+    made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), False)
+    (folder / "cert.pem").write_bytes(made.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    locks = {"key.pem": serialization.NoEncryption(), "locked.pem": serialization.BestAvailableEncryption(b"secret")}
+    for file, lock in locks.items():
+        form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+        (folder / file).write_bytes(key.private_bytes(*form, lock))
+    (folder / "token").write_text(TOKEN, encoding="ascii")
+    (folder / "token").chmod(0o600)
+
+
+def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(
+    tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certificate(tmp_path)
+    words = ("--shadow", "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem")
+    process, port = start(tmp_path, *words)
+    monkeypatch.delenv("DENGINE_STORE_WAIT", raising=False)  # as a cell waits for its store: the tests' own wait is long
+    try:
+        trusted, said = ssl.create_default_context(cafile=str(tmp_path / "cert.pem")), {"authorization": f"Bearer {TOKEN}"}
+        how: dict[str, Any] = {"verify": trusted, "timeout": 60, "trust_env": False}
+        with httpx.Client(base_url=f"https://localhost:{port}", **how) as client:
+            assert client.get("/healthz").json()["status"] == "ok"
+            must_be_problem(client.get("/status"), 401)
+            client.headers.update(said)
+            assert client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()["action"] == "verify"
+            assert client.get("/status").json()["shadow"] is True
+            for store, at, text in (("cell.db", "0", "cell.db"), ("b.db", port, "already in use")):
+                refused = CliRunner().invoke(main, ["serve", "--store", str(tmp_path / store), "--port", at])
+                assert (refused.exit_code, refused.output.count("\n")) == (1, 1), (refused.output, refused.exc_info)
+                assert text in refused.output
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(60) == 0
+    finally:
+        process.kill()
+        out, lines = process.communicate()
+    assert all(" level=" in line and " message=" in line for line in lines.splitlines()), lines
+    assert TOKEN not in out + lines
+    with DataEngine.open(tmp_path / "cell.db") as engine:
+        assert engine.find("order-0").action == "verify"
+
+
+def test_what_the_verb_does_by_default_is_what_serving_does() -> None:
+    typed = {option.name: option.default for option in main.commands["serve"].params}
+    names = ("host", "port", "deadline", "largest", "rate", "connections")
+    assert {name: typed[name] for name in names} == {name: getattr(Serving(), name) for name in names}
+
+
+def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:
+    certificate(tmp_path)
+    token, locked = tmp_path / "token", ["--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "locked.pem")]
+    serve = ["serve", "--store", str(tmp_path / "cell.db"), "--port", "0", "--host", "0.0.0.0"]
+    for words, text, mode in (
+        ([], "Expected --token-file FILE", 0o600),
+        (["--token-file", str(token)], "chmod 600", 0o644),
+        (["--token-file", str(token)], "at least 16 characters", 0o600),
+        (["--token-file", str(tmp_path / "none")], "Cannot read the token's file", 0o600),
+        (["--cert", str(token)], "--cert and --key together", 0o600),
+        (locked, "Expected a key without a password", 0o600),
+    ):
+        token.write_text("short", encoding="ascii")
+        token.chmod(mode)
+        done = CliRunner().invoke(main, [*serve, *words])
+        assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
+        assert text in done.output
+    assert not (tmp_path / "cell.db").exists()
+
+
+def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path: Path) -> None:
+    pytest.importorskip("asyncua")
+    serve = ["serve", "--store", str(tmp_path / "cell.db"), "--reducer", "pca", "--port", "0"]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = CliRunner().invoke(main, [*serve, "--opcua", port])
+        assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
+        assert port in done.output
+    nobody = CliRunner().invoke(main, [*serve, "--robot", f"127.0.0.1:{port}"])
+    assert (nobody.exit_code, nobody.output.count("\n")) == (1, 1), nobody.output
+    assert "127.0.0.1" in nobody.output

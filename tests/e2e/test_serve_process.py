@@ -1,0 +1,229 @@
+"""`dengine serve` as a process of its own: how it ends, and a robot whose force it records."""
+
+import http.client
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+for needed in ("uvicorn", "starlette", "prometheus_client", "msgpack", "defusedxml"):
+    pytest.importorskip(needed, reason='the server is not installed: pip install "dengine[serve]"')
+
+from dengine import DataEngine, Dataset, Recipe  # not before it is known to be there
+from dengine.cells import FakeController
+from dengine.cells.ur.protocol import column_of
+
+REPO = Path(__file__).resolve().parents[2]
+SAMPLES = 80
+WAIT = 60.0  # seconds, for what takes a fraction of one: a machine may be busy
+
+
+@pytest.fixture(scope="module")
+def parts(make_data) -> Dataset:
+    return make_data(200, samples=SAMPLES)
+
+
+@dataclass
+class Process:
+    """A server that runs, and what it said."""
+
+    process: subprocess.Popen[str]
+    port: int
+    said: str = ""
+
+    def ask(self, path: str, body: Any = None) -> dict[str, Any]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)
+        data, kind = (None, {}) if body is None else (json.dumps(body), {"content-type": "application/json"})
+        connection.request("GET" if body is None else "POST", path, data, kind)
+        answer = connection.getresponse()
+        said = json.loads(answer.read())
+        connection.close()
+        if answer.status != 200:
+            raise OSError(f"{path}: {answer.status} {said}")
+        return said
+
+    def robot(self) -> Any:
+        return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
+
+    def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
+        """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
+        (os.killpg if group else os.kill)(self.process.pid, number)
+        self.said, _ = self.process.communicate(timeout=WAIT)
+        return self.process.returncode
+
+
+@contextmanager
+def server(folder: Path, *words: str) -> Iterator[Process]:
+    command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--no-page", *words]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    environment = os.environ | {"PYTHONPATH": str(REPO)}
+    process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
+    try:
+        said = next(line for line in process.stdout if "is served at" in line or process.poll() is not None)
+        yield Process(process, int(said.partition("127.0.0.1:")[2].partition(",")[0]))
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
+    """What this returns, once it is anything."""
+    end = time.monotonic() + wait
+    while not (found := true()):
+        assert time.monotonic() < end, "it did not come in time"
+        time.sleep(0.02)
+    return found
+
+
+def children(pid: int) -> list[int]:
+    """Processes below this one."""
+    try:
+        own = [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except FileNotFoundError:
+        pytest.skip("this system does not say which processes are whose")
+    return [*own, *(deeper for each in own for deeper in children(each))]
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@dataclass
+class Robots:
+    """Several that ask and report until the server is gone; what they were answered, and which labels were acknowledged."""
+
+    ask: Callable[[str, Any], dict[str, Any]]
+    parts: Dataset
+    answers: dict[str, dict[str, Any]] = field(default_factory=dict)
+    labels: dict[str, bool] = field(default_factory=dict)
+
+    def start(self, n: int = 3) -> list[threading.Thread]:
+        threads = [threading.Thread(target=self.work, args=(each,)) for each in range(n)]
+        for each in threads:
+            each.start()
+        return threads
+
+    def work(self, robot: int) -> None:
+        for cycle in range(10**6):
+            i = cycle % len(self.parts)
+            try:
+                asked = {"trace": self.parts.X[i].tolist(), "request": f"{robot}-{cycle}"}
+                answer = self.answers[asked["request"]] = self.ask("/decide", asked)
+                if answer["action"] != "reject":
+                    self.ask("/report", {"id": answer["id"], "success": bool(self.parts.y[i])})
+                    self.labels[answer["id"]] = bool(self.parts.y[i])
+            except (OSError, http.client.HTTPException):  # it ends
+                return
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
+    tmp_path: Path, parts: Dataset, name: str
+) -> None:
+    recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=3.0)  # seconds: so that a retrain is met
+    (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
+    with server(tmp_path, "--recipe", "recipe.toml", "--rate", "0") as process:
+        robots = Robots(process.ask, parts)
+        threads = robots.start()
+        until(lambda: process.ask("/status")["retraining"])
+        below = until(lambda: children(process.process.pid))
+        code = process.end(getattr(signal, name), group=name == "SIGINT")
+        for each in threads:
+            each.join(WAIT)
+    assert code == 0
+    assert "Traceback" not in process.said
+    lines = process.said.splitlines()
+    assert all(" level=" in line and " message=" in line for line in lines), lines
+    assert any(f"{name}: ending" in line for line in lines)
+    until(lambda: not any(map(is_alive, below)))
+    assert len(robots.labels) >= 20
+    with DataEngine.open(tmp_path / "cell.db") as engine:
+        assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
+        for id_, answer in robots.answers.items():
+            known = engine.find(id_)
+            assert (known.action, known.reason, known.lower) == (answer["action"], answer["reason"], answer["lower"])
+
+
+class Insertions:
+    """A robot's program that inserts when it is told to; its register 25 is on meanwhile."""
+
+    place = None
+
+    def __init__(self) -> None:
+        self._told: queue.SimpleQueue[np.ndarray] = queue.SimpleQueue()
+        self._force: Iterator[float] = iter(())
+        self._over: threading.Event | None = None
+
+    def insert(self, trace: np.ndarray) -> None:
+        """Play a trace (T,), and return when it is over."""
+        self._over = threading.Event()
+        self._told.put(trace)
+        assert self._over.wait(WAIT)
+
+    def step(self, inputs: dict[str, float]) -> dict[str, float]:
+        force = next(self._force, None)
+        if force is None and not self._told.empty():
+            self._force = iter(self._told.get().tolist())
+            force = next(self._force)
+        elif force is None and self._over is not None:
+            self._over.set()
+        return {column_of("FZ_Base"): force or 0.0, "output_int_register_25": float(force is not None)}
+
+
+def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, Any]:
+    """The answer to what was recorded of an insertion; another one where the recording came too late, on a busy machine."""
+
+    def decided() -> dict[str, Any] | None:
+        part = robot.begin()
+        program.insert(trace)
+        answer: dict[str, Any] = robot.decide_recorded(part)
+        return answer if answer["id"] == part else None
+
+    return until(decided)
+
+
+def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(
+    tmp_path: Path, parts: Dataset
+) -> None:
+    program = Insertions()
+    with FakeController(program) as fake:
+        robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
+        with server(tmp_path, "--reducer", "pca", *robot_at) as process:
+            robot = process.robot()
+            for i in range(2):
+                answer = inserted(robot, program, parts.X[i])
+                assert (answer["action"], answer["reason"]) == (0, "no_model")
+                assert robot.decide_recorded(answer["id"]) == answer  # asked again
+                assert robot.report(answer["id"], bool(parts.y[i])) is True
+                known = process.ask(f"/decisions/{answer['id']}?trace=true")
+                assert known["success"] is bool(parts.y[i])
+                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[i])  # as it was sent
+            fake.close()
+            unknown = robot.decide_recorded(robot.begin())
+            assert (unknown["action"], unknown["id"], unknown["reason"]) == (0, "", "not_recorded")
+            assert robot.report(unknown["id"], True) is False
+            with FakeController(program, port=fake.port):
+                answer = inserted(robot, program, parts.X[2])
+                known = process.ask(f"/decisions/{answer['id']}?trace=true")
+                np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[2])
+                assert process.ask("/status")["store"]["decisions"] >= 3
+            assert process.end() == 0
+    assert "no recording of" in process.said
+    assert "Traceback" not in process.said

@@ -1,0 +1,218 @@
+"""Decisions with the caller's own ids, and the shadow mode."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, Source
+from dengine.errors import ReportError, SettingError, TraceError
+from dengine.store.outbox import Keeper, TakenIds
+from tests.support.driving import drive
+
+POLICY = Policy(alpha=0.1, lower_bound=0.9)
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=POLICY)
+
+
+# ------------------------------------------------------------------------------------------------ ids of the caller's
+
+
+def test_a_new_id_is_not_looked_up_once_the_taken_ones_are_known(tmp_path: Path, stream: Dataset) -> None:
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        first = engine.decide(stream.X[0], decision_id="order-0")
+    with DataEngine.open(tmp_path / "cell.db") as engine:
+        recent = engine._keeper.recent
+        assert not recent.is_new("order-1")  # that is not known yet
+        engine.know_ids()
+        assert not recent.is_new("order-0")
+        assert recent.is_new("order-1")
+        engine.decide(stream.X[1], decision_id="order-1")
+        assert not recent.is_new("order-1")
+        assert engine.decide(stream.X[0], decision_id="order-0") == first
+
+
+def test_a_label_is_known_however_many_decisions_came_since(
+    tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dengine.store.outbox.MOST", 3)
+    monkeypatch.setattr(
+        "dengine.store.outbox.BEAT", 3600.0
+    )  # a cell that never pauses: the journal keeps what the store has
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        for i in range(5):
+            engine.decide(stream.X[i], decision_id=f"order-{i}")
+            engine.report(f"order-{i}", True)
+        assert engine._keeper._backlog.find("order-0").success is None  # the label went to the store alone
+        assert engine.find("order-0").success is True
+
+
+def test_the_journal_of_a_cell_that_never_pauses_does_not_grow_for_ever(
+    tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dengine.store.outbox.BEAT", 3600.0)
+    monkeypatch.setattr("dengine.store.outbox.RESERVE", 20_000)
+    with DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE) as engine:
+        journal, most = engine._keeper._backlog.journal, 0
+        for i in range(200):
+            engine.decide(stream.X[i], decision_id=f"order-{i}")
+            engine.report(f"order-{i}", True)
+            most = max(most, journal.end)
+    assert 10_000 < most < 50_000
+
+
+def test_taken_ids_are_never_taken_for_new_ones() -> None:
+    taken = TakenIds(f"order-{i}" for i in range(20_000))
+    assert all(taken.may_hold(f"order-{i}") for i in range(20_000))
+    assert not any(taken.may_hold(f"part-{i}") for i in range(1_000))
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(
+    stream: Dataset, tmp_path: Path, stored: bool
+) -> None:
+    with DataEngine(recipe=RECIPE, store=tmp_path / "engine.db" if stored else None) as engine:
+        first = engine.decide(stream.X[0], part="P1", decision_id="order-7")
+        assert first.id == "order-7"
+        assert first.action is Action.VERIFY
+        drive(engine, stream, 1, 200)
+        assert engine.decide(stream.X[0]).model_version > 0
+        assert engine.decide(stream.X[0], part="P1", decision_id="order-7") == first
+        assert engine.store.status()["decisions"] == 201
+
+
+def test_an_id_of_another_trace_is_refused_and_changes_nothing(stream: Dataset) -> None:
+    with DataEngine(recipe=RECIPE) as engine:
+        engine.decide(stream.X[0], decision_id="order-7")
+        with pytest.raises(TraceError, match="Expected the trace that decision 'order-7' was made on"):
+            engine.decide(stream.X[1], decision_id="order-7")
+        assert engine.store.status()["decisions"] == 1
+
+
+def test_a_trace_that_is_not_finite_is_known_again_too(stream: Dataset) -> None:
+    broken = stream.X[0].copy()
+    broken[3] = np.nan
+    with DataEngine(recipe=RECIPE) as engine:
+        engine.decide(stream.X[1])
+        first = engine.decide(broken, decision_id="order-7")
+        assert engine.decide(broken, decision_id="order-7") == first
+        assert first.reason is Reason.NOT_FINITE
+
+
+@pytest.mark.parametrize("id_", ["", "two\nlines", 7, "x" * 1000])
+def test_what_is_no_id_is_refused(stream: Dataset, id_: object) -> None:
+    with DataEngine(recipe=RECIPE) as engine:
+        with pytest.raises(ReportError, match="Expected the id"):
+            engine.decide(stream.X[0], decision_id=id_)
+        assert engine.store.status()["decisions"] == 0
+
+
+KILLED = """
+import os, signal, sys
+import numpy as np
+from dengine import DataEngine, Policy, Recipe
+X = np.load(sys.argv[1])
+engine = DataEngine(recipe=Recipe("pca", radius=0.5, retrain_every=40), store=sys.argv[2])
+for i, x in enumerate(X):
+    decision = engine.decide(x, decision_id=f"order-{i}")
+    print(decision.id, decision.action.value, decision.reason.value, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(stream: Dataset, tmp_path: Path) -> None:
+    np.save(tmp_path / "x.npy", stream.X[:20])
+    file = tmp_path / "engine.db"
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "x.npy"), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    told = [line.split() for line in done.stdout.splitlines()]
+    assert len(told) == 20
+    with DataEngine.open(file) as engine:
+        for x, (id_, action, reason) in zip(stream.X, told, strict=False):
+            again = engine.decide(x, decision_id=id_)
+            assert (again.id, again.action, again.reason) == (id_, action, reason)
+        assert engine.store.status()["decisions"] == 20
+
+
+def test_the_journal_is_emptied_of_what_the_store_has(stream: Dataset, tmp_path: Path) -> None:
+    engine = DataEngine(recipe=RECIPE, store=tmp_path / "engine.db")
+    for i in range(10):
+        engine.decide(stream.X[i], decision_id=f"order-{i}")
+    keeper: Keeper = engine._keeper
+    assert not keeper._backlog.journal.empty
+    keeper._beat(keeper._backlog)
+    assert keeper._backlog.journal.empty
+    engine.decide(stream.X[10], decision_id="order-10")
+    engine.close()
+    assert not list(tmp_path.glob("*.journal"))  # one that holds something would stay
+
+
+# ---------------------------------------------------------------------------------------------------------- shadow
+
+
+def test_in_the_shadow_every_part_is_verified_and_what_the_model_would_have_done_is_known(stream: Dataset) -> None:
+    with DataEngine(recipe=RECIPE) as engine, DataEngine(recipe=RECIPE) as free:
+        changed = engine.set_shadow(True, "kim")
+        assert (changed.kind, engine.shadow) == ("shadow", True)
+        cycles = drive(engine, stream, 0, 300)
+        assert {cycle.decision.action for cycle in cycles} == {Action.VERIFY}
+        would = [cycle for cycle in cycles if cycle.decision.predicted is not Action.VERIFY]
+        assert len(would) > 50
+        assert {cycle.source for cycle in would} == {Source.AUDIT}
+        assert {cycle.decision.propensity for cycle in would} == {1.0}
+        assert {cycle.decision.predicted for cycle in drive(free, stream, 0, 300)} == {"accept", "reject", "verify"}
+        (event,) = [each for each in engine.store.events() if each.kind == "shadow"]
+        assert event.author == "kim"
+
+
+def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(stream: Dataset, tmp_path: Path) -> None:
+    recipe = replace(RECIPE, policy=replace(POLICY, audit_rate=0.05))
+    with DataEngine(recipe=recipe, store=tmp_path / "engine.db") as engine:
+        drive(engine, stream, 0, 200)
+        engine.set_shadow(True)
+        assert engine.set_shadow(True).event is None
+    with DataEngine.open_or_create(tmp_path / "engine.db", recipe=recipe) as engine:  # the program's own settings
+        assert engine.shadow
+        assert {cycle.decision.action for cycle in drive(engine, stream, 200, 240)} == {Action.VERIFY}
+        engine.set_shadow(False, "kim")
+        assert engine.policy == recipe.policy
+        assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 240, 400)}
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert not engine.shadow
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.05])
+def test_a_policy_that_is_set_in_the_shadow_holds_when_it_ends_and_so_does_the_audit_rate_from_before(
+    stream: Dataset, rate: float, tmp_path: Path
+) -> None:
+    recipe = replace(RECIPE, policy=replace(POLICY, audit_rate=rate))
+    with DataEngine(recipe=recipe, store=tmp_path / "engine.db") as engine:
+        engine.set_shadow(True)
+        drive(engine, stream, 0, 200)
+        engine.set_policy(replace(engine.policy, lower_bound=0.8), "kim")
+        assert engine.shadow
+    with DataEngine.open(tmp_path / "engine.db") as engine:
+        assert engine.set_shadow(False, "kim").kind == "shadow"
+        assert not engine.shadow
+        assert engine.policy == replace(POLICY, lower_bound=0.8, audit_rate=rate)
+        assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 200, 300)}
+
+
+def test_the_certificate_begins_anew_with_the_shadow_and_counts_its_audits(stream: Dataset) -> None:
+    with DataEngine(recipe=RECIPE) as engine:
+        drive(engine, stream, 0, 200)
+        engine.set_shadow(True)
+        assert engine.certificate().accepted.n == 0
+        drive(engine, stream, 200, 400)
+        known = engine.certificate().accepted
+        assert known.n == known.n_looked_at > 50
+
+
+@pytest.mark.parametrize("value", [1, "on", None])
+def test_the_shadow_is_on_or_off(value: object) -> None:
+    with DataEngine() as engine, pytest.raises(SettingError, match="Expected True or False"):
+        engine.set_shadow(value)

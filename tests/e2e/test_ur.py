@@ -1,0 +1,729 @@
+"""A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of orders; over real TCP."""
+
+import csv
+import json
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from dengine import DataEngine, Dataset, Outcome, Policy, Reason, ReplayCell
+from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
+from dengine.cells.ur import RobotProgram, Trouble
+from dengine.cells.ur.cell import ANSWER, ORDER, PHASE, Answer, Verb, after, word
+from dengine.cells.ur.protocol import TYPES, Kind, Package, Packages, Recipe, column_of, type_of
+from dengine.cells.ur.stream import Lateness, RtdeClient, RtdeStream
+from dengine.cli import main
+from dengine.datasets.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger
+from dengine.errors import CellError, SettingError
+
+SAMPLES = 80
+WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
+
+
+@pytest.fixture(scope="module")
+def parts(make_data) -> Dataset:
+    return make_data(60, samples=SAMPLES)
+
+
+def cell_of(fake: FakeController, **how) -> UrCell:
+    return UrCell(fake.host, port=fake.port, samples=SAMPLES, order_timeout=WAIT, start_timeout=WAIT, **how)
+
+
+def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
+    return {(part, int(sample)) for sample in np.flatnonzero(np.isnan(trace))}
+
+
+# The wire.
+
+
+def test_packages_come_whole_from_pieces_of_any_size() -> None:
+    sent = [Package(Kind.DATA, bytes(range(n))) for n in (0, 1, 40)]
+    for size in (1, 2, 7, 100):
+        stream, packages = b"".join(each.bytes for each in sent), Packages()
+        pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
+        assert [found for piece in pieces for found in packages.feed(piece)] == sent
+
+
+@pytest.mark.parametrize("garbage", [b"\x00\x02U", b"\x00\x10?", b"GET / HTTP/1.1\r\n"])
+def test_what_is_no_package_is_said_to_be_none(garbage: bytes) -> None:
+    with pytest.raises(CellError, match="Expected an RTDE package"):
+        list(Packages().feed(garbage))
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_every_type_of_the_guide_is_packed_and_unpacked(kind: str) -> None:
+    recipe = Recipe(3, ("a", "b"), ("DOUBLE", kind))
+    n = TYPES[kind][1]
+    values = (0.5, *([True] if kind == "BOOL" else range(1, n + 1)))
+    assert recipe.unpack(recipe.pack(values)[3:]) == values
+    assert len(recipe.columns) == 1 + n
+    with pytest.raises(CellError, match="Expected a data package"):
+        recipe.unpack(recipe.pack(values)[3:-1])
+
+
+def test_a_data_package_is_bytes_as_the_guide_says() -> None:
+    # Header: size uint16 and kind uint8; then the recipe's number; big-endian.
+    recipe = Recipe(1, ("timestamp", "output_int_register_24"), ("DOUBLE", "INT32"))
+    assert recipe.pack((2.0, -1)) == struct.pack(">HBBdi", 16, ord("U"), 1, 2.0, -1)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("actual_TCP_force", "VECTOR6D"),
+        ("output_int_register_47", "INT32"),
+        ("output_int_register_48", "NOT_FOUND"),
+        ("output_bit_register_64", "BOOL"),
+        ("output_bit_register_63", "NOT_FOUND"),
+        ("nothing", "NOT_FOUND"),
+    ],
+)
+def test_a_field_has_the_type_that_the_guide_gives_it(name: str, kind: str) -> None:
+    assert type_of(name) == kind
+
+
+# One connection.
+
+
+def read_on(client: RtdeClient) -> None:
+    while client.rows():
+        pass
+
+
+def test_a_client_gets_every_package_of_what_it_asked_for() -> None:
+    with FakeController(speed=None) as fake:
+        client = RtdeClient(fake.host, fake.port, ("timestamp", "robot_mode", "actual_TCP_force"))
+        rows = [row for _ in range(20) for row in client.rows()]
+        client.close()
+    assert client.outputs.columns[:3] == ("timestamp", "robot_mode", "actual_TCP_force[0]")
+    np.testing.assert_allclose(np.diff([row[0] for row in rows]), 0.002)
+    assert {row[1] for row in rows} == {7}
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"refuses": [Kind.VERSION]}, "protocol version 2"),
+        ({"refuses": [Kind.START]}, "refuses"),
+        ({"unknown": ["actual_TCP_force"]}, "does not know actual_TCP_force"),
+        ({"held": [ORDER]}, f"Expected to write {ORDER}, another client"),
+    ],
+    ids=["version", "start", "unknown", "held"],
+)
+def test_what_a_controller_refuses_is_said_at_once(how: dict, said: str) -> None:
+    with FakeController(speed=None, **how) as fake, pytest.raises(CellError, match=said):
+        RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force"), (ORDER,))
+
+
+def test_a_second_writer_of_one_register_is_refused_and_the_first_stays() -> None:
+    with FakeController(speed=None) as fake:
+        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        with pytest.raises(CellError, match="another client"):
+            RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        assert first.rows()
+        first.close()
+
+
+def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(CellError, match=r"silent for 0\.1 s"):
+            RtdeClient("127.0.0.1", port, timeout=0.1)
+    with pytest.raises(CellError, match="cannot be reached"):
+        RtdeClient("127.0.0.1", port, timeout=0.1)
+
+
+def test_a_register_that_its_owner_gives_up_is_taken_over_soon_after_and_one_that_is_held_is_said() -> None:
+    with FakeController(speed=20.0) as fake:
+        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        timer = threading.Timer(0.2, first.close)
+        timer.start()
+        with RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
+            assert stream.after(0, WAIT)[0]
+        timer.join()
+    held = pytest.raises(CellError, match="another client")
+    with FakeController(speed=20.0, held=[ORDER]) as fake, held:
+        RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port).open()
+
+
+def test_the_controllers_own_words_are_in_the_error() -> None:
+    with FakeController(speed=1.0) as fake:
+        client = RtdeClient(fake.host, fake.port)
+        fake.say("the input buffer overflows")
+        fake.hang_up()
+        with pytest.raises(CellError, match=r"hung up.*the input buffer overflows"):
+            read_on(client)
+        client.close()
+
+
+def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() -> None:
+    with FakeController(speed=None, patience=0.2) as fake:
+        idle = RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force", "actual_q"))
+        with RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
+            while fake._connections[0].started:
+                stream.after(stream.position, WAIT)
+            begun = stream.position
+            assert stream.after(begun + 100, 0.0)[0] == []
+            while stream.position < begun + 100:
+                stream.after(stream.position, WAIT)
+        with pytest.raises(CellError, match="Expected packages"):
+            read_on(idle)
+        idle.close()
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        Package(Kind.OUTPUTS, b"short").bytes,
+        Package(Kind.OUTPUTS, bytes(8) + b"\xff\xfe").bytes,
+        Package(Kind.DATA, b"\x09").bytes,
+        Package(Kind.VERSION, b"").bytes,
+    ],
+    ids=["http", "half a set-up", "no text", "no recipe", "no version"],
+)
+def test_who_does_not_speak_rtde_is_hung_up_on_and_others_are_served(sent: bytes) -> None:
+    with FakeController(speed=None) as fake, socket.create_connection((fake.host, fake.port), WAIT) as stranger:
+        stranger.sendall(sent)
+        assert stranger.recv(100) == b""
+        client = RtdeClient(fake.host, fake.port)
+        assert client.rows()
+        client.close()
+
+
+def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:
+    late = Lateness()
+    drifting = [late.is_late(t, 1.0005 * t + 5.0) for t in np.arange(0.0, 60.0, 0.002)]
+    assert not any(drifting)
+    held = [late.is_late(60.0 + 0.002 * i, 1.0005 * 60.1 + 5.0) for i in range(50)]  # all at once, up to 0.1 s late
+    assert sum(held) == 40
+    assert not late.is_late(0.0, 70.0)  # the controller was switched off and on
+
+
+# Insertions, cut out and accounted for.
+
+TROUBLES = [
+    Trouble(3, 50, "drop", 7),
+    Trouble(4, 20, "hold", 30),
+    Trouble(5, 40, "close"),
+    Trouble(6, 0, "drop", 4),
+    Trouble(7, SAMPLES - 1, "half"),
+    Trouble(8, 60, "garbage"),
+    Trouble(9, 3, "repeat"),
+    Trouble(10, 70, "drop", 40),
+    Trouble(11, 0, "close"),
+]
+
+
+def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=None, troubles=TROUBLES) as fake, cell_of(fake) as cell:
+        for part in range(16):
+            trace = cell.insert()
+            lost = {place for place in fake.lost if place[0] == part}
+            if (part, 0) in lost:  # its start was not seen: no sample's place is known
+                lost = {(part, sample) for sample in range(SAMPLES)}
+            assert nan_places(part, trace) == lost
+            there = ~np.isnan(trace)
+            np.testing.assert_array_equal(trace[there], parts.X[part][there])
+            assert (cell.last.missing, cell.last.complete) == (len(lost), not lost)
+            assert sum(length for _, length in cell.last.gaps) == len(lost)
+            assert cell.last.repeated == (part == 9)
+            assert cell.last.reconnects == (part in (5, 7, 8, 11))
+            cell.reject()
+        report = cell.recorder.report()
+    hit = {part for part, _ in fake.lost}
+    assert {3, 5, 6, 7, 8, 10, 11} == hit
+    assert cell.incomplete == len(hit)
+    assert (report.reconnects, report.repeated, report.restarts) == (4, 1, 0)
+    assert report.missing >= len(fake.lost)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_so_it_is_with_any_faults_at_any_samples(parts: Dataset, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = ("drop", "hold", "close", "half", "garbage", "repeat")
+    samples = rng.integers(SAMPLES, size=40) * (rng.random(40) < 0.8)  # the first more often than by chance
+    wrong = [Trouble(i, int(samples[i]), str(rng.choice(kinds)), int(rng.integers(1, 200))) for i in range(40)]
+    with FakeController(RobotProgram(parts), speed=None, troubles=wrong) as fake, cell_of(fake) as cell:
+        for part in range(40):
+            trace = cell.insert()
+            lost = {place for place in fake.lost if place[0] == part}
+            unseen = (part, 0) in lost
+            assert nan_places(part, trace) == ({(part, i) for i in range(SAMPLES)} if unseen else lost), wrong[part]
+            there = ~np.isnan(trace)
+            np.testing.assert_array_equal(trace[there], parts.X[part][there])
+            assert cell.verify() == bool(parts.y[part])
+
+
+def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), troubles=[Trouble(0, 10, "hold", 60)]) as fake, cell_of(fake) as cell:
+        trace = cell.insert()  # in real time
+    np.testing.assert_array_equal(trace, parts.X[0])
+    assert cell.last.late >= 20  # of 60, those that came over 0.02 s late
+    assert cell.last.missing == 0
+
+
+def test_a_connection_that_breaks_off_abruptly_loses_what_it_loses_and_says_so(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=20.0) as fake, cell_of(fake) as cell:
+        for part in range(12):
+            timer = threading.Timer(0.002 * part, fake.hang_up, kwargs={"abruptly": True})
+            timer.start()
+            trace = cell.insert()
+            there = ~np.isnan(trace)
+            np.testing.assert_array_equal(trace[there], parts.X[part][there])
+            assert cell.last.missing == np.isnan(trace).sum()
+            timer.join()
+            cell.reject()
+
+
+def test_a_controller_whose_clock_begins_anew_ends_the_trace_it_was_in(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(1, 30, "reset")]) as fake, cell_of(fake) as cell:
+        traces = []
+        for _ in range(3):
+            traces.append(cell.insert())
+            cell.reject()
+        assert cell.recorder.report().restarts == 1
+    np.testing.assert_array_equal(traces[0], parts.X[0])
+    np.testing.assert_array_equal(traces[1][:30], parts.X[1][:30])
+    assert np.isnan(traces[1][30:]).all()
+    np.testing.assert_array_equal(traces[2], parts.X[2])
+
+
+def test_an_insertion_that_no_start_was_seen_of_is_all_missing(parts: Dataset) -> None:
+    trouble = Trouble(0, 0, "drop", SAMPLES + 1)
+    with FakeController(RobotProgram(parts), speed=None, troubles=[trouble]) as fake, cell_of(fake) as cell:
+        assert np.isnan(cell.insert()).all()
+        assert cell.last.missing == SAMPLES
+        cell.reject()
+        np.testing.assert_array_equal(cell.insert(), parts.X[1])
+
+
+class Signals:
+    """Plays columns of numbers, again and again, with a rest between."""
+
+    place = None
+
+    def __init__(self, **columns: np.ndarray) -> None:
+        names = {name: column_of(name) for name in columns}
+        length = len(next(iter(columns.values())))
+        self._rows = [{names[n]: float(c[i]) for n, c in columns.items()} for i in range(length)]
+        self._cycle = 0
+
+    def step(self, inputs: dict) -> dict:
+        self._cycle += 1
+        return self._rows[self._cycle % len(self._rows)]
+
+
+def contact() -> np.ndarray:
+    """(400,) 200 at rest, a push of 100, 100 at rest."""
+    force = np.zeros(400)
+    force[200:300] = np.linspace(6.0, 40.0, 100)
+    return force
+
+
+@pytest.mark.parametrize(
+    ("trigger", "columns"),
+    [
+        (ContactTrigger(5.0, quiet_s=0.1), {}),
+        (BitTrigger(3), {"actual_digital_output_bits": 8 * (contact() > 0)}),
+        (RegisterTrigger("output_int_register_30", 2), {"output_int_register_30": 2 * (contact() > 0)}),
+        ("register@output_bit_register_64", {"output_bit_register_64": contact() > 0}),
+        (MotionTrigger(0.01), {"actual_TCP_speed[2]": -0.02 * (contact() > 0)}),
+    ],
+    ids=["contact", "digital output", "register", "bit register", "motion"],
+)
+def test_a_recorder_cuts_by_any_trigger_with_samples_from_before_it(trigger, columns: dict) -> None:
+    program = Signals(FZ_Base=contact(), **columns)
+    how = {"samples": 60, "before": 20}
+    with FakeController(program, speed=None) as fake, RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder:
+        for _ in range(3):
+            np.testing.assert_array_equal(recorder.record(WAIT).trace, contact()[180:240].astype(np.float32))
+
+
+def test_a_controller_is_asked_for_the_rate_that_a_trace_has() -> None:
+    with FakeController(Signals(FZ_Base=contact()), speed=None) as fake:  # 500 cycles a second: it sends every fourth
+        how = {"samples": 20, "rate_hz": 125.0, "port": fake.port}
+        with RtdeRecorder(fake.host, ContactTrigger(5.0, quiet_s=0.1), **how) as recorder:
+            insertion = recorder.record(WAIT)
+    assert insertion.complete
+    starts = [contact()[first : first + 80 : 4].astype(np.float32).tolist() for first in range(200, 204)]
+    assert insertion.trace.tolist() in starts
+
+
+def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts: Dataset) -> None:
+    columns = {"FX_Base": contact() / 2, "FZ_Base": contact(), "actual_q[5]": contact() / 4}
+    how = {"trigger": "contact=5", "samples": 50, "channels": tuple(columns)}
+    with FakeController(Signals(**columns), speed=None) as fake, RtdeRecorder(fake.host, port=fake.port, **how) as recorder:
+        insertion = recorder.record(WAIT)
+    np.testing.assert_array_equal(insertion.trace, np.stack(list(columns.values()))[:, 200:250].astype(np.float32))
+    assert (recorder.spec.samples, recorder.spec.channels, recorder.spec.columns) == (50, 3, tuple(columns))
+
+
+def test_a_trigger_that_never_goes_on_is_said_after_the_time_that_was_given() -> None:
+    said = pytest.raises(CellError, match="the trigger never went on: RegisterTrigger")
+    with FakeController(speed=None) as fake, RtdeRecorder(fake.host, port=fake.port) as recorder, said:
+        recorder.record(timeout=0.05)
+
+
+def test_whoever_asks_too_late_for_packages_is_told_how_many_were_given_up() -> None:
+    with FakeController(speed=None) as fake, RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
+        stream._most = 10
+        while stream.position < 1000:
+            assert stream.after(10**9, 0.01)[0] == []
+        with pytest.raises(CellError, match="were given up"):
+            stream.after(0, WAIT)
+
+
+@pytest.mark.parametrize("name", ["FZ", "actual_TCP_force", "actual_TCP_force[6]", "timestamp[0]", "actual_q[x]"])
+def test_a_channel_that_is_none_is_refused_before_anything_is_asked(name: str) -> None:
+    with pytest.raises(SettingError, match="Expected a channel among FX_Base"):
+        RtdeRecorder("127.0.0.1", channels=(name,))
+
+
+def test_samples_from_before_the_trigger_must_leave_some_after_it() -> None:
+    with pytest.raises(SettingError, match="Expected 0 to 9 samples"):
+        RtdeRecorder("127.0.0.1", samples=10, before=10)
+
+
+# The cell.
+
+
+def test_a_robots_cell_is_a_cell(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=None) as fake, cell_of(fake) as cell:
+        assert isinstance(cell, Cell)
+        for i in range(12):
+            np.testing.assert_array_equal(cell.insert(), parts.X[i])
+            if i % 3 == 0:
+                assert cell.verify() == bool(parts.y[i])
+            elif i % 3 == 1:
+                assert cell.proceed() is (Outcome.UNKNOWN if parts.y[i] else Outcome.STOPPED)
+            else:
+                cell.reject()
+        assert cell.incomplete == 0
+
+
+def test_a_confirming_line_says_so(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts, confirm=True), speed=None) as fake, cell_of(fake) as cell:
+        for i in range(5):
+            cell.insert()
+            assert cell.proceed() is (Outcome.CONFIRMED if parts.y[i] else Outcome.STOPPED)
+
+
+def decisions(cell: Cell, cycles: int, **how) -> list[dict]:
+    engine = DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0, **how)
+    found = []
+    with engine:
+        for cycle in engine.run(cell, cycles):
+            told = asdict(cycle.decision)
+            told.pop("id")
+            found.append({**told, "outcome": cycle.outcome, "success": cycle.success})
+    return found
+
+
+def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(make_data) -> None:
+    data = make_data(120, samples=SAMPLES)
+    with FakeController(RobotProgram(data), speed=None) as fake, cell_of(fake) as cell:
+        live = decisions(cell, 120)
+    assert live == decisions(ReplayCell(data), 120)
+    assert {told["action"] for told in live} >= {"verify", "accept"}
+
+
+def test_a_trace_with_a_gap_is_verified_and_never_learned_from(parts: Dataset) -> None:
+    troubles = [Trouble(part, 30, "drop", 3) for part in (2, 20, 40)]
+    engine = DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0)
+    with engine, FakeController(RobotProgram(parts), speed=None, troubles=troubles) as fake, cell_of(fake) as cell:
+        cycles = list(engine.run(cell, 60))
+        learned = engine.retrain().n_traces
+    broken = [i for i, cycle in enumerate(cycles) if cycle.decision.reason is Reason.NOT_FINITE]
+    assert broken == [2, 20, 40]
+    assert all(cycles[i].decision.action == "verify" for i in broken)
+    assert learned == sum(cycle.success is not None for cycle in cycles) - 3
+
+
+def test_a_new_owner_goes_on_after_the_last_order_and_the_robot_does_nothing_twice(parts: Dataset) -> None:
+    program = RobotProgram(parts)
+    with FakeController(program, speed=None) as fake:
+        for i in range(3):
+            with cell_of(fake) as cell:
+                np.testing.assert_array_equal(cell.insert(), parts.X[i])
+        assert program.played == [0, 1, 2]
+
+
+def test_a_new_owner_waits_until_an_old_order_is_answered(parts: Dataset) -> None:
+    program = RobotProgram(parts, approach=200)
+    with FakeController(program, speed=20.0) as fake:
+        old = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
+        old.send((word(41, Verb.INSERT),))
+        while not program.played:
+            old.rows()
+        old.close()
+        with cell_of(fake) as cell:
+            assert program.outputs[ANSWER] == word(41, Answer.DONE)
+            np.testing.assert_array_equal(cell.insert(), parts.X[1])
+
+
+class Deaf(RobotProgram):
+    """A robot whose program answers nothing."""
+
+    def _carry_out(self, number: int, verb: int) -> Iterator[None]:
+        while True:
+            yield
+
+
+@pytest.fixture
+def short() -> dict:
+    return {"order_timeout": 0.3, "start_timeout": 1.0, "samples": SAMPLES}
+
+
+def test_a_robot_that_does_not_answer_is_an_error_that_says_which_order(parts: Dataset, short: dict) -> None:
+    said = pytest.raises(CellError, match=r"to answer order 1 \(insert\) in time, it did not")
+    with FakeController(Deaf(parts), speed=20.0) as fake, UrCell(fake.host, port=fake.port, **short) as cell, said:
+        cell.insert()
+
+
+def test_a_robot_that_fails_says_so(parts: Dataset, short: dict) -> None:
+    said = pytest.raises(CellError, match=r"order 1 \(verify\), it says that it failed")
+    with FakeController(RobotProgram(parts), speed=None) as fake, cell_of(fake) as cell, said:
+        cell.verify()  # nothing was inserted
+
+
+def test_a_program_that_is_stopped_ends_the_wait_at_once(parts: Dataset) -> None:
+    with FakeController(Deaf(parts), speed=20.0) as fake, cell_of(fake) as cell:
+        fake.runtime = 1
+        with pytest.raises(CellError, match="its program has stopped"):
+            cell.insert()
+
+
+def test_a_program_that_is_started_anew_carries_no_old_order_out(parts: Dataset) -> None:
+    program = RobotProgram(parts, approach=10**6)
+    with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
+        timer = threading.Timer(0.2, program.restart)
+        timer.start()
+        with pytest.raises(CellError, match="started anew"):
+            cell.insert()
+        timer.join()
+
+
+def test_a_program_that_does_not_run_is_said_when_the_cell_is_opened(parts: Dataset, short: dict) -> None:
+    with FakeController(RobotProgram(parts), speed=20.0) as fake:
+        fake.runtime = 1
+        with pytest.raises(CellError, match="its program does not run; start"):
+            UrCell(fake.host, port=fake.port, **short).open()
+        assert not any(thread.name.startswith("rtde") for thread in threading.enumerate())
+
+
+def test_an_order_given_while_there_is_no_connection_is_carried_out_once_there_is_one(parts: Dataset) -> None:
+    program = RobotProgram(parts)
+    with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
+        fake.hang_up()
+        cell.insert()
+        cell.reject()
+    assert program.played == [0]
+
+
+def reconnected(fake: FakeController, stream: RtdeStream) -> float | None:
+    """What the order's register holds once the connection was lost and made again."""
+    before = stream.report().reconnects
+    fake.hang_up()
+    while stream.report().reconnects == before:
+        stream.after(stream.position, 0.05)
+    begun = stream.position
+    while stream.position < begun + 50:
+        stream.after(stream.position, WAIT)
+    return fake._inputs.get(ORDER)
+
+
+def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
+    now, order = [0.0], word(7, Verb.INSERT)
+    fake = FakeController(speed=20.0)
+    fake._cycle = 10**6
+    how = {"port": fake.port, "clock": lambda: now[0]}
+    with fake, RtdeStream(fake.host, ("timestamp",), (ORDER,), **how) as stream:
+        stream.after(0, WAIT)
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
+            stream.after(stream.position, WAIT)
+        fake._inputs.clear()  # as if it had been lost on the way
+        assert reconnected(fake, stream) == order
+        fake._inputs.clear()
+        now[0] = 11.0
+        assert reconnected(fake, stream) is None
+        stream.write((order,))
+        while fake._inputs.get(ORDER) != order:
+            stream.after(stream.position, WAIT)
+        with fake._lock:  # off and on
+            fake._inputs.clear()
+            fake._begin = fake._cycle
+        assert reconnected(fake, stream) is None
+
+
+# From the shell.
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(main, ["run", "--cell", "ur", *words])
+
+
+def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dataset, tmp_path: Path) -> None:
+    store = str(tmp_path / "cell.db")
+    with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "12", "--json")
+        assert done.exit_code == 0, done.output
+        told = json.loads(done.stdout)
+        done = run(*words[:-2], "--cycles", "3")
+    assert (told["total"]["verified"], told["recording"]["incomplete"]) == (12, 1)
+    assert told["recording"]["missing"] >= 2
+    assert "Traces with a gap, verified and never learned from: 0." in " ".join(done.output.split())
+    with DataEngine.open(store) as engine:
+        kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
+        assert engine.store.status()["decisions"] == 15
+    assert {trace.tobytes() for trace in kept} == {x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3}
+
+
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts: Dataset, tmp_path: Path
+) -> None:
+    program, store = RobotProgram((parts.X[:10], parts.y[:10])), str(tmp_path / "cell.db")  # then its bin is empty
+    with FakeController(program, speed=None) as fake:
+        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
+        done = run(*words, "--cycles", "14")
+        said = " ".join(done.output.split())
+        assert done.exit_code == 1
+        assert "1 to 10 100 %" in said
+        assert (
+            "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14 cycles were done."
+            in said
+        )
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in said
+        program.played.clear()  # somebody has filled it
+        assert run(*words[:-2], "--cycles", "4").exit_code == 0
+    with DataEngine.open(store) as engine:
+        assert engine.store.status()["decisions"] == 14
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "Expected the robot's address for --cell ur"),
+        (("--host", "127.0.0.1:x"), "Expected a host, or host:port"),
+        (("--host", "127.0.0.1:1"), "it cannot be reached"),
+        (("--host", "127.0.0.1:1", "--trigger", "bits"), "Expected a trigger, as bit=0"),
+        (("--host", "127.0.0.1:1", "--channel", "FZ"), "Expected a channel among FX_Base"),
+    ],
+)
+def test_what_is_wrong_with_a_robot_is_one_line(words: tuple[str, ...], said: str) -> None:
+    done = run(*words)
+    assert done.exit_code == 1
+    assert said in " ".join(done.output.split())
+    assert "Traceback" not in done.output
+
+
+def test_a_controller_without_a_robot_is_started_from_the_shell() -> None:
+    words = [sys.executable, "-m", "dengine.cells.ur", "--port", "0", "--speed", "0"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            said = process.stdout.readline()
+            host, port = said.split(" at ")[1].split(",")[0].split(":")
+            with UrCell(host, port=int(port), order_timeout=WAIT, start_timeout=WAIT) as cell:
+                assert cell.insert().shape == (1000,)
+        finally:
+            process.terminate()
+
+
+def test_an_owner_that_thinks_for_long_between_two_orders_goes_on(parts: Dataset) -> None:
+    with FakeController(RobotProgram(parts), speed=None) as fake, cell_of(fake) as cell:
+        cell.insert()
+        cell.recorder.stream._most = 20  # packages that are kept, instead of a minute's
+        begun = cell.recorder.stream.position
+        while cell.recorder.stream.position < begun + 200:
+            assert cell.recorder.stream.after(10**9, 0.01)[0] == []
+        cell.recorder.stream._most = 10**5
+        assert cell.verify() == bool(parts.y[0])
+
+
+def test_orders_are_numbered_so_that_they_fit_a_register_for_ever() -> None:
+    assert after(0) == 1
+    assert after(2 * 10**8) == 1
+    assert word(2 * 10**8, Answer.FAILED) < 2**31
+    assert divmod(word(12, Verb.PROCEED), 10) == (12, Verb.PROCEED)
+
+
+def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: Path) -> None:
+    text = (repo / "training" / "ur_cell.script").read_text(encoding="utf-8")
+    for name in (ORDER, ANSWER, PHASE):
+        way, _, number = name.partition("_int_register_")
+        verb = "read_input" if way == "input" else "write_output"
+        assert f"{verb}_integer_register({number}" in text
+    for each in (*Verb, *Answer):
+        assert f"{type(each).__name__.upper()}_{each.name} = {each.value}\n" in text
+
+
+def test_every_block_of_the_robots_program_is_closed_where_it_was_opened(repo: Path) -> None:
+    blocks: list[int] = []
+    for line in (repo / "training" / "ur_cell.script").read_text(encoding="utf-8").splitlines():
+        indent, words = len(line) - len(line.lstrip()), line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0] in ("def", "if", "while"):
+            assert words[-1].endswith(":"), line
+            blocks.append(indent)
+        elif words[0] in ("end", "elif"):
+            assert indent == blocks[-1], line
+            if words == ["end"]:
+                blocks.pop()
+        else:
+            assert indent == 2 * len(blocks), line
+    assert not blocks
+
+
+# Another client than ours, against the same controller.
+
+THEIRS = """
+import sys, time, rtde_io, rtde_receive
+host, path = sys.argv[1:]
+receive = rtde_receive.RTDEReceiveInterface(host, 500.0)
+io = rtde_io.RTDEIOInterface(host, False, True)
+assert io.setInputIntRegister(42, 77)
+end = time.monotonic() + 20.0
+while receive.getOutputDoubleRegister(12) != 77.0 and time.monotonic() < end:
+    time.sleep(0.01)
+print(receive.isConnected(), receive.getOutputDoubleRegister(12), receive.getActualTCPForce()[2], receive.getRobotMode())
+receive.startFileRecording(path, ["timestamp", "actual_TCP_force"])
+time.sleep(0.5)
+receive.stopFileRecording()
+receive.disconnect()
+io.disconnect()
+"""
+
+
+class Echo:
+    """Gives back what register 42 was set to."""
+
+    place = None
+
+    def step(self, inputs: dict) -> dict:
+        return {"output_double_register_12": float(inputs.get("input_int_register_42", 0)), "actual_TCP_force[2]": 12.5}
+
+
+@pytest.mark.skipif(find_spec("rtde_receive") is None, reason='ur_rtde is not installed: pip install "dengine[ur]"')
+def test_ur_rtdes_own_client_takes_the_fake_for_a_controller(tmp_path: Path) -> None:
+    # Its port is fixed, and its constructor holds Python's lock: an address of its own, and a process of its own.
+    host = f"127.77.{np.random.default_rng().integers(256)}.{np.random.default_rng().integers(1, 255)}"
+    with FakeController(Echo(), host=host, port=30004):
+        words = [sys.executable, "-c", THEIRS, host, str(tmp_path / "theirs.csv")]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout.split() == ["True", "77.0", "12.5", "7"], done.stderr
+    with (tmp_path / "theirs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {float(row["actual_TCP_force_2"]) for row in rows} == {12.5}

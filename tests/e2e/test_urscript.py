@@ -1,0 +1,276 @@
+"""The robot's program that asks over XML-RPC: its calls are there, and a robot of paper plays it in Python.
+
+URScript reads nearly as Python: the program is turned into it line by line, and run against a real server. What only a real
+controller shows is listed in docs/howto/plc_and_robot.md.
+"""
+
+import asyncio
+import re
+import socket
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dengine import Action, DataEngine, Dataset, Policy, Recipe
+from dengine.cells import FakeController, RtdeRecorder
+from dengine.serve.robot_calls import RobotCalls
+from dengine.serve.service import CellService
+from dengine.store.views import HistoryFilter
+
+served = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
+uvicorn = pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
+Starlette = pytest.importorskip("starlette.applications").Starlette
+
+SCRIPT = Path(__file__).parents[2] / "training" / "ur_xmlrpc_cell.script"
+TEXT = SCRIPT.read_text(encoding="utf-8")
+CODE = [line.partition("#")[0].rstrip() for line in TEXT.splitlines()]
+SAMPLES = 60
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
+CLOSE = "closeXMLRPCClientConnection"
+BLOCK = re.compile(r"^\s*(def|thread|if|while)\b.*:$")
+MANUAL = {  # of the script manual of e-Series, version 5
+    *("movel", "stopl", "pose_trans", "sleep", "force_mode", "end_force_mode", "get_actual_tcp_pose", "zero_ftsensor"),
+    *("set_standard_digital_out", "get_standard_digital_in", "set_flag", "get_flag", "write_output_integer_register"),
+    *("socket_open", "socket_close", "textmsg", "rpc_factory"),
+}
+
+
+def arguments(call: str) -> int:
+    return len([each for each in call.split(",") if each.strip()])
+
+
+def test_every_remote_call_is_there_with_that_many_arguments() -> None:
+    table = RobotCalls.table(object.__new__(RobotCalls))
+    calls = re.findall(r"dengine\.(\w+)\(([^)]*)\)", "\n".join(CODE))
+    assert {name for name, _ in calls} == {"begin", "action_recorded", "report", CLOSE}
+    for name, given in calls:
+        if name == CLOSE:  # the handle's own
+            continue
+        _, fewest, most = table[name]
+        assert fewest <= arguments(given) <= most, name
+
+
+def test_every_block_has_its_end_and_every_function_is_known() -> None:
+    assert sum(bool(BLOCK.match(line)) for line in CODE) == sum(line.strip() == "end" for line in CODE)
+    own = set(re.findall(r"(?:def|thread) (\w+)\(", "\n".join(CODE)))
+    called = set(re.findall(r"(?<![.\w])(\w+)\(", "\n".join(CODE))) - {"and", "or", "not", "while", "if", "elif"}
+    assert called - own == MANUAL
+
+
+def test_remote_calls_are_made_in_threads_alone() -> None:
+    inside = ""
+    for line in CODE:
+        if found := re.match(r"  (def|thread) (\w+)\(", line):
+            inside = found[1]
+        assert "dengine." not in line or inside == "thread", line
+
+
+def as_python(code: list[str]) -> str:
+    """The program as Python: the outermost function is the module, and every function may set its globals."""
+    names = sorted({*re.findall(r"global (\w+)", "\n".join(code))})
+    lines = []
+    for line in code[next(i for i, line in enumerate(code) if line.startswith("def ")) + 1 :]:
+        line = re.sub(r"\b(global|local) (\w+) =", r"\2 =", line[2:])
+        line = re.sub(r"^(\s*)thread ", r"\1def ", line)
+        line = re.sub(r"\brun (\w+)\(\)", r"run(\1)", re.sub(r"\bkill (\w+)", r"kill(\1)", line)).replace("p[", "[")
+        if line.strip() == "end" or not line.strip():
+            continue
+        lines.append(line)
+        if found := re.match(r"^(\s*)def ", line):
+            lines.append(f"{found[1]}  global {', '.join(names)}")
+    return "\n".join(lines)
+
+
+class Handle(xmlrpc.client.ServerProxy):
+    """What `rpc_factory` gives."""
+
+    def closeXMLRPCClientConnection(self) -> None:  # noqa: N802  # so it is called there
+        self("close")()
+
+
+class Recorder:
+    """A recorder of the traces that the robot of paper pushes in."""
+
+    def __init__(self) -> None:
+        self.traces: list[Any] = []
+
+    def arm(self) -> None:
+        self.traces.clear()
+
+    def record(self, timeout: float) -> Any:
+        return SimpleNamespace(trace=self.traces.pop())
+
+
+class Cell:
+    """A server in a thread of its own, at a port of its own."""
+
+    def __init__(self, file: Path) -> None:
+        self.service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
+        self.recorder = Recorder()
+        app = Starlette(routes=served.routes(self.service, self.recorder))
+        self._server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", lifespan="off"))
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+        while not self._server.started:
+            self._thread.join(0.01)
+        self.port = self._server.servers[0].sockets[0].getsockname()[1]
+
+    def end(self) -> None:
+        self._server.should_exit = True
+        self._thread.join()
+
+    def close(self) -> None:
+        self.end()
+        self.service.close()
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[Cell]:
+    made = Cell(tmp_path / "cell.db")
+    yield made
+    made.close()
+
+
+class EndOfShiftError(Exception):
+    """The robot has no more parts."""
+
+
+class Robot:
+    """A robot of paper: its bin is a data set, its height check knows the labels; what it did with each part is noted."""
+
+    def __init__(self, data: Dataset, parts: int, cell: Cell, patience: float = 600.0) -> None:
+        self.data, self.parts, self.port, self.recorder, self.patience = data, parts, cell.port, cell.recorder, patience
+        self.taken, self.outputs, self.flags = -1, dict[int, bool](), dict[int, bool]()
+        self.checked: list[int] = []
+        self.said: list[str] = []
+
+    def play(self) -> None:
+        """Run the program until the shift ends."""
+        names: dict[str, Any] = {name: getattr(self, name, lambda *args, **named: [0.0] * 6) for name in MANUAL}
+        names |= {"run": self.run, "kill": lambda thread: None, "textmsg": lambda *text: self.said.append("".join(text))}
+        source = as_python(CODE).replace("192.168.1.20:8000/RPC2/TOKEN", f"127.0.0.1:{self.port}/RPC2")
+        source = source.replace('HOST = "192.168.1.20"', 'HOST = "127.0.0.1"').replace("PORT = 8000", f"PORT = {self.port}")
+        source = source.replace("MOST_S = 3.0", f"MOST_S = {self.patience}").replace("while True:", "while next_part():")
+        with pytest.raises(EndOfShiftError):
+            exec(compile(source, str(SCRIPT), "exec"), names | {"next_part": self.next_part})
+
+    def next_part(self) -> bool:
+        if self.taken + 1 == self.parts:
+            raise EndOfShiftError
+        self.taken += 1
+        return True
+
+    def run(self, call: Callable[[], object]) -> threading.Thread:
+        thread = threading.Thread(target=call, daemon=True)
+        thread.start()
+        return thread
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(min(seconds, 0.002))
+
+    def write_output_integer_register(self, number: int, value: int) -> None:
+        if value:
+            self.recorder.traces.append(self.data.X[self.taken])
+
+    def get_standard_digital_in(self, number: int) -> bool:
+        good = bool(self.data.y[self.taken])
+        if number == 2:
+            self.checked.append(self.taken)
+            return good
+        return not good  # the line stops for a bad part that was passed on
+
+    def set_flag(self, number: int, value: bool) -> None:
+        self.flags[number] = value
+
+    def get_flag(self, number: int) -> bool:
+        return self.flags.get(number, False)
+
+    def socket_open(self, host: str, port: int, name: str) -> bool:
+        with socket.socket() as look:
+            return look.connect_ex((host, port)) == 0
+
+    def rpc_factory(self, kind: str, url: str) -> Handle:
+        assert kind == "xmlrpc"
+        return Handle(url)
+
+
+def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data) -> None:
+    data = make_data(90, samples=SAMPLES, seed=3)
+    robot = Robot(data, len(data), cell)
+    robot.play()
+    asked = cell.service._put(lambda engine, late: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
+    found = asked.future.result(60)
+    assert len(found) == len(data)
+    actions = [each.action for each in found]
+    assert {Action.VERIFY, Action.ACCEPT} <= set(actions)
+    assert robot.checked == [i for i, action in enumerate(actions) if action is Action.VERIFY]
+    for i, each in enumerate(found):
+        if each.action is Action.VERIFY:
+            assert each.success is bool(data.y[i])
+        elif each.action is Action.ACCEPT:
+            assert each.success is (None if data.y[i] else False)  # a stop is told, silence is not
+    assert robot.said == []
+
+
+def test_what_is_not_answered_in_time_is_checked(cell: Cell, make_data) -> None:
+    data, free = make_data(2, samples=SAMPLES, seed=3), threading.Event()
+    held = cell.service._put(lambda engine, late: free.wait(60))
+    robot = Robot(data, 2, cell, patience=0.3)
+    robot.play()
+    free.set()
+    held.future.result(60)
+    assert robot.checked == [0, 1]
+    assert sum("no answer" in said for said in robot.said) == 2
+    assert sum("a label was not kept" in said for said in robot.said) == 2
+
+
+def test_without_a_server_everything_is_checked_and_the_program_goes_on(cell: Cell, make_data) -> None:
+    data = make_data(8, samples=SAMPLES, seed=3)
+    robot = Robot(data, 8, cell)
+    first_look = robot.socket_open
+    robot.socket_open = lambda *where: first_look(*where) if robot.taken < 4 else False
+    robot.play()
+    assert robot.checked == list(range(8))
+    assert cell.service._put(lambda engine, late: engine.store.status()).future.result(60)["decisions"] == 4
+
+
+def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: Cell, make_data) -> None:
+    robot = Robot(make_data(2, samples=SAMPLES, seed=3), 1, cell)
+    robot.flags[7] = True
+    robot.play()
+    assert robot.checked == [-1, 0]
+    assert not any(robot.flags.values())
+
+
+def test_the_recorder_of_rtde_is_one_that_the_calls_can_use(tmp_path: Path, make_data) -> None:
+    from dengine.cells.ur import RobotProgram, UrCell
+
+    data = make_data(3, samples=SAMPLES, seed=3)
+
+    async def shift() -> None:
+        with (
+            FakeController(RobotProgram(data), speed=None) as fake,
+            RtdeRecorder(fake.host, samples=SAMPLES, port=fake.port) as recorder,
+            UrCell(fake.host, port=fake.port, samples=SAMPLES) as robot,  # it moves; the calls only listen
+        ):
+            calls = RobotCalls(service, recorder, patience=60.0)
+            for x in data.X:
+                id_ = await calls.begin()
+                await asyncio.to_thread(robot.insert)
+                answer = await calls.decide_recorded(id_)
+                assert answer["id"] == id_
+                assert np.array_equal((await service.find(id_)).trace[0], x)
+                await asyncio.to_thread(robot.verify)
+
+    service = CellService(lambda: DataEngine(recipe=RECIPE), deadline=30.0)
+    try:
+        asyncio.run(shift())
+    finally:
+        service.close()

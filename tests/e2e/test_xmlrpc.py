@@ -1,0 +1,320 @@
+"""XML-RPC over a real server: what a robot's program calls, and what it is told when something is wrong."""
+
+import http.client
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.errors import DataError
+from dengine.serve.robot_calls import SAMPLES, RobotCalls
+from dengine.serve.service import CellService
+
+served = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
+uvicorn = pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
+Starlette = pytest.importorskip("starlette.applications").Starlette
+
+RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
+VERIFY, ACCEPT = 0, 1
+
+
+class Recorder:
+    """A recorder of traces that are at hand: what a robot sends is tested where it is recorded."""
+
+    def __init__(self) -> None:
+        self.traces: list[np.ndarray] = []
+        self.armed = 0
+
+    def arm(self) -> None:
+        self.armed += 1
+
+    def record(self, timeout: float) -> SimpleNamespace:
+        if not self.traces:
+            raise DataError(f"Expected an insertion within {timeout:g} s, none came.")
+        return SimpleNamespace(trace=self.traces.pop(0))
+
+
+class Cell:
+    """A server in a thread of its own, on a port of its own, and what is behind it."""
+
+    def __init__(self, folder: Path) -> None:
+        file = folder / "cell.db"
+        self.service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
+        self.recorder = Recorder()
+        app = Starlette(routes=served.routes(self.service, self.recorder, patience=0.1, most=200_000))
+        self._server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", lifespan="off"))
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+        while not self._server.started:
+            self._thread.join(0.01)
+        self.port = self._server.servers[0].sockets[0].getsockname()[1]
+
+    def robot(self) -> xmlrpc.client.ServerProxy:
+        return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
+
+    def post(self, body: bytes, content: str = "text/xml", method: str = "POST", **headers: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        connection.request(method, "/RPC2", body, {"Content-Type": content, **headers})
+        answer = connection.getresponse()
+        said = answer.status, answer.read()
+        connection.close()
+        return said
+
+    def find(self, id_: str) -> Any:
+        return self.service._put(lambda engine, late: engine.find(id_)).future.result(60)
+
+    def close(self) -> None:
+        self._server.should_exit = True
+        self._thread.join()
+        self.service.close()
+
+
+@pytest.fixture(scope="module")
+def stream(make_data) -> Dataset:
+    return make_data(200, samples=60, seed=3)
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[Cell]:
+    made = Cell(tmp_path_factory.mktemp("cell"))
+    robot = made.robot()
+    for i in range(50):  # it retrains after 40
+        answer = robot.decide(stream.X[i].tolist())
+        if answer["action"] == VERIFY:
+            assert robot.report(answer["id"], bool(stream.y[i]))
+    yield made
+    made.close()
+
+
+def fault_of(answer: tuple[int, bytes]) -> xmlrpc.client.Fault:
+    assert answer[0] == 200
+    with pytest.raises(xmlrpc.client.Fault) as caught:
+        xmlrpc.client.loads(answer[1])
+    assert "\n" not in caught.value.faultString
+    assert "Traceback" not in caught.value.faultString
+    return caught.value
+
+
+def call(name: str, *arguments: object) -> bytes:
+    return xmlrpc.client.dumps(arguments, name, allow_none=True).encode()
+
+
+def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> None:
+    robot = cell.robot()
+    answers = [robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(stream.X[50:90])]
+    assert cell.service.engine.version >= 1
+    assert ACCEPT in {answer["action"] for answer in answers}
+    for i, answer in enumerate(answers):
+        assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (f"order-{i}", int, float)
+        known = cell.find(f"order-{i}")
+        assert (known.part, np.array_equal(known.trace[0], stream.X[50 + i])) == (f"P{i}", True)
+
+
+def test_a_request_that_is_asked_again_has_the_same_answer(cell: Cell, stream: Dataset) -> None:
+    robot = cell.robot()
+    first = robot.decide(stream.X[0].tolist(), "again")
+    assert robot.decide(stream.X[0].tolist(), "again") == first
+    assert robot.action(stream.X[0].tolist(), "again") == first["action"]
+    with pytest.raises(xmlrpc.client.Fault, match="got another") as caught:
+        robot.decide(stream.X[1].tolist(), "again")
+    assert caught.value.faultCode == served.REFUSED
+
+
+def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
+    robot = cell.robot()
+    id_ = robot.begin()
+    assert [robot.add(id_, stream.X[1][at : at + 25].tolist()) for at in (0, 25, 50)] == [25, 50, 60]
+    answer = robot.decide_added(id_, 7)
+    assert answer["id"] == id_
+    assert robot.decide_added(id_, 7) == answer
+    assert robot.action_added(id_) == answer["action"]
+    known = cell.find(id_)
+    assert (known.part, np.array_equal(known.trace[0], stream.X[1])) == ("7", True)
+    with pytest.raises(xmlrpc.client.Fault, match="Expected begin and add"):
+        robot.decide_added("unheard of")
+    with pytest.raises(xmlrpc.client.Fault, match="Expected begin before add"):
+        robot.add("unheard of", [1.0])
+
+
+def test_what_a_recorder_cut_is_decided_on(cell: Cell, stream: Dataset) -> None:
+    robot = cell.robot()
+    id_ = robot.begin()
+    assert cell.recorder.armed > 0
+    cell.recorder.traces.append(stream.X[2])
+    answer = robot.decide_recorded(id_)
+    assert (answer["id"], robot.decide_recorded(id_), robot.action_recorded(id_)) == (id_, answer, answer["action"])
+    assert np.array_equal(cell.find(id_).trace[0], stream.X[2])
+    robot.begin("named")
+    cell.recorder.traces.append(stream.X[3])
+    assert robot.decide_recorded()["id"] == "named"
+
+
+@pytest.mark.parametrize("wrong", ["nothing came", "another part", "never begun"])
+def test_what_was_not_recorded_is_verified_and_no_fault(cell: Cell, stream: Dataset, wrong: str) -> None:
+    robot = cell.robot()
+    id_ = robot.begin()
+    if wrong == "another part":
+        robot.begin()
+        cell.recorder.traces.append(stream.X[4])
+    answer = robot.decide_recorded("never" if wrong == "never begun" else id_)
+    cell.recorder.traces.clear()
+    assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "not_recorded")
+    assert robot.report(id_, True) is False  # nothing is known of it, and the robot goes on
+
+
+def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset, monkeypatch) -> None:
+    robot, free, begun = cell.robot(), threading.Event(), threading.Event()
+    with monkeypatch.context() as patch:
+        patch.setattr(cell.service._jobs, "maxsize", 1)
+        held = cell.service._put(lambda engine, late: (begun.set(), free.wait(60)))
+        begun.wait(60)
+        waiting = cell.service._put(lambda engine, late: None)
+        answer = robot.decide(stream.X[0].tolist(), "too much")
+        assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
+        assert robot.report("order-1", True) is False
+        free.set()
+        held.future.result(60), waiting.future.result(60)
+    assert cell.find("too much") is None
+
+
+def test_the_status_is_plain_values(cell: Cell) -> None:
+    said = cell.robot().status()
+    assert {type(value) for value in said.values()} <= {int, float, bool, str}
+    assert (said["version"], said["safe_mode"], said["shadow"]) == (cell.service.engine.version, "", False)
+    assert said["decisions"] >= 50
+    assert 0.0 < said["verified_share"] <= 1.0
+
+
+def test_reports_are_a_bool_and_one_a_decision(cell: Cell, stream: Dataset) -> None:
+    robot = cell.robot()
+    far = (stream.X[0] * -3.0).tolist()
+    assert robot.decide(far, "far")["action"] == VERIFY
+    assert robot.report("far", 1) is True
+    assert robot.report("far", True) is True
+    for said in (False, "OK", -1):
+        with pytest.raises(xmlrpc.client.Fault) as caught:
+            robot.report("far", said)
+        assert caught.value.faultCode == served.NO_REPORT
+    assert robot.report("unheard of", True) is False
+
+
+@pytest.mark.parametrize(
+    "trace", [[], [[]], [1.0, "2"], [True, 1.0], [[1.0], [1.0, 2.0]], [[[1.0]]], "1,2,3", 5, [1.0] * 10, [1.0, [2.0]]]
+)
+def test_what_is_no_trace_is_a_fault(cell: Cell, trace: object) -> None:
+    assert fault_of(cell.post(call("decide", trace))).faultCode == served.REFUSED
+
+
+def test_bad_samples_are_verified_and_not_refused(cell: Cell, stream: Dataset) -> None:
+    trace = stream.X[0].tolist()
+    for i, odd in enumerate((float("nan"), float("inf"), 1e308)):
+        answer = cell.robot().decide([odd, *trace[1:]], f"odd-{i}")
+        assert (answer["action"], answer["reason"]) == (VERIFY, "not_finite")
+
+
+BOMB = b'<?xml version="1.0"?><!DOCTYPE b [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;">]>'
+INSIDE = b"<methodCall><methodName>status</methodName><params>%s</params></methodCall>"
+PARAM = b"<param><value>%s</value></param>"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"{}",
+        b"<a>",
+        b"\0" * 100,
+        b"<methodResponse><params></params></methodResponse>",
+        BOMB + INSIDE % (PARAM % b"&b;"),
+        b'<?xml version="1.0"?><!DOCTYPE a SYSTEM "file:///etc/passwd">' + INSIDE % b"",
+        b'<?xml version="1.0" encoding="utf-7"?>' + INSIDE % b"",
+        b'<?xml version="1.0" encoding="no-such"?>' + INSIDE % b"",
+        "<?xml version='1.0' encoding='utf-16'?>".encode("utf-16") + INSIDE % b"",
+        b'<?xml version="1.0" encoding="utf-8"?>' + INSIDE % (PARAM % b"<string>\xff</string>"),
+        INSIDE % (PARAM % (b"<int>" + b"9" * 5000 + b"</int>")),
+        INSIDE % (PARAM % b"<int>one</int>"),
+        INSIDE % (PARAM % b"<base64>////==garbage</base64>"),
+        INSIDE % (PARAM % b"<struct><member><name>a</name><value>1</value></member></struct>"),
+        INSIDE % (PARAM % b"<dateTime.iso8601>20200101T00:00:00</dateTime.iso8601>"),
+        INSIDE % (PARAM % b"<nil/>"),
+        INSIDE % b"</array>",
+        INSIDE % (b"<array><data>" * 5000),
+    ],
+    ids=range(19),
+)
+def test_what_is_no_call_is_a_fault_of_one_line(cell: Cell, body: bytes) -> None:
+    assert fault_of(cell.post(body)).faultCode == served.NOT_XML
+
+
+def test_deep_lists_are_refused_and_no_stack_overflows(cell: Cell) -> None:
+    deep = b"<value><array><data>" * 3000 + b"</data></array></value>" * 3000
+    body = INSIDE.replace(b"status", b"decide") % (b"<param>%s</param>" % deep)
+    assert fault_of(cell.post(body)).faultCode == served.REFUSED
+
+
+def test_unknown_methods_and_wrong_numbers_of_arguments_are_faults(cell: Cell) -> None:
+    assert fault_of(cell.post(call("system.listMethods"))).faultCode == served.NO_METHOD
+    assert fault_of(cell.post(call("__init__"))).faultCode == served.NO_METHOD
+    assert fault_of(cell.post(call("decide"))).faultCode == served.WRONG_ARGUMENTS
+    assert fault_of(cell.post(call("report", "a", True, 1))).faultCode == served.WRONG_ARGUMENTS
+    assert fault_of(cell.post(call("decide", [1.0], "a\nb"))).faultCode == served.NO_REPORT
+
+
+def test_what_is_no_xml_rpc_at_all_is_refused_before_it_is_read(cell: Cell) -> None:
+    body = call("status")
+    assert cell.post(body, "application/json")[0] == 415
+    assert cell.post(body, method="GET")[0] == 405
+    assert cell.post(body, **{"Content-Encoding": "gzip"})[0] == 415
+    assert cell.post(b"x" * 200_001)[0] == 413
+    assert cell.post(body, "text/xml; charset=utf-8")[0] == 200
+
+
+def test_a_body_without_a_length_is_cut_off_at_the_limit(cell: Cell) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", cell.port, timeout=60)
+    connection.request("POST", "/RPC2", iter([b"x" * 70_000] * 3), {"Content-Type": "text/xml"}, encode_chunked=True)
+    assert connection.getresponse().status == 413
+    connection.close()
+
+
+def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell: Cell, monkeypatch, caplog) -> None:
+    def broken(*args: object) -> None:
+        raise KeyError("secret")
+
+    monkeypatch.setattr(cell.service, "decide", broken)
+    fault = fault_of(cell.post(call("decide", [1.0] * 60)))
+    assert fault.faultCode == served.OURS
+    assert "secret" not in fault.faultString
+    assert "a call failed" in caplog.text
+
+
+def test_pieces_are_bounded(cell: Cell) -> None:
+    robot = cell.robot()
+    ids = [robot.begin() for _ in range(9)]
+    with pytest.raises(xmlrpc.client.Fault, match="Expected begin before add"):
+        robot.add(ids[0], [1.0])
+    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == SAMPLES
+    with pytest.raises(xmlrpc.client.Fault, match=f"at most {SAMPLES} samples"):
+        robot.add(ids[-1], [0.0])
+
+
+def test_every_call_takes_as_many_arguments_as_it_says(cell: Cell) -> None:
+    from inspect import signature
+
+    for name, (_, fewest, most) in RobotCalls(cell.service).table().items():
+        method = getattr(RobotCalls, name.replace("action", "decide"))
+        taken = [p for p in signature(method).parameters.values() if p.name != "self"]
+        least = sum(p.default is p.empty for p in taken)
+        assert most == len(taken), name
+        assert fewest == least or (name.startswith("action") and fewest == least + 1), name
+
+
+def test_the_page_names_every_call(cell: Cell) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    for name in RobotCalls(cell.service).table():
+        assert f"`{name}" in page

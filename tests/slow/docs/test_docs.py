@@ -1,0 +1,190 @@
+"""Every command and snippet of the README and of the site runs, page by page, as a newcomer would type it; only smaller.
+
+Each page has a desk of its own and runs from top to bottom. A long command gets options behind its own, of which the last
+counts. What needs the network or would call this very suite is held to what can be known without running it.
+"""
+
+import json
+import multiprocessing
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPO = Path(__file__).resolve().parents[3]
+PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
+
+ONE_REPLAY = "--seeds 100:101 --cycles 60 --policies 0.2:0.8 --n-jobs 1"
+SMALL = "--data small.npz --samples 100"
+SMALLER = {  # by the command's beginning: options that make it quick
+    "dengine replay --data insertion": "--repeats 1 --cycles 120",
+    "dengine replay --data screw_driving.npz": "--cycles 60",
+    "dengine compare --data screw_driving.npz": "--repeats 1 --cycles 60 --n-jobs 1",
+    "dengine compare --data insertion": "--repeats 1 --cycles 80 --n-jobs 1",
+    "dengine compare --data insertion --reducers conv --paper": "--cycles 50",
+    "dengine compare --reducers pca,my_reducers:PeakReducer": "--cycles 80",
+    "dengine run --cell replay": "--cycles 80",
+    "dengine run --cell simulated": "--cycles 15",
+    "dengine costs": "--repeats 2 --cycles 70 --alphas 0.5 --lower-bounds 0.8 --n-jobs 1",
+    "dengine simulate": "--n 12 --n-jobs 1",
+    "dengine replay --data recordings": "--repeats 1 --cycles 80",
+    "dengine replay --data numbered.npz": "--cycles 80",
+    "dengine train --data insertion": "--data small.npz --retrains 1",
+    "dengine train --data recordings": "--retrains 1",
+    "python training/compare_reducers.py report --data insertion": f"{ONE_REPLAY} --reducers conv,pca,knn",
+    "python training/compare_reducers.py report --data screw_driving.npz": f"{ONE_REPLAY} --reducers conv,pca",
+    "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
+    "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1 --umap-most 1",
+    "python training/check_noise.py": "--data screw_driving.npz --samples 100 --seeds 100:101",
+    "python training/benchmark_faults.py": "--trials 1 --kills 1 --others 1 --only locked",
+    "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
+    "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",
+    "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100 --ur-rtde 0",
+    "python training/show_scenarios.py": "--cycles 12 --n-jobs 1",
+    "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
+    "python training/check_cost_choice.py": "--data small.npz --parts 40 --repeats 2 --escapes 60 --n-jobs 1",
+    "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
+    "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
+    "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
+    "cmake --build build/cpp": "--parallel 2",
+    "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
+}
+HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")
+NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what installs
+CPP = ("cmake", "build/")
+PYTHON = ("dengine ", "python training/", "python snippet.py")
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(
+    ["dengine.cli", "dengine.engine.engine", "dengine.experiments.grid", "dengine.store.sql", *HEAVY]
+)
+RUNS, STEP_S = 80, 0.0012  # of the recordings that stand in for the public ones
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    language: str
+    title: str
+    text: str
+
+    @property
+    def commands(self) -> list[str]:
+        """The lines of a shell block, without comments."""
+        return [line for line in re.sub(r"\s+#.*$", "", self.text, flags=re.M).splitlines() if line.strip()]
+
+
+def blocks(page: Path) -> list[Block]:
+    """A page's fenced blocks; a title names the file that a reader would save a block as."""
+    found = re.findall(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', page.read_text(encoding="utf-8"), flags=re.S | re.M)
+    return [Block(*each) for each in found]
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(REPO))
+
+
+COMMANDS = [command for page in PAGES for block in blocks(page) if block.language == "sh" for command in block.commands]
+TYPED = [page for page in PAGES if any(block.language in ("sh", "python") for block in blocks(page))]
+HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Path:
+    """A folder that looks like a clone to whoever types in it, and keeps what the commands write."""
+    for folder in ("training", "tests", "models", "notebooks"):
+        (tmp_path / folder).symlink_to(REPO / folder)
+    X, y = recordings()
+    np.savez(tmp_path / "small.npz", X=X[:, ::5], y=y)  # in the place of a large set
+    return tmp_path
+
+
+def recordings() -> tuple[np.ndarray, np.ndarray]:
+    """A few traces (RUNS, 500), told apart by their height, and labels."""
+    rng = np.random.default_rng(0)
+    y = (rng.random(RUNS) < 0.7).astype(np.int8)
+    slope = np.where(y == 1, 2.0, 1.0)[:, None]
+    return slope * np.arange(500) * STEP_S + rng.normal(0.0, 0.01, (RUNS, 500)), y
+
+
+def record(folder: Path) -> None:
+    """Recordings in the form of the public ones, as `git clone` would bring them."""
+    folder.mkdir(parents=True)
+    time = (np.arange(500) * STEP_S).tolist()
+    for i, (torque, good) in enumerate(zip(*recordings(), strict=True)):
+        graph = {"graph": {"time values": time, "torque values": torque.tolist()}}
+        run = {"id code": str(i // 10), "result": "OK" if good else "NOK", "tightening steps": [graph]}
+        (folder / f"Ch_{i:012d}.json").write_text(json.dumps(run), encoding="utf-8")
+
+
+def shell(command: str, desk: Path) -> None:
+    """Run one command as it is typed, with the environment activated."""
+    if command.startswith(PYTHON) and not re.search(r"[<>|$&;`]", command):
+        python(shlex.split(command.removeprefix("python ")), desk)
+        return
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    env = os.environ | {"PATH": path, "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
+    done = subprocess.run(["bash", "-c", command], cwd=desk, env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
+
+
+def python(words: list[str], desk: Path) -> None:
+    """Run a script or `dengine` in a fork of a process that has imported torch already: eighty would wait for it."""
+    said = desk / "said.txt"
+    given = {"WHERE": str(desk), "ARGV": words, "SAID": str(said)}
+    typed = {"init_globals": given, "run_name": "typed"}
+    process = FORKS.Process(target=runpy.run_path, args=(str(REPO / "tests" / "typed.py"),), kwargs=typed)
+    process.start()
+    process.join(300)
+    process.kill()
+    assert process.exitcode == 0, f"{' '.join(words)}\n{said.read_text(encoding='utf-8')[-4000:]}"
+
+
+def smaller(command: str) -> str:
+    """The command with its quick options, where it has any."""
+    extra = [options for beginning, options in SMALLER.items() if command.startswith(beginning)]
+    return " ".join([command, *extra])
+
+
+def type_in(command: str, desk: Path) -> None:
+    """One line of a shell block, as far as it can be run here."""
+    if command.startswith("git clone"):
+        record(desk / command.rsplit("/", 1)[1] / "data")
+    elif command.startswith(CPP) and not HAS_CPP:
+        assert "DENGINE_REQUIRE_CPP" not in os.environ
+    elif command.startswith("python training/benchmark_export.py") and not HAS_CPP:
+        shell(smaller(command).replace("--cell build/cpp/dengine-cell", ""), desk)
+    elif not command.startswith(NOT_RUN):
+        shell(smaller(command), desk)
+
+
+def snippet(block: Block, desk: Path) -> None:
+    """A block of Python: saved where it has a file's name, run where it has none."""
+    if block.title:
+        (desk / block.title).write_text(block.text, encoding="utf-8")
+        return
+    (desk / "snippet.py").write_text(block.text, encoding="utf-8")
+    for _ in range(2 if "open_or_create" in block.text else 1):  # a cell's program is started again
+        shell("python snippet.py", desk)
+
+
+@pytest.mark.parametrize("page", TYPED, ids=name)
+def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path) -> None:
+    for block in blocks(page):
+        if block.language == "python":
+            snippet(block, desk)
+        if block.language == "sh":
+            for command in block.commands:
+                type_in(command, desk)
+
+
+def test_every_shortened_command_is_on_a_page() -> None:
+    assert [beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in COMMANDS)] == []

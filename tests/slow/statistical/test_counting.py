@@ -1,0 +1,180 @@
+"""Honest counting, and six ways to cheat: each one is seen by the very check that the honest engine passes beside it.
+
+The count-only statistic sees labels that are counted where they were learned; the blindness check, what is chosen by them,
+however little it is worth; the guarantee's replay, evidence that was taken after its label.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from proof.blindness import moved, places, weak_signal
+from proof.counts import count_noise, mean_square, relabelled, white_noise
+from proof.replays import Case, broken, judge
+from torch import Tensor
+
+from dengine import load_dataset
+from dengine.engine.versions import ModelVersions
+from dengine.folds import content_fold
+from dengine.model import neighbours as prediction
+from dengine.model.base import Told
+from dengine.model.neighbours import ModelPrediction
+from dengine.recipe import RECIPES
+from dengine.records import Reason
+from dengine.reducers import heads as logistic
+from dengine.reducers import scored
+from dengine.reducers.heads import CrossFittedScores
+
+HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
+SEEDS = 16
+JUST_BEYOND = Case("just beyond", "just beyond", reducer="pca", alpha=0.2, lower_bound=0.8, cycles=500)
+
+
+def z2(reducer: str = "conv", seeds: int = SEEDS) -> float:
+    return mean_square(count_noise(RECIPES[reducer], white_noise(500, 0.8, seed), seed) for seed in range(seeds))
+
+
+def peeks(*strengths: float, folds: tuple[int, ...] = (3,)) -> float:
+    """Largest share of traces whose place in a fold's space was moved by the fold's labels."""
+    return max(moved(RECIPES["conv"], weak_signal(200, s, seed=1), fold, seed=0) for s in strengths for fold in folds)
+
+
+def worse_than_allowed(replays: int) -> float:
+    """Share of replays in which accepted parts were worse than the tolerance, where every part is."""
+    return broken([judge(JUST_BEYOND, seed) for seed in range(replays)], "accepted_failure", 0.2) / replays
+
+
+# ------------------------------------------------------------------------------------------------ the honest engine
+
+
+@pytest.mark.parametrize(("reducer", "seeds"), [("conv", SEEDS), ("pca", 2 * SEEDS)])  # the plane of pca has fewer balls
+def test_labels_of_noise_are_counted_as_chance_says(reducer: str, seeds: int) -> None:
+    assert HONEST[0] <= z2(reducer, seeds) <= HONEST[1]
+
+
+def test_labels_of_noise_on_real_traces_are_counted_as_chance_says(proof_repeats: int) -> None:
+    X = load_dataset("insertion").X[:, ::10]
+    seeds = range(max(SEEDS, proof_repeats))
+    found = mean_square(count_noise(RECIPES["conv"], relabelled(X, 500, 0.5, seed), seed) for seed in seeds)
+    assert HONEST[0] - 0.1 <= found <= HONEST[1]
+
+
+def test_no_label_of_a_fold_moves_anything_in_its_own_space() -> None:
+    assert peeks(2.0, 8.0, folds=(0, 3)) == 0.0
+
+
+def test_it_would_be_seen_in_the_other_spaces() -> None:
+    # Or a check that compares nothing would pass.
+    data = weak_signal(200, 8.0, seed=1)
+    own = content_fold(data.X[:, None, :], 5)
+    turned = replace(data, y=np.where(own == 0, 1 - data.y, data.y).astype(np.int8))
+    one, other = places(RECIPES["conv"], data, 0), places(RECIPES["conv"], turned, 0)
+    assert np.nanmax(np.abs(one[:, 1] - other[:, 1])) > 0.05
+
+
+def test_where_every_part_is_just_beyond_the_tolerance_hardly_any_replay_accepts(proof_repeats: int) -> None:
+    assert worse_than_allowed(max(5, proof_repeats)) <= 0.2
+
+
+# ---------------------------------------------------------------------------------------------------- six mutations
+
+Mutation = Callable[[pytest.MonkeyPatch], None]
+
+
+def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
+    head = CrossFittedScores._head
+    patch.setattr(CrossFittedScores, "_head", lambda self, k, g, y, out, l2: head(self, k, g, y, torch.ones_like(out), l2))
+
+
+def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
+    train, fold_of, rng = ModelPrediction.train, prediction.fold_of, np.random.default_rng(0)
+    salt = [0]
+
+    def train_anew(self: Any, *args: Any, **options: Any) -> Any:
+        salt[0] = int(rng.integers(2**62))
+        return train(self, *args, **options)
+
+    patch.setattr(ModelPrediction, "train", train_anew)
+    patch.setattr(prediction, "fold_of", lambda hashes, folds: fold_of(hashes ^ np.int64(salt[0]), folds))
+
+
+def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(scored, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+
+
+def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
+    def train_on(
+        self: Any, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: Any, least: int = 0
+    ) -> int:
+        g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
+        heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
+        steps = logistic._interleave(heads, max_iter, stop, least)
+        new, old, base = (
+            np.mean([f(h) for h in heads])
+            for f in (lambda h: h.leave_one_out_loss(), lambda h: h.first_loss, lambda h: h.base_rate_loss())
+        )
+        self.kept.fill_(bool(new > max(old, base)))
+        if not self.kept[0]:
+            for k, head in enumerate(heads):
+                self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
+        self._turn(g[:, :-1])
+        return steps
+
+    patch.setattr(CrossFittedScores, "train_on", train_on)
+
+
+def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
+    train_on = CrossFittedScores.train_on
+
+    def screened(self: Any, g: Tensor, y: Tensor, folds: Tensor, *rest: Any) -> int:
+        relevance = ((g - g.mean(0)) * (y - y.double().mean())[:, None]).mean(0).abs() / (g.std(0) + 1e-9)
+        best = torch.zeros(g.size(1)).index_fill_(0, relevance.topk(10).indices, 1.0)
+        self.weight[:: self.dim] *= best
+        steps = train_on(self, g * best, y, folds, *rest)
+        self.weight[:: self.dim] *= best
+        return steps
+
+    patch.setattr(CrossFittedScores, "train_on", screened)
+
+
+def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
+    def learn(self: Any, known: Any, success: bool, point: Any, silent: int) -> None:
+        lower, upper = known.lower, known.upper
+        self.newest.add_safely(point, int(success), known.content_hash)
+        if self.answering is not None:
+            now = self.answering.predict_one(known.trace)
+            lower, upper = now.lower, now.upper
+        self.newest.tell_safely(Told(lower, upper, success, known.reason is Reason.NOVEL, silent))
+        self.new_labels += 1
+
+    patch.setattr(ModelVersions, "learn", learn)
+
+
+@contextmanager
+def mutated(mutation: Mutation) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        mutation(patch)
+        yield
+
+
+@pytest.mark.parametrize("mutation", [heads_of_all_folds, references_at_the_mean_of_heads])
+def test_labels_counted_where_they_were_learned_are_caught(mutation: Mutation) -> None:
+    with mutated(mutation):
+        assert z2(seeds=SEEDS // 4) > 1.5 * HONEST[1]
+
+
+@pytest.mark.parametrize(
+    "mutation", [heads_of_all_folds, folds_dealt_anew, one_gate_for_all_heads, features_screened_by_labels]
+)
+def test_whatever_a_label_chose_in_its_own_space_is_caught(mutation: Mutation) -> None:
+    with mutated(mutation):
+        assert peeks(2.0) > 0.1
+
+
+def test_evidence_that_is_taken_after_its_label_is_caught() -> None:
+    with mutated(evidence_after_its_label):
+        assert worse_than_allowed(3) > 0.5

@@ -1,0 +1,28 @@
+"""The trained files in models/ are whole, load here, and say what they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import Recipe, load_dataset, load_exported
+
+MODELS = sorted((Path(__file__).parents[2] / "models").glob("*/model.ts"))
+
+
+@pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
+def test_a_shipped_model_loads_and_is_certain_and_right_of_most_of_its_own_data(path: Path) -> None:
+    model, data = load_exported(path), load_dataset("insertion")
+    assert model.metadata["references"] == len(data)
+    decisions = model.decide_many(data.X[:300])
+    accepted = np.array([d.action == "accept" for d in decisions])
+    rejected = np.array([d.action == "reject" for d in decisions])
+    assert (accepted | rejected).mean() > 0.5
+    assert data.y[:300][accepted].mean() >= Recipe.load(path.parent.name).policy.lower_bound
+
+
+@pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
+def test_a_shipped_model_has_a_card_with_the_command_that_made_it(path: Path) -> None:
+    assert f"--out models/{path.parent.name}" in (path.parent / "card.md").read_text(encoding="utf-8")

@@ -1,0 +1,274 @@
+"""The simulated cell keeps the cell protocol, its clock, and its physics."""
+
+from __future__ import annotations
+
+import builtins
+from dataclasses import fields, replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from dengine.cells.base import Cell
+from dengine.cells.simulation.cell import CAUSES, SimulatedCell, insert_once
+from dengine.cells.simulation.conditions import (
+    JUMP_N,
+    SCENARIOS,
+    WEAR_FRICTION,
+    CellParameters,
+    Conditions,
+    draw_conditions,
+    find_scenario,
+)
+from dengine.cells.simulation.generate import save_traces, simulate, simulate_balanced
+from dengine.cells.simulation.world import push
+from dengine.errors import DengineError, SettingError
+from dengine.records import Outcome
+
+NO_FAULTS = CellParameters(missed_grasp=0, weak_grip=0, debris=0, wrong_part=0)
+ALWAYS_GOOD = replace(NO_FAULTS, offset_sd_mm=0.0, tilt_sd_deg=0.0, yaw_sd_deg=0.0, clearance_mm=(0.4, 0.4))
+ALWAYS_MISSED = CellParameters(missed_grasp=1, weak_grip=0, debris=0, wrong_part=0)
+
+
+def good(**changes: float | str) -> Conditions:
+    """A well aligned part, but for these changes."""
+    return replace(draw_conditions(ALWAYS_GOOD, np.random.default_rng(0)), force_limit_n=40.0, **changes)
+
+
+def test_it_is_a_cell() -> None:
+    assert isinstance(SimulatedCell(), Cell)
+
+
+@pytest.mark.parametrize(("channels", "shape"), [("z", (1000,)), ("all", (6, 1000))])
+def test_a_trace_has_one_thousand_samples_per_channel(channels: str, shape: tuple[int, ...]) -> None:
+    trace = SimulatedCell(channels=channels).insert()
+    assert trace.shape == shape
+    assert trace.dtype == np.float32
+    assert np.isfinite(trace).all()
+
+
+def test_all_channels_contain_the_same_z_force() -> None:
+    one = insert_once(CellParameters(), seed=3, cycle=1, channels="z").trace
+    six = insert_once(CellParameters(), seed=3, cycle=1, channels="all").trace
+    np.testing.assert_array_equal(six[2], one)
+
+
+def test_a_well_aligned_part_seats_and_meets_the_bottom_late() -> None:
+    pushed = push(good())
+    assert abs(pushed.height_mm) < 0.5
+    force = pushed.wrench[:, 2]
+    assert np.abs(force[:400]).max() < 3
+    assert 8 < force[-50:].mean() < 41
+
+
+def test_a_part_beside_the_hole_rests_on_the_rim_at_the_force_limit() -> None:
+    pushed = push(good(offset_x_mm=5.0))
+    assert pushed.height_mm > 11
+    assert pushed.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
+
+
+def test_debris_holds_the_part_up_by_its_thickness() -> None:
+    assert push(good(fault="debris", debris_mm=2.0)).height_mm == pytest.approx(2.0, abs=0.5)
+
+
+def test_a_weak_grip_slips_at_its_own_force() -> None:
+    pushed = push(good(fault="weak_grip", grip_n=12.0, offset_x_mm=5.0))
+    assert pushed.slip_mm > 1
+    assert np.median(pushed.wrench[400:500, 2]) == pytest.approx(12.0, abs=3.0)
+
+
+def test_a_missed_grasp_meets_nothing() -> None:
+    pushed = push(good(fault="missed_grasp"))
+    assert np.abs(pushed.wrench[:, 2]).max() < 2
+    assert pushed.height_mm < -10
+
+
+def test_a_longer_part_stands_out_of_the_fixture() -> None:
+    assert push(good(fault="wrong_part", extra_length_mm=2.0)).height_mm == pytest.approx(2.0, abs=0.3)
+
+
+def test_the_label_is_the_height_alone() -> None:
+    traces = simulate(12, seed=5, n_jobs=1)
+    np.testing.assert_array_equal(traces.y == 1, np.abs(traces.height_mm) <= CellParameters().height_tolerance_mm)
+    assert set(traces.cause) <= set(CAUSES)
+    np.testing.assert_array_equal(traces.cause == "none", traces.y == 1)
+
+
+def test_a_trace_depends_on_seed_and_cycle_only() -> None:
+    few, many = simulate(3, seed=9, n_jobs=1), simulate(6, seed=9, n_jobs=2)
+    np.testing.assert_array_equal(few.X, many.X[:3])
+    assert not np.array_equal(few.X, simulate(3, seed=10, n_jobs=1).X)
+
+
+def test_the_cell_replays_what_simulate_makes() -> None:
+    cell, traces = SimulatedCell(seed=2), simulate(3, seed=2, n_jobs=1)
+    for trace, label in zip(traces.X, traces.y, strict=True):
+        np.testing.assert_array_equal(cell.insert(), trace)
+        assert cell.verify() == bool(label)
+
+
+def test_the_cell_still_makes_the_bundled_traces() -> None:
+    with (files("dengine") / "data" / "insertion.npz").open("rb") as file, np.load(file) as stored:
+        bundled, cycles, seed = stored["X"][:5] * stored["scale"], stored["cycle"][:5], int(stored["seed"])
+    made = np.stack([insert_once(CellParameters(), seed, int(cycle)).trace for cycle in cycles])
+    assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
+
+
+def test_quotas_keep_the_first_of_each_label_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dengine.cells.simulation.generate._BLOCK", 5)
+    traces = simulate_balanced(successes=2, failures=2, seed=5, n_jobs=1)
+    assert sorted(traces.y) == [0, 0, 1, 1]
+    assert list(traces.cycle) == sorted(traces.cycle)
+    whole = simulate(int(traces.cycle[-1]) + 1, seed=5, n_jobs=1)
+    np.testing.assert_array_equal(whole.X[traces.cycle], traces.X)
+    for label in (0, 1):
+        np.testing.assert_array_equal(np.flatnonzero(whole.y == label)[:2], traces.cycle[traces.y == label])
+
+
+def test_progress_is_told_of_every_trace() -> None:
+    seen: list[tuple[int, int]] = []
+    simulate(3, n_jobs=1, progress=lambda done, of: seen.append((done, of)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_the_clock_charges_cycles_verifications_and_stops() -> None:
+    cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=0.0))
+    cell.insert()
+    assert not cell.verify()
+    cell.insert()
+    assert cell.proceed() is Outcome.STOPPED
+    assert cell.clock == 47 + 5 + 47 + 120
+    report = cell.report()
+    assert (report.cycles, report.finished, report.verifications, report.stops) == (2, 0, 1, 1)
+    assert report.seconds_saved == 5 - 120
+
+
+def test_a_silent_failure_is_an_escape() -> None:
+    cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=1.0))
+    cell.insert()
+    assert cell.proceed() is Outcome.UNKNOWN
+    assert cell.report().escapes == 1
+
+
+@pytest.mark.parametrize(("confirm_share", "outcome"), [(0.0, Outcome.UNKNOWN), (1.0, Outcome.CONFIRMED)])
+def test_a_good_part_passed_on_is_silent_unless_confirmed(confirm_share: float, outcome: Outcome) -> None:
+    cell = SimulatedCell(replace(ALWAYS_GOOD, confirm_share=confirm_share))
+    cell.insert()
+    assert cell.proceed() is outcome
+    report = cell.report()
+    assert report.finished == 1
+    assert report.seconds_saved == 5
+    assert report.parts_per_hour == pytest.approx(3600 / 47)
+
+
+def test_a_good_part_sent_back_costs_a_further_cycle() -> None:
+    cell = SimulatedCell(ALWAYS_GOOD)
+    cell.insert()
+    cell.reject()
+    cell.insert()
+    cell.verify()
+    assert cell.clock == 47 + 47 + 5
+    report = cell.report()
+    assert (report.finished, report.sent_back) == (1, 1)
+    assert report.seconds_saved == (47 + 5) - cell.clock  # always verifying, one part would have taken 52 s
+
+
+@pytest.mark.parametrize("call", ["verify", "proceed", "reject"])
+def test_a_part_is_taken_once(call: str) -> None:
+    cell = SimulatedCell()
+    with pytest.raises(DengineError, match=r"insert\(\) before"):
+        getattr(cell, call)()
+    cell.insert()
+    getattr(cell, call)()
+    with pytest.raises(DengineError, match=r"insert\(\) before"):
+        getattr(cell, call)()
+
+
+def test_two_inserts_in_a_row_are_refused() -> None:
+    cell = SimulatedCell()
+    cell.insert()
+    with pytest.raises(DengineError, match="after insert"):
+        cell.insert()
+
+
+def test_scenarios_change_what_they_say_and_nothing_else() -> None:
+    base = CellParameters()
+    changed = {
+        name: {
+            field.name
+            for field in fields(base)
+            if getattr(scenario(base, 99, 100), field.name) != getattr(base, field.name)
+        }
+        for name, scenario in SCENARIOS.items()
+    }
+    assert changed == {
+        "nominal": set(),
+        "wear": {"friction"},
+        "variant": {"part_mass_kg", "clearance_mm", "chamfer_mm"},
+        "bias_jump": {"bias_offset_n"},
+    }
+    assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + WEAR_FRICTION)
+    for name in ("variant", "bias_jump"):
+        assert SCENARIOS[name](base, 49, 100) == base
+
+
+def test_a_bias_jump_shifts_the_force_and_keeps_the_truth() -> None:
+    before, after = simulate(4, seed=1, n_jobs=1), simulate(4, seed=1, n_jobs=1, scenario="bias_jump")
+    np.testing.assert_array_equal(before.height_mm, after.height_mm)
+    np.testing.assert_array_equal(before.X[:2], after.X[:2])
+    np.testing.assert_allclose(after.X[2:].mean(axis=1) - before.X[2:].mean(axis=1), JUMP_N, atol=0.2)
+
+
+def test_the_sensor_draw_does_not_touch_the_world() -> None:
+    quiet = insert_once(replace(CellParameters(), noise_n=(0.0, 0.0), bias_n=(0.0, 0.0)), seed=4, cycle=0)
+    loud = insert_once(replace(CellParameters(), noise_n=(2.0, 2.0), bias_n=(5.0, 5.0)), seed=4, cycle=0)
+    assert quiet.conditions == loud.conditions
+    assert quiet.height_mm == loud.height_mm
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (lambda: CellParameters(friction=(0.5, 0.1)), "low <= high"),
+        (lambda: CellParameters(debris=8.0), "probability"),
+        (lambda: CellParameters(noise_n=(-1.0, 1.0)), "at least 0"),
+        (lambda: CellParameters(debris=0.6, weak_grip=0.6), "sum to at most 1"),
+        (lambda: find_scenario("rain"), "nominal, wear, variant, bias_jump"),
+        (lambda: SimulatedCell(channels="x"), "z, all"),
+        (lambda: SimulatedCell(cycles=0), "at least 1"),
+        (lambda: simulate(0), "at least 1"),
+        (lambda: simulate(1, channels="y"), "z, all"),
+        (lambda: push(good(), time_step_s=0.0007), "divides 2 ms"),
+        (lambda: push(good(chamfer_mm=0.0)), "above zero"),
+    ],
+)
+def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        bad()  # type: ignore[operator]
+
+
+def test_a_missing_mujoco_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *args: object, **kwargs: object) -> object:
+        if name == "mujoco":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(DengineError, match=r"pip install dengine\[sim\]"):
+        SimulatedCell().insert()
+
+
+@pytest.mark.parametrize(("channels", "shape"), [("z", (4, 1000)), ("all", (4, 6, 1000))])
+def test_saved_traces_come_back_within_one_step(tmp_path, channels: str, shape: tuple[int, ...]) -> None:
+    traces = simulate(4, seed=6, n_jobs=1, channels=channels)
+    with np.load(save_traces(tmp_path / "traces.npz", traces), allow_pickle=False) as saved:
+        assert saved["X"].dtype == np.int16
+        assert saved["X"].shape == shape
+        np.testing.assert_allclose(saved["X"] * saved["scale"], traces.X, atol=0.51 * float(saved["scale"].max()))
+        np.testing.assert_array_equal(saved["y"], traces.y)
+        np.testing.assert_array_equal(saved["cause"], traces.cause)
+        assert float(saved["rate_hz"]) == 500

@@ -1,0 +1,293 @@
+"""One long recording of a wrench, as ROS 2 writes it: cut into insertions, its gaps said; in files that mcap writes."""
+
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dengine import load_dataset
+from dengine.cli import main
+from dengine.datasets.cutting import slots, usual_step
+from dengine.datasets.triggers import ContactTrigger
+from dengine.errors import DataError
+
+writing = pytest.importorskip("mcap_ros2.writer", reason='mcap is not installed: pip install "dengine[mcap]"')
+
+STEP = 2_000_000  # nanoseconds
+BEGIN = 1_700_000_000_000_000_000
+SAMPLES, REST = 60, 40  # of an insertion, and between two
+WRENCH = """std_msgs/Header header
+geometry_msgs/Wrench wrench
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Wrench
+geometry_msgs/Vector3 force
+geometry_msgs/Vector3 torque
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+BARE = WRENCH.split("MSG: geometry_msgs/Wrench\n")[1]
+FORCE, PHASE, CHECK = "/ft/wrench", "/phase", "/height_check/ok"
+
+
+def vector(values: np.ndarray) -> dict[str, float]:
+    return dict(zip("xyz", values.tolist(), strict=True))
+
+
+class Bag:
+    """Writes a recording of n insertions; what a test changes of it are the times, and which messages are left out."""
+
+    def __init__(self, n: int = 8, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.good = rng.random(n) < 0.6
+        self.traces = rng.normal(0.0, 1.0, (n, 6, SAMPLES)) + 10.0
+        length = n * (SAMPLES + REST) + REST
+        self.wrench = np.zeros((length, 6))
+        self.phase = np.zeros(length, dtype=int)
+        self.starts = [REST + i * (SAMPLES + REST) for i in range(n)]
+        for start, trace in zip(self.starts, self.traces, strict=True):
+            self.wrench[start : start + SAMPLES] = trace.T
+            self.phase[start : start + SAMPLES] = 1
+        self.stamps = BEGIN + STEP * np.arange(length)
+        self.logged = self.stamps + 500_000
+        self.lost: set[int] = set()
+        self.stamped = True
+        self.told = {i: bool(good) for i, good in enumerate(self.good)}
+
+    def write(self, path: Path, parts: slice = slice(None)) -> Path:
+        with path.open("wb") as file:
+            writer = writing.Writer(file)
+            kinds = {
+                FORCE: ("geometry_msgs/msg/WrenchStamped", WRENCH) if self.stamped else ("geometry_msgs/msg/Wrench", BARE),
+                PHASE: ("std_msgs/msg/Int32", "int32 data"),
+                CHECK: ("std_msgs/msg/Bool", "bool data"),
+            }
+            schemas = {topic: writer.register_msgdef(*kind) for topic, kind in kinds.items()}
+            ends = {start + SAMPLES + 10: i for i, start in enumerate(self.starts)}
+            sequence = count()
+            for i in range(len(self.wrench))[parts]:
+                time = int(self.logged[i])
+
+                def put(topic: str, message: dict, time: int = time) -> None:
+                    writer.write_message(topic, schemas[topic], message, time, time, next(sequence))
+
+                put(PHASE, {"data": int(self.phase[i])})
+                if i not in self.lost:
+                    put(FORCE, self.message(i))
+                if i in ends and ends[i] in self.told:
+                    put(CHECK, {"data": self.told[ends[i]]})
+            writer.finish()
+        return path
+
+    def message(self, i: int) -> dict:
+        wrench = {"force": vector(self.wrench[i, :3]), "torque": vector(self.wrench[i, 3:])}
+        sec, nanosec = divmod(int(self.stamps[i]), 10**9)
+        header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "tool0"}
+        return {"header": header, "wrench": wrench} if self.stamped else wrench
+
+
+ASKED = {"trigger": "register@/phase", "label": CHECK, "samples": SAMPLES}
+
+
+@pytest.fixture
+def bag() -> Bag:
+    return Bag()
+
+
+def test_a_recording_is_cut_into_its_insertions_with_their_labels(bag: Bag, tmp_path: Path) -> None:
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    np.testing.assert_array_equal(data.y, bag.good)
+    assert (data.name, data.channels, data.rate_hz, data.faults) == ("cell", ("FZ",), 500.0, ())
+    assert data.source.tolist() == [f"cell/{i}" for i in range(1, 9)]
+
+
+@pytest.mark.parametrize("trigger", ["contact=5", "contact=5@FZ", ContactTrigger(5.0, "FX_Base", quiet_s=0.05)])
+def test_it_is_cut_by_the_same_triggers_as_a_live_one(bag: Bag, tmp_path: Path, trigger) -> None:
+    quiet = ContactTrigger(5.0, "FZ", quiet_s=0.05) if isinstance(trigger, str) else trigger
+    asked = {**ASKED, "trigger": quiet}
+    np.testing.assert_array_equal(load_dataset(bag.write(tmp_path / "a.mcap"), **asked).X, bag.traces[:, 2].astype("f4"))
+    asked["trigger"] = trigger  # 0.08 s of rest are less than the 0.2 s that its text stands for
+    if isinstance(trigger, str):
+        with pytest.raises(DataError, match="it never does"):
+            load_dataset(tmp_path / "a.mcap", **asked)
+
+
+def test_several_channels_under_either_name(bag: Bag, tmp_path: Path) -> None:
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), channel="FX,MuZ_Base", **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[:, [0, 5]].astype(np.float32))
+    assert data.unit == "mixed units"
+
+
+def test_a_bag_of_several_files_is_one_recording(bag: Bag, tmp_path: Path) -> None:
+    folder = tmp_path / "cell"
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n", encoding="utf-8")
+    middle = bag.starts[3] + 20  # in an insertion
+    bag.write(folder / "cell_2.mcap", slice(0, middle))
+    bag.write(folder / "cell_10.mcap", slice(middle, None))
+    data = load_dataset(folder, **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    assert not data.faults
+
+
+def test_a_message_that_was_lost_is_a_fault_and_says_where(bag: Bag, tmp_path: Path) -> None:
+    bag.lost = {
+        bag.starts[1] + 30,
+        *range(bag.starts[4] + 10, bag.starts[4] + 15),
+        bag.starts[5],
+        bag.starts[6] + SAMPLES - 1,
+    }
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[[0, 2, 3, 7], 2].astype(np.float32))
+    assert [str(fault) for fault in data.faults] == [
+        f"cell/2: Expected a message each 0.002 s, 1 of {SAMPLES} are missing, the first at sample 30",
+        f"cell/5: Expected a message each 0.002 s, 5 of {SAMPLES} are missing, the first at sample 10",
+        "cell/6: Expected the message that it begins with, that one fell into a gap",
+        f"cell/7: Expected a message each 0.002 s, 1 of {SAMPLES} are missing, the first at sample {SAMPLES - 1}",
+    ]
+
+
+def test_a_message_that_came_late_is_not_lost(bag: Bag, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    bag.stamps = bag.stamps + rng.integers(0, STEP // 3, len(bag.stamps))
+    start = bag.starts[2]
+    bag.stamps[start + 5 : start + 35] = bag.stamps[start + 34] + np.arange(30)  # all stamped in one burst
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
+    assert not data.faults
+
+
+def test_a_clock_that_is_a_little_fast_loses_nothing_in_a_long_recording(bag: Bag, tmp_path: Path) -> None:
+    bag.stamps = BEGIN + (np.arange(len(bag.stamps)) * STEP * 1.0007).astype(np.int64)
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    assert (len(data), data.faults) == (8, ())
+    assert data.rate_hz == 499.7
+
+
+def test_times_that_turn_back_are_a_fault_unless_a_rate_is_stated(bag: Bag, tmp_path: Path) -> None:
+    bag.stamps[bag.starts[1] + 7] = bag.stamps[bag.starts[1] + 6]
+    path = bag.write(tmp_path / "cell.mcap")
+    data = load_dataset(path, **ASKED)
+    assert [str(fault) for fault in data.faults] == [
+        "cell/2: Expected later times from message to message, sample 7 is not later"
+    ]
+    assert len(load_dataset(path, rate_hz=500.0, **ASKED)) == 8
+
+
+def test_without_stamps_the_log_tells_the_times(bag: Bag, tmp_path: Path) -> None:
+    bag.stamped = False
+    bag.lost = {bag.starts[0] + 9}
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    np.testing.assert_array_equal(data.X, bag.traces[1:, 2].astype(np.float32))
+    assert len(data.faults) == 1
+
+
+def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path) -> None:
+    path, table = bag.write(tmp_path / "cell.mcap"), tmp_path / "labels.csv"
+    rows = [f"{i},{'OK' if good else 'NOK'},P{i // 2}" for i, good in enumerate(bag.good, start=1)]
+    table.write_text("\n".join(["insertion,label,part", *rows[:-1], "77,OK,P9"]), encoding="utf-8")
+    asked = {name: ASKED[name] for name in ("trigger", "samples")}
+    data = load_dataset(path, labels=table, **asked)
+    np.testing.assert_array_equal(data.y, bag.good[:-1])
+    assert data.part.tolist() == [f"P{i // 2}" for i in range(1, 8)]
+    assert [fault.source for fault in data.faults] == ["cell/8", "labels.csv"]
+
+
+def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(bag: Bag, tmp_path: Path) -> None:
+    del bag.told[2]
+    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
+    np.testing.assert_array_equal(data.y, np.delete(bag.good, 2))
+    assert str(data.faults[0]).startswith(f"cell/3: Expected a message of {CHECK} before the next insertion")
+    bag.told = {0: True}
+    with pytest.raises(DataError, match="7 of 8 have none"):
+        load_dataset(bag.write(tmp_path / "few.mcap"), **ASKED)
+
+
+def test_an_insertion_is_two_seconds_where_nothing_else_was_asked(bag: Bag, tmp_path: Path) -> None:
+    asked = {**ASKED, "samples": None}
+    with pytest.raises(DataError, match="found none of 1"):  # the whole file is shorter than one
+        load_dataset(bag.write(tmp_path / "cell.mcap"), **asked)
+
+
+def without(name: str) -> Callable[[dict], dict]:
+    return lambda asked: {key: value for key, value in asked.items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (without("trigger"), "Expected a trigger that cuts"),
+        (without("label"), "Expected the labels' topic"),
+        (lambda a: {**a, "trigger": "register@/nothing"}, "Expected the topic /nothing"),
+        (lambda a: {**a, "label": "/nothing"}, "Expected the topic /nothing"),
+        (lambda a: {**a, "topic": PHASE}, "Expected a topic of a wrench"),
+        (lambda a: {**a, "channel": "actual_q[5]"}, "Expected a channel among FX"),
+        (lambda a: {**a, "trigger": f"register@{FORCE}"}, "Expected messages with a field data"),
+        (lambda a: {**a, "trigger": "contact=500"}, "it never does"),
+    ],
+    ids=["no trigger", "no labels", "no signal", "no label topic", "no wrench", "no channel", "no data", "never"],
+)
+def test_what_cannot_be_cut_is_said_with_what_to_give(bag: Bag, tmp_path: Path, change: Callable, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        load_dataset(bag.write(tmp_path / "cell.mcap"), **change(ASKED))
+
+
+def test_a_trigger_for_what_is_cut_already_is_refused(tmp_path: Path) -> None:
+    for source in ("insertion", (np.zeros((2, 5)), [0, 1]), tmp_path):
+        with pytest.raises(DataError, match="Expected no trigger for"):
+            load_dataset(source, trigger="contact=5")
+
+
+def test_a_bag_of_another_storage_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("", encoding="utf-8")
+    (tmp_path / "cell_0.db3").write_bytes(b"")
+    with pytest.raises(DataError, match="ros2 bag convert"):
+        load_dataset(tmp_path, **ASKED)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(bag: Bag, tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    raw = bytearray(bag.write(tmp_path / "cell.mcap").read_bytes())
+    for place in rng.integers(0, len(raw), 6):
+        raw[place] = rng.integers(256)
+    raw = raw[: rng.integers(1, len(raw))] if seed % 3 == 0 else raw
+    (tmp_path / "cell.mcap").write_bytes(raw)
+    try:
+        data = load_dataset(tmp_path / "cell.mcap", **ASKED)
+    except DataError:
+        return
+    np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32)[: len(data)])
+
+
+def test_lost_messages_leave_their_places_and_late_ones_do_not() -> None:
+    times = np.delete(np.arange(1000) * 0.002, [100, 101, 500])
+    times[300] += 0.009
+    assert usual_step(times) == pytest.approx(0.002)
+    np.testing.assert_array_equal(slots(times, 0.002), np.delete(np.arange(1000), [100, 101, 500]))
+
+
+def test_a_bag_is_looked_at_and_replayed_from_the_shell(bag: Bag, tmp_path: Path) -> None:
+    bag.lost = {bag.starts[1] + 30}
+    path = str(bag.write(tmp_path / "cell.mcap"))
+    how = ["--trigger", "register@/phase", "--label", CHECK, "--samples", str(SAMPLES)]
+    done = CliRunner().invoke(main, ["data", path, *how])
+    assert done.exit_code == 0, done.output
+    assert "7, 1 left out" in done.output
+    assert "cell/2: Expected a message each 0.002 s" in " ".join(done.output.split())
+    done = CliRunner().invoke(main, ["run", "--cell", "replay", "--data", path, *how, "--cycles", "7", "--reducer", "pca"])
+    assert done.exit_code == 0, done.output

@@ -1,0 +1,194 @@
+"""The four intervals: the paper's numbers, SciPy and statsmodels as oracles, and the mathematics as properties."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from statsmodels.stats.proportion import proportion_confint
+
+from dengine import (
+    INTERVALS,
+    binomial_interval,
+    clopper_pearson_interval,
+    jeffreys_interval,
+    wilson_interval,
+)
+from dengine.decision.intervals import normal_quantile
+from dengine.errors import SettingError
+
+ALPHAS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.5)
+COUNTS = [(s, n - s) for n in (1, 2, 3, 7, 30, 100, 1503) for s in sorted({0, 1, n // 3, n // 2, n - 1, n})]
+
+intervals = pytest.mark.parametrize("interval", INTERVALS.values(), ids=INTERVALS)
+counts = st.integers(0, 2000)
+alphas = st.floats(1e-4, 0.9999)
+
+
+def truncated(value: float, digits: int) -> float:
+    return math.floor(value * 10**digits + 1e-9) / 10**digits
+
+
+# --------------------------------------------------------------------------------------------------- the paper
+
+
+@pytest.mark.parametrize(
+    ("alpha", "lower", "upper"),
+    [(0.2, 0.91, 0.97), (0.1, 0.90, 0.97), (0.05, 0.88, 0.97), (0.01, 0.86, 0.98)],
+)
+def test_wilson_gives_the_papers_table_a_of_decreasing_alpha(alpha: float, lower: float, upper: float) -> None:
+    # "Wilson Formula results" (a): 95 successes of 100; two digits, truncated.
+    low, high = wilson_interval(95, 5, alpha)
+    assert (truncated(low, 2), truncated(high, 2)) == (lower, upper)
+
+
+@pytest.mark.parametrize(
+    ("n_success", "lower", "upper"),
+    [(96, 0.901, 0.984), (97, 0.915, 0.989), (98, 0.929, 0.994), (99, 0.945, 0.998), (100, 0.963, 1.000)],
+)
+def test_wilson_gives_the_papers_table_b_of_more_successes(n_success: int, lower: float, upper: float) -> None:
+    # "Wilson Formula results" (b): alpha 0.05, 100 neighbours; three digits, truncated.
+    low, high = wilson_interval(n_success, 100 - n_success, 0.05)
+    assert (truncated(low, 3), truncated(high, 3)) == (lower, upper)
+
+
+def test_one_successful_neighbour_satisfies_the_binomial_interval_and_not_wilson() -> None:
+    # The paper's example: [1.0, 1.0] against [0.2, 1.0].
+    assert binomial_interval(1, 0, 0.05) == (1.0, 1.0)
+    low, high = wilson_interval(1, 0, 0.05)
+    assert (truncated(low, 1), high) == (0.2, 1.0)
+
+
+@pytest.mark.parametrize(("interval", "enough"), [(wilson_interval, 73), (clopper_pearson_interval, 72)])
+def test_all_successful_neighbours_needed_at_95_percent(interval, enough: int) -> None:
+    assert interval(enough, 0, 0.05)[0] > 0.95
+    assert interval(enough - 1, 0, 0.05)[0] <= 0.95
+
+
+# ----------------------------------------------------------------------------------------------------- oracles
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize(
+    ("interval", "method"),
+    [(wilson_interval, "wilson"), (binomial_interval, "normal"), (clopper_pearson_interval, "beta")],
+)
+def test_interval_equals_statsmodels(interval, method: str, alpha: float) -> None:
+    for n_s, n_f in COUNTS:
+        expected = proportion_confint(n_s, n_s + n_f, alpha, method=method)
+        np.testing.assert_allclose(interval(n_s, n_f, alpha), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+def test_jeffreys_equals_statsmodels_with_the_ends_closed(alpha: float) -> None:
+    for n_s, n_f in COUNTS:
+        lower, upper = proportion_confint(n_s, n_s + n_f, alpha, method="jeffreys")
+        expected = (0.0 if n_s == 0 else lower, 1.0 if n_f == 0 else upper)
+        np.testing.assert_allclose(jeffreys_interval(n_s, n_f, alpha), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+@pytest.mark.parametrize(("interval", "method"), [(wilson_interval, "wilson"), (clopper_pearson_interval, "exact")])
+def test_interval_equals_scipys_binomial_test(interval, method: str, alpha: float) -> None:
+    for n_s, n_f in COUNTS:
+        oracle = stats.binomtest(n_s, n_s + n_f).proportion_ci(1.0 - alpha, method=method)
+        np.testing.assert_allclose(interval(n_s, n_f, alpha), (oracle.low, oracle.high), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("alpha", ALPHAS)
+def test_jeffreys_equals_scipys_beta_quantiles(alpha: float) -> None:
+    for n_s, n_f in COUNTS:
+        posterior = stats.beta(n_s + 0.5, n_f + 0.5)
+        lower, upper = jeffreys_interval(n_s, n_f, alpha)
+        assert lower == pytest.approx(0.0 if n_s == 0 else posterior.ppf(alpha / 2), rel=1e-9)
+        assert upper == pytest.approx(1.0 if n_f == 0 else posterior.ppf(1 - alpha / 2), rel=1e-9)
+
+
+@given(alphas)
+def test_normal_quantile_equals_scipys(alpha: float) -> None:
+    assert normal_quantile(alpha) == pytest.approx(stats.norm.isf(alpha / 2), rel=1e-9, abs=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------- properties
+
+
+@intervals
+@given(n_s=counts, n_f=counts, alpha=alphas)
+def test_bounds_enclose_the_observed_rate_within_0_and_1(interval, n_s: int, n_f: int, alpha: float) -> None:
+    lower, upper = interval(n_s, n_f, alpha)
+    rate = n_s / (n_s + n_f) if n_s + n_f else 0.5
+    assert 0.0 <= lower <= rate <= upper <= 1.0
+
+
+@intervals
+@given(n_s=counts, n_f=counts, alpha=alphas)
+def test_exchanging_success_and_failure_mirrors_the_interval(interval, n_s: int, n_f: int, alpha: float) -> None:
+    lower, upper = interval(n_s, n_f, alpha)
+    mirrored_lower, mirrored_upper = interval(n_f, n_s, alpha)
+    assert (lower, upper) == pytest.approx((1.0 - mirrored_upper, 1.0 - mirrored_lower), abs=1e-9)
+
+
+@intervals
+@given(n=st.integers(1, 300), alpha=alphas)
+def test_both_bounds_grow_with_the_number_of_successes(interval, n: int, alpha: float) -> None:
+    n_s = np.arange(n + 1)
+    lower, upper = interval(n_s, n - n_s, alpha)
+    assert (np.diff(lower) >= -1e-12).all()
+    assert (np.diff(upper) >= -1e-12).all()
+
+
+@intervals
+@given(n_s=counts, n_f=counts, one=alphas, other=alphas)
+def test_a_smaller_alpha_never_narrows_the_interval(interval, n_s: int, n_f: int, one: float, other: float) -> None:
+    wide, narrow = interval(n_s, n_f, min(one, other)), interval(n_s, n_f, max(one, other))
+    assert wide[0] <= narrow[0] + 1e-12
+    assert narrow[1] <= wide[1] + 1e-12
+
+
+@given(n_s=counts, n_f=counts, alpha=st.floats(1e-3, 0.5), times=st.integers(2, 10))
+def test_more_evidence_at_the_same_rate_narrows_wilson(n_s: int, n_f: int, alpha: float, times: int) -> None:
+    few, many = wilson_interval(n_s, n_f, alpha), wilson_interval(times * n_s, times * n_f, alpha)
+    assert many[1] - many[0] <= few[1] - few[0] + 1e-12
+
+
+@intervals
+@pytest.mark.parametrize("alpha", ALPHAS)
+def test_no_neighbours_means_nothing_is_known(interval, alpha: float) -> None:
+    assert interval(0, 0, alpha) == (0.0, 1.0)
+
+
+# ------------------------------------------------------------------------------------------ scalars, arrays, errors
+
+
+@intervals
+def test_arrays_give_what_scalars_give_one_by_one(interval) -> None:
+    n_s, n_f = np.array(COUNTS).T
+    lower, upper = interval(n_s, n_f, 0.1)
+    one_by_one = np.array([interval(s, f, 0.1) for s, f in COUNTS])
+    assert lower.dtype == upper.dtype == np.float64
+    np.testing.assert_array_equal(np.stack([lower, upper], axis=1), one_by_one)
+
+
+@intervals
+def test_the_shape_of_the_counts_is_the_shape_of_the_bounds(interval) -> None:
+    n_s = np.arange(6).reshape(2, 3)
+    assert [b.shape for b in interval(n_s, n_s + 1, 0.1)] == [(2, 3), (2, 3)]
+    assert [b.shape for b in interval(np.zeros(0, int), np.zeros(0, int), 0.1)] == [(0,), (0,)]
+    assert [type(b) for b in interval(np.int64(3), np.int64(1), 0.1)] == [float, float]
+
+
+@intervals
+@pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1, 1.5, math.nan])
+def test_an_alpha_out_of_range_is_a_setting_error(interval, alpha: float) -> None:
+    with pytest.raises(SettingError, match="0 < alpha < 1"):
+        interval(3, 1, alpha)
+
+
+@intervals
+def test_counts_that_cannot_be_are_refused(interval) -> None:
+    with pytest.raises(ValueError, match="one shape"):
+        interval([1, 2], [1], 0.1)
+    with pytest.raises(ValueError, match="negative"):
+        interval(-1, 2, 0.1)

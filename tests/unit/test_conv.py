@@ -1,0 +1,319 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from sklearn.utils import get_tags
+
+from dengine.errors import SettingError, TraceError
+from dengine.folds import content_fold
+from dengine.reducers.base import StopRule
+from dengine.reducers.conv import ConvReducer
+from dengine.reducers.heads import CrossFittedScores
+from dengine.reducers.scored import FIRST_STEPS
+
+STEPS = StopRule(max_steps=20)
+
+
+def traces(n=160, channels=1, samples=152, seed=0):
+    """Bumps at a random place; a late bump is a failure, with some noise in the labels."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(0.2, 0.9, size=(n, 1, 1))
+    t = np.linspace(0.0, 1.0, samples)
+    X = np.exp(-(((t - place) / 0.05) ** 2)) * rng.uniform(5, 15, size=(n, channels, 1))
+    X = (X + 0.3 * rng.normal(size=(n, channels, samples))).astype(np.float32)
+    y = (place[:, 0, 0] + 0.05 * rng.normal(size=n) < 0.7).astype(np.int64)
+    return X, y
+
+
+def fitted(**params):
+    X, y = traces()
+    return ConvReducer(**params).fit(X, y, stop=STEPS), X, y
+
+
+def train(reducer, X, y, stop=None):
+    """The engine's warm start; returns the reducer."""
+    reducer.train(X, y, content_fold(X, reducer.folds), stop)
+    return reducer
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over_warm_starts(k):
+    X, y = traces()
+    folds, rng = content_fold(X, 3), np.random.default_rng(1)
+    other = y.copy()
+    other[folds == k] = 1 - y[folds == k]
+    one, two = ConvReducer(folds=3), ConvReducer(folds=3)
+    for n in (60, 110, 160):
+        one.train(X[:n], y[:n], folds[:n])
+        two.train(X[:n], other[:n], folds[:n])
+        other[folds == k] = rng.permutation(other[folds == k])  # other labels again at the next warm start
+        a, b = one.embed(X), two.embed(X)
+        assert np.array_equal(a[:, k], b[:, k])
+        assert one.holdout_losses_[k] == two.holdout_losses_[k]
+        assert not np.array_equal(a, b)  # the other spaces did see them
+
+
+def test_space_k_stays_the_same_where_a_step_limit_ends_the_fit():
+    X, y = traces()
+    folds = content_fold(X, 2)
+    other = np.where(folds == 0, 1 - y, y)
+    stop = StopRule(max_steps=2)
+    a, b = (ConvReducer(folds=2).fit(X, labels, folds=folds, stop=stop).embed(X) for labels in (y, other))
+    assert np.array_equal(a[:, 0], b[:, 0])
+
+
+def test_the_features_read_no_label_and_the_heads_say_that_they_do():
+    X, y = traces()
+    a, b = (ConvReducer().fit(X, labels).net_.features.state_dict() for labels in (y, 1 - y))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    assert get_tags(ConvReducer()).target_tags.required
+
+
+@pytest.mark.parametrize("n_components", [1, 2])
+@pytest.mark.parametrize(("samples", "channels"), [(152, 1), (400, 6), (800, 2), (1000, 1), (997, 3)])
+def test_every_length_and_number_of_channels_embeds_into_k_spaces_of_d(n_components, samples, channels):
+    X, y = traces(60, channels, samples)
+    reducer = ConvReducer(n_components=n_components, folds=3).fit(X, y, stop=StopRule(max_steps=2))
+    Z = reducer.embed(X)
+    assert Z.shape == (60, 3, n_components)
+    assert Z.dtype == np.float32
+    assert np.isfinite(Z).all()
+    assert reducer.transform(X).shape == (60, n_components)
+
+
+def test_embedding_in_the_own_space_picks_row_i_of_space_folds_i():
+    reducer, X, _ = fitted()
+    folds = content_fold(X, 5)
+    assert np.array_equal(reducer.embed_own(X, folds), reducer.embed(X)[np.arange(len(X)), folds])
+
+
+def test_training_places_its_traces_without_a_second_pass_where_a_pass_would_place_them():
+    X, y = traces()
+    reducer, folds = ConvReducer(), content_fold(X, 5)
+    placed = reducer.train(X, y, folds, STEPS)
+    assert placed.shape == (len(X), 2)
+    assert np.abs(placed - reducer.embed_own(X, folds)).max() <= 1e-6
+
+
+def test_one_trace_alone_lands_where_it_does_in_a_batch():
+    reducer, X, _ = fitted()
+    single = np.concatenate([reducer.embed(x[None]) for x in X])
+    assert np.abs(single - reducer.embed(X)).max() <= reducer.single_tolerance
+
+
+def test_scripted_and_frozen_the_module_answers_as_the_reducer_does(tmp_path):
+    reducer, X, _ = fitted()
+    frozen = torch.jit.freeze(torch.jit.script(reducer.module()))
+    torch.jit.save(frozen, tmp_path / "conv.ts")
+    loaded = torch.jit.load(tmp_path / "conv.ts")
+    x = torch.from_numpy(X[:7])
+    for module in (frozen, loaded):
+        for _ in range(4):  # TorchScript optimises over the first calls
+            Z = module(x).detach().numpy()
+        assert np.abs(Z - reducer.embed(X[:7])).max() <= 1e-6
+
+
+def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit():
+    reducer, X, y = fitted()
+    state = reducer.get_state()
+    again = clone(reducer).set_state(state)
+    assert np.array_equal(again.embed(X), reducer.embed(X))
+    assert again.holdout_loss_ == reducer.holdout_loss_
+    X2, y2 = np.concatenate([X, traces(seed=5)[0]]), np.concatenate([y, traces(seed=5)[1]])
+    cold = clone(reducer).fit(X2, y2, stop=STEPS).embed(X)
+    trained_on = train(again, X2, y2, STEPS).embed(X)
+    assert np.array_equal(trained_on, train(reducer, X2, y2, STEPS).embed(X))
+    assert not np.array_equal(trained_on, cold)  # it went on from where it was
+    assert all(isinstance(value, np.ndarray) for value in state.values())
+
+
+def test_a_seed_repeats_exactly_and_a_clone_starts_cold():
+    reducer, X, y = fitted()
+    assert np.array_equal(clone(reducer).fit(X, y, stop=STEPS).embed(X), reducer.embed(X))
+
+
+def test_a_retrain_on_the_same_labels_does_not_move_the_map():
+    reducer, X, y = fitted()
+    before = reducer.embed(X)
+    train(reducer, X, y)
+    assert np.abs(reducer.embed(X) - before).max() < 1e-3
+
+
+def test_a_warm_start_ends_where_a_cold_start_does():
+    X, y = traces(300)
+    cold = ConvReducer().fit(X, y)
+    warm = train(train(clone(cold).set_state(cold.get_state()), X[:100], y[:100]), X, y)
+    assert np.abs(warm.embed(X)[:, :, 0] - cold.embed(X)[:, :, 0]).max() < 2e-3
+
+
+def test_the_scores_of_traces_they_never_saw_rank_successes_above_failures():
+    reducer, _, _ = fitted()
+    X, y = traces(400, seed=9)
+    p = reducer.transform(X)[:, 0]
+    assert ((p >= 0) & (p <= 1)).all()
+    rank = (p[y == 1][:, None] > p[y == 0][None]).mean()
+    assert rank > 0.9
+
+
+def test_the_second_axis_is_small_against_the_first():
+    reducer, X, _ = fitted()
+    Z = reducer.embed(X)
+    assert np.ptp(Z[..., 1]) <= 0.04 < 0.5 < np.ptp(Z[..., 0])
+
+
+def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_than_the_base_rate():
+    reducer, _, _ = fitted()
+    X, y = traces(1000, seed=9)
+    p = np.clip(reducer.embed(X)[:, :, 0], 1e-6, 1 - 1e-6)
+    new = -np.where(y[:, None] == 1, np.log(p), np.log1p(-p)).mean()
+    base = -(y.mean() * np.log(y.mean()) + (1 - y.mean()) * np.log(1 - y.mean()))
+    assert abs(reducer.holdout_loss_ - new) < 0.15
+    assert reducer.holdout_loss_ < base
+
+
+def test_no_step_begins_after_the_deadline():
+    X, y = traces()
+    ticks = iter(range(1000))
+    reducer = ConvReducer().fit(X, y, stop=StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
+    assert reducer.n_iter_ == 5
+    before = reducer.embed(X)
+    reducer.train(X, y, content_fold(X, 5), StopRule(deadline=-1.0, clock=lambda: 0.0))
+    assert reducer.n_iter_ == 0
+    np.testing.assert_allclose(reducer.embed(X)[..., 0], before[..., 0], atol=1e-3)
+
+
+def test_a_first_model_that_comes_too_late_has_learned_something_all_the_same():
+    X, y = traces()
+    late = ConvReducer().fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
+    assert late.n_iter_ == FIRST_STEPS
+    apart = late.embed(X)[..., 0].mean(1)
+    assert apart[y == 1].mean() > apart[y == 0].mean() + 0.5
+
+
+def test_dead_channels_and_huge_scales_embed_finitely():
+    X, y = traces(80, channels=2)
+    X[:, 1] = 7.0
+    X[:, 0] = X[:, 0] * 1e6 + 1e7
+    reducer = ConvReducer().fit(X, y, stop=STEPS)
+    Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
+    assert np.isfinite(Z).all()
+
+
+def test_the_scale_and_offset_of_a_channel_do_not_matter():
+    X, y = traces()
+    a, b = ConvReducer().fit(X, y, folds=content_fold(X, 5)), ConvReducer().fit(8 * X + 32, y, folds=content_fold(X, 5))
+    assert np.abs(a.embed(X)[..., 0] - b.embed(8 * X + 32)[..., 0]).max() < 5e-3
+
+
+def test_more_traces_move_the_map_less_and_less():
+    moves = np.zeros(3)
+    for seed in range(6):  # a doubling moves the map by luck too, so on the average of some streams
+        X, y = traces(640, seed=seed)
+        reducer = ConvReducer()
+        maps = [train(reducer, X[:n], y[:n]).transform(X)[:, 0] for n in (80, 160, 320, 640)]
+        moves += [np.abs(b - a).mean() / 6 for a, b in pairwise(maps)]
+    assert moves[:2].min() > moves[2]
+    assert moves[2] < 0.05
+
+
+def test_too_little_to_learn_from_is_said_clearly():
+    X, y = traces()
+    with pytest.raises(SettingError, match="at least 20 traces, got 12"):
+        train(ConvReducer(), X[:12], y[:12])
+    with pytest.raises(SettingError, match="both classes outside fold 0"):
+        ConvReducer(folds=2).fit(X, np.ones(len(X), dtype=int))
+    folds = np.zeros(len(X), dtype=np.int64)
+    with pytest.raises(SettingError, match="both classes outside fold 0, got 0"):
+        ConvReducer(folds=2).fit(X, y, folds=folds)
+    with pytest.raises(SettingError, match="uses labels"):
+        ConvReducer().fit(X)
+
+
+@pytest.mark.parametrize(
+    ("params", "message"),
+    [
+        ({"n_components": 3}, "n_components 1 or 2"),
+        ({"folds": 1}, "folds >= 2"),
+        ({"max_iter": 0}, "max_iter >= 1"),
+        ({"l2": 0.0}, "l2 > 0"),
+        ({"filters": 0}, "filters >= 1"),
+        ({"kernels": -1}, "kernels >= 0"),
+        ({"width": 0}, "width >= 1"),
+        ({"regions": 40}, "regions <= 16"),
+        ({"augmentations": "scale, blur"}, "augmentations among shift, scale"),
+        ({"segments": 0}, "segments >= 1"),
+    ],
+)
+def test_a_setting_out_of_range_is_named(params, message):
+    X, y = traces()
+    with pytest.raises(SettingError, match=message):
+        ConvReducer(**params).fit(X, y)
+
+
+@pytest.mark.parametrize("samples", [2, 3, 7, 15])
+def test_a_trace_too_short_for_its_segments_has_fewer_of_them(samples):
+    X, y = traces(samples=152)
+    short = np.ascontiguousarray(X[:, :, :: 152 // samples][:, :, :samples])
+    reducer = ConvReducer(kernels=0, segments=100).fit(short, y)
+    assert reducer.net_.features.segments == samples // 2
+    assert np.isfinite(reducer.embed(short)).all()
+    assert np.isfinite(ConvReducer().fit(short, y).embed(short)).all()
+
+
+def test_a_single_sample_is_no_trace():
+    with pytest.raises(SettingError, match="at least 2 samples, got 1"):
+        ConvReducer().fit(np.arange(30.0)[:, None], np.arange(30) % 2)
+
+
+def test_a_trace_of_another_shape_is_an_error_that_names_both():
+    reducer, X, _ = fitted()
+    with pytest.raises(TraceError, match=r"1 channels x 152 samples, as in fit, got 1 x 150"):
+        reducer.embed(X[:, :, :150])
+
+
+def test_no_traces_embed_to_no_points():
+    reducer, X, _ = fitted()
+    assert reducer.embed(X[:0]).shape == (0, 5, 2)
+
+
+def test_a_head_that_would_do_worse_than_the_base_rate_keeps_its_earlier_weights_and_the_others_do_not():
+    rng = np.random.default_rng(0)
+    g = torch.from_numpy(rng.normal(size=(2000, 50)).astype(np.float32))
+    y = torch.from_numpy((rng.random(2000) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64))
+    folds = torch.from_numpy(rng.integers(0, 2, 2000))
+    heads = CrossFittedScores(50, folds=2, dim=1)
+    heads.train_on(g, y, folds, 0.01, 12, None)
+    learned = heads.weight.clone()
+    assert not heads.kept.any()
+    few = torch.cat(
+        [(folds == 0).nonzero()[:40, 0], (folds == 1).nonzero()[:900, 0]]
+    )  # head 1 sees forty rows, head 0 enough
+    heads.train_on(g[few], y[few], folds[few], 0.01, 12, None)
+    assert heads.kept.tolist() == [False, True]
+    assert torch.equal(heads.weight[1], learned[1])
+    assert not torch.equal(heads.weight[0], learned[0])
+
+
+def test_features_standardised_anew_leave_the_scores_of_a_warm_start_where_they_were():
+    X, y = traces(200)
+    reducer = ConvReducer(folds=2).fit(X[:100], y[:100])
+    before = reducer.embed(X)
+    with torch.no_grad():
+        features, head = reducer.net_.features, reducer.net_.head
+        _, carry = features.standardise(reducer.raw_features(X))
+        head.carry_over(carry)
+        reducer.net_.fold()
+    assert np.abs(reducer.embed(X)[..., 0] - before[..., 0]).max() < 0.02  # but for what is clipped
+
+
+@pytest.mark.parametrize("kernels", [0, 28])
+def test_what_answers_is_the_features_and_then_the_heads(kernels: int) -> None:
+    X, y = traces(100)
+    reducer = ConvReducer(folds=3, kernels=kernels).fit(X, y)
+    with torch.no_grad():
+        apart = reducer.net_.head(reducer.net_.features(torch.from_numpy(X[:, None] if X.ndim == 2 else X)))
+    np.testing.assert_allclose(reducer.embed(X), apart, atol=2e-6)

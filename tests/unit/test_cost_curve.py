@@ -1,0 +1,206 @@
+"""What a part costs under each policy: sums by hand, the choice, what it says, its picture and its verb."""
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from dengine import Dataset, Policy, Recipe
+from dengine.cli import main
+from dengine.errors import SettingError
+from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of
+from dengine.experiments.figures import cost_picture
+from dengine.experiments.metrics import Costs
+from dengine.experiments.replay import Replay, replay
+
+COSTS = Costs(check=5, escape=100, false_reject=20)
+STRICT, LAX = Policy(0.05, 0.95), Policy(0.5, 0.8)
+HOW = {"recipe": "pca", "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats": 4, "cycles": 120}
+
+
+def played(policy: Policy, seed: int, verified: int, accepted: int, bad: int, rejected: int = 0, good: int = 0) -> Replay:
+    """A replay with so many decisions of each kind, in that order, of which so many are wrong."""
+    action = np.array(["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected)
+    truth = np.ones(len(action), dtype=bool)
+    truth[verified : verified + bad] = False
+    truth[verified + accepted + good :] = False
+    n, never = len(action), np.zeros(len(action), dtype=bool)
+    return Replay(
+        action=action, truth=truth, index=np.random.default_rng(seed).permutation(n), name="pca", dataset="by hand",
+        recipe=Recipe("pca", policy=policy), seed=seed, lower=np.zeros(n), upper=np.ones(n), n_success=np.zeros(n, int),
+        n_failure=np.zeros(n, int), position=np.zeros((n, 2)), decide_seconds=np.zeros(n), stopped=never,
+        reason=np.full(n, "certain"), version=np.zeros(n, int), safe_mode=never,
+    )  # fmt: skip
+
+
+def curve(lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4) -> CostCurve:
+    """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the others were bad."""
+    replays = [
+        played(policy, seed, verified, 100 - verified, bad)
+        for policy, each in ((LAX, lax), (STRICT, strict))
+        for seed, (verified, bad) in enumerate(each)
+    ]
+    return curve_of(replays, COSTS)
+
+
+def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
+    one = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
+    assert cost_a_part(one, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
+    assert cost_a_part(one, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
+    assert cost_a_part(played(LAX, 0, 100, 0, 0), COSTS) == 5.0
+
+
+def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
+    found = curve(lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)])
+    lax, strict = found.rows
+    assert (found.choosing, found.reporting) == (2, 2)
+    assert (lax.chosen_by, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
+    assert lax.sd == pytest.approx(math.sqrt(0.125))
+    assert (strict.chosen_by, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
+    assert found.policy == LAX  # cheaper where it was chosen, though not where it is reported
+    assert f"{lax.cost:.3g} a part" in found.sentence
+
+
+def test_the_interval_moves_the_errors_to_their_ends_and_is_wider_than_the_luck_of_the_order() -> None:
+    (row, _) = curve(lax=[(50, 0), (50, 0), (50, 1), (50, 0)]).rows
+    assert row.lower < row.cost < row.upper
+    assert row.upper == pytest.approx(5 * 0.5 + 100 * 0.5 * row.bad.upper)
+    assert (row.bad.decided, row.bad.wrong, row.verified, row.certain) == (100, 1, 0.5, 0.5)
+
+
+def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everything() -> None:
+    clear = [played(LAX, seed, 100, 2900, 10) for seed in range(4)]
+    assert curve_of(clear, COSTS).verdict == "pays"
+    doubtful = curve(lax=[(50, 0)] * 4)
+    assert doubtful.verdict == "may pay"
+    assert doubtful.policy == LAX
+    assert "may be bad, and accepting pays up to 5 %" in doubtful.sentence
+
+
+@pytest.mark.parametrize(
+    "lax", [[(50, 5)] * 4, [(50, 0), (50, 0), (50, 5), (50, 5)]], ids=["never cheaper", "cheaper only where chosen"]
+)
+def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, int]]) -> None:
+    found = curve(lax)
+    assert (found.verdict, found.policy) == ("does not pay", None)
+    assert found.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
+    assert not found.to_frame()["chosen"].any()
+
+
+def test_where_nothing_was_ever_certain_it_asks_for_more_recordings() -> None:
+    found = curve(lax=[(100, 0)] * 4)
+    assert found.policy is None
+    assert "everything was verified. Record more." in found.sentence
+
+
+def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear() -> None:
+    replays = [played(policy, seed, 99, 1, 0) for policy in (LAX, STRICT) for seed in range(4)]
+    dear, cheap = (curve_of(replays, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15))
+    assert dear.cheapest.cost == cheap.cheapest.cost == 4.95
+    assert (dear.verdict, cheap.verdict) == ("does not pay", "may pay")
+    assert "is expected to cost 5.01 and cost 4.95 in other shuffles" in dear.sentence
+
+
+def test_of_equal_policies_the_strictest_is_taken() -> None:
+    assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT
+
+
+def test_a_shuffle_that_not_every_policy_has_played_is_left_out() -> None:
+    found = curve(lax=[(50, 0), (50, 0), (0, 50)], strict=[(100, 0)] * 2)
+    assert (found.choosing, found.reporting, found.rows[0].cost) == (1, 1, 2.5)
+    with pytest.raises(SettingError, match="2 or more shuffles"):
+        curve(lax=[(50, 0)], strict=[(100, 0)])
+
+
+@pytest.fixture(scope="module")
+def found(make_data: Callable[..., Dataset]) -> CostCurve:
+    return cost_curve(make_data(160), check=5, escape=20, false_reject=10, **HOW)
+
+
+def test_the_curve_is_that_of_replays(found: CostCurve, make_data: Callable[..., Dataset]) -> None:
+    policy = replace(Recipe.load("pca").policy, alpha=0.5, lower_bound=0.8)
+    again = [
+        replay(make_data(160), Recipe.load("pca").with_policy(alpha=0.5, lower_bound=0.8), seed, 120) for seed in (2, 3)
+    ]
+    assert found.rows[0].policy == policy
+    assert found.rows[0].cost == pytest.approx(np.mean([cost_a_part(one, found.costs) for one in again]))
+    assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
+
+
+def test_a_policy_comes_from_costs_and_with_it_whatever_the_recipe_says(make_data: Callable[..., Dataset]) -> None:
+    how = HOW | {"recipe": Recipe.load("pca").with_policy(stops="all")}
+    policy = Policy.from_costs(make_data(160), check=5, escape=20, false_reject=10, **how)
+    assert (policy.alpha, policy.stops) == (0.5, "all")
+    assert policy.lower_bound in HOW["lower_bounds"]
+
+
+def test_where_nothing_pays_there_is_no_policy_from_costs(make_data: Callable[..., Dataset]) -> None:
+    coins = replace(make_data(160), y=np.random.default_rng(0).integers(0, 2, 160).astype(np.int8))
+    with pytest.raises(SettingError, match=r"verifying everything\. Nothing pays"):
+        Policy.from_costs(coins, check=5, escape=1e6, false_reject=1e6, **HOW)
+
+
+@pytest.mark.parametrize("how", [{"repeats": 1}, {"alphas": (2,)}, {"lower_bounds": (0.4,)}, {"check": -1}])
+def test_what_cannot_be_asked_is_refused_before_anything_is_played(how: dict) -> None:
+    with pytest.raises(SettingError):
+        cost_curve("insertion", **{"check": 5, "escape": 20, "false_reject": 10} | how)
+
+
+def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> None:
+    figure = cost_picture(found, unit="EUR")
+    top, bottom = figure.axes
+    assert top.get_ylabel() == "cost a part [EUR]"
+    assert [text.get_text() for text in bottom.get_xticklabels()] == ["80", "95"]
+    labels = [text.get_text() for text in top.get_legend().get_texts()]
+    assert "verify everything" in labels
+    assert "alpha 0.5" in labels
+    assert any(label.startswith("the choice: ") for label in labels) == (found.policy is not None)
+    assert "check 5 EUR, escape 20 EUR, false reject 10 EUR" in figure.get_suptitle()
+
+
+@pytest.fixture
+def folder(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def costs(words: str) -> Result:
+    how = "--data mine.npz --reducer pca --cycles 90 --repeats 2 --alphas 0.5,0.1 --lower-bounds 0.8 --n-jobs 1"
+    return CliRunner().invoke(main, ["costs", *how.split(), *words.split()])
+
+
+def test_the_verb_shows_a_table_and_writes_the_curve(folder: Path) -> None:
+    done = costs("--escape 20 --false-reject 10 --out out --keep kept")
+    assert done.exit_code == 0, done.output
+    shown = " ".join(done.stdout.split())
+    assert "what a part costs, in s, by alpha and LB" in shown
+    assert max(map(len, done.stdout.splitlines())) <= 80
+    assert (folder / "out" / "costs.png").stat().st_size > 10_000
+    assert (folder / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") == 3
+    told = json.loads(costs("--escape 20 --false-reject 10 --keep kept --json").stdout)
+    assert told["verdict"] in ("pays", "may pay", "does not pay")
+    assert [row["alpha"] for row in told["rows"]] == [0.5, 0.1]
+    assert told["sentence"] in shown
+    assert len(list((folder / "kept").iterdir())) == 4  # played once
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ("--escape 20", 2, "--false-reject"),
+        ("--escape 20 --false-reject 10 --alpha 0.1", 2, "name those to be tried, --alphas"),
+        ("--escape -1 --false-reject 10", 2, "-1"),
+        ("--escape 20 --false-reject 10 --repeats 1", 2, "1 is not in the range"),
+        ("--escape 20 --false-reject 10 --check 0", 1, "Expected a check that costs something"),
+    ],
+)
+def test_a_wrong_call_says_what_was_expected(folder: Path, words: str, code: int, said: str) -> None:
+    done = costs(words)
+    assert done.exit_code == code
+    assert said in " ".join(done.output.split())

@@ -1,0 +1,345 @@
+"""Why a decision came out so: what is found again is what was counted, and what is said is true."""
+
+import os
+import re
+import sqlite3
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, SqlStore, TraceSpec
+from dengine.engine.engine import explain_stored
+from dengine.errors import ReportError, StoreError
+from dengine.folds import content_hash
+from dengine.history.envelope import envelope_of
+from dengine.history.explain import Explanation, explain
+from dengine.history.sentences import WHY, Circumstances, bound_of
+from dengine.store import MemoryStore, Store
+
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+STORES = [
+    "memory",
+    "sqlite",
+    pytest.param("postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset")),
+]
+LOCAL = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.1)
+POOLED = replace(LOCAL, guarantee="pooled", stops="all")
+RECIPES = {
+    "local": Recipe.load("pca").with_settings(policy=LOCAL, retrain_every=40),
+    "watched": Recipe.load("pca").with_settings(policy=replace(LOCAL, stops="all"), retrain_every=40),
+    "pooled": Recipe.load("pca").with_settings(policy=POOLED, retrain_every=40),
+    "two balls": replace(Recipe.load("pca").with_policy(alpha=0.1, lower_bound=0.9), fraction=0.2, reject_fraction=0.1),
+    "full block": replace(Recipe.load("pca").with_policy(alpha=0.2, lower_bound=0.8), window=60, retrain_every=25),
+    "folds": replace(Recipe.load("conv").with_policy(alpha=0.2, lower_bound=0.8), retrain_every=60, folds=2, max_steps=8),
+}
+
+
+def open_store(kind: str, folder: Path) -> Store:
+    if kind == "memory":
+        return MemoryStore()
+    return SqlStore(str(folder / "engine.db") if kind == "sqlite" else str(POSTGRES), uuid.uuid4().hex)
+
+
+def played(store: Store, data: Dataset, recipe: Recipe, **options: Any) -> DataEngine:
+    """An engine that has gone through the data, part by part."""
+    engine = DataEngine(recipe=recipe, store=store, replaying=True, **options)
+    for _ in engine.run(ReplayCell(data), len(data)):
+        pass
+    engine.flush()
+    return engine
+
+
+def said_of(found: Explanation) -> str:
+    return " ".join((*found.said, *found.notes))
+
+
+# ----------------------------------------------------------------------------------------------- what is found again
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
+    name: str, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data = make_data(260, samples=60)
+    with played(open_store("sqlite", tmp_path), data, RECIPES[name]) as engine:
+        balls, rejected = 0, 0
+        for past in list(engine.history())[::3]:
+            found = engine.explain(past.id)
+            assert not any("Counted again" in note or "another bound" in note for note in found.notes), (past, found.notes)
+            assert found.decision == past
+            if found.bound is not None:
+                balls += 1
+                rejected += past.predicted is Action.REJECT
+                needed = {Action.ACCEPT: found.bound.successes_needed, Action.REJECT: found.bound.failures_needed}
+                assert (needed.get(past.predicted, 1) == 0) or past.predicted is Action.VERIFY
+        assert balls > 30
+        assert rejected or name != "two balls"
+
+
+@pytest.mark.parametrize("kind", STORES)
+def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
+    kind: str, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data = make_data(120, samples=60)
+    data = Dataset(np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice")
+    with played(open_store(kind, tmp_path), data, RECIPES["local"]) as engine:
+        (past,) = engine.history(last=1, action="accept")
+        found = engine.explain(past.id, neighbours=15)
+        distances = [each.distance for each in found.neighbours]
+        assert distances == sorted(distances)
+        assert found.radius == pytest.approx(engine.recipe.radius)
+        assert [each.inside for each in found.neighbours] == [each <= found.radius for each in distances]
+        own = engine.store.get_decision(past.id)
+        assert own is not None
+        for each in found.neighbours:
+            assert each.decision_id is not None
+            stored = engine.store.get_decision(each.decision_id)
+            assert stored is not None
+            assert (stored.success, stored.source) == (each.success, each.source)
+            assert stored.content_hash != own.content_hash  # the same part, which came before, has no vote
+            np.testing.assert_array_equal(each.trace, stored.trace)
+            z = engine.model.predictor.embed(_tensor(stored.trace))[each.space].numpy()
+            assert np.linalg.norm(z - own.embedding[each.space]) == pytest.approx(each.distance, abs=1e-3)
+
+
+def _tensor(trace: np.ndarray) -> Any:
+    import torch
+
+    return torch.from_numpy(np.array(trace))
+
+
+def test_a_closed_store_explains_as_its_engine_did(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    with played(open_store("sqlite", tmp_path), make_data(200, samples=60), RECIPES["pooled"]) as engine:
+        shown = {past.id: engine.explain(past.id).record() for past in list(engine.history())[::17]}
+        cell = engine.store.cell_id
+    with SqlStore(str(tmp_path / "engine.db"), cell) as store:
+        assert {id_: explain_stored(store, id_).record() for id_ in shown} == shown
+
+
+def test_a_version_that_is_not_kept_gives_way_to_the_present_one_and_that_is_said(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    with played(open_store("sqlite", tmp_path), make_data(260, samples=60), RECIPES["local"]) as engine:
+        old = next(past for past in engine.history() if past.model_version == 1 and past.reason is Reason.UNCERTAIN)
+        first, cell, version = engine.explain(old.id), engine.store.cell_id, engine.version
+        assert first.neighbours_version == 1
+    with sqlite3.connect(tmp_path / "engine.db") as connection:
+        connection.execute("UPDATE model_version SET state = NULL WHERE version = 1")
+    with SqlStore(str(tmp_path / "engine.db"), cell) as store:
+        again = explain_stored(store, old.id)
+    assert again.neighbours_version == version > 1
+    assert f"by version {version}, the present one; version 1, which answered, is not kept any more" in said_of(again)
+    assert again.decision == first.decision
+    assert again.bound == first.bound  # the recorded counts stand; LB needs no version
+
+
+def test_in_memory_too_a_version_that_is_not_kept_gives_way_to_the_present_one(make_data: Callable[..., Dataset]) -> None:
+    store = MemoryStore()
+    with played(store, make_data(200, samples=60), RECIPES["pooled"]) as engine:
+        old = next(past for past in engine.history() if past.model_version == 1 and past.reason is Reason.UNCERTAIN)
+        assert engine.explain(old.id).neighbours_version == 1
+        del store._states[1]
+        found = engine.explain(old.id)
+        assert found.neighbours_version == engine.version > 1
+        assert found.bound is not None
+        assert (found.bound.accept_at, found.bound.reject_at) == (None, None)
+        assert "the levels that held then are not kept" in said_of(found)
+
+
+# --------------------------------------------------------------------------------------------------------- what is said
+
+
+def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable[..., Dataset]) -> None:
+    with played(MemoryStore(), make_data(200, samples=60), RECIPES["local"]) as engine:
+        (past,) = engine.history(last=1, reason="certain")
+    found = Circumstances(recipe=RECIPES["local"])
+    policy = found.recipe.policy
+    for n_success, n_failure in ((38, 0), (3, 1), (0, 0), (100, 12), (0, 30), (1, 60)):
+        lower, upper = policy.bound(n_success, n_failure)
+        counted = replace(past, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper, reason=Reason.UNCERTAIN)
+        bound = bound_of(counted, found)
+        assert bound is not None
+        assert bound.successes_needed is not None
+        for needed, of_success, at in ((bound.successes_needed, 1, 0.9), (bound.failures_needed, 0, 0.1)):
+            reached = [
+                policy.bound(n_success + of_success * m, n_failure + (1 - of_success) * m) for m in (needed, needed - 1)
+            ]
+            assert reached[0][0] >= at if of_success else reached[0][1] <= at + 1e-12
+            if needed:
+                assert reached[1][0] < at if of_success else reached[1][1] > at
+        assert bound.repeats
+    wrong = bound_of(replace(counted, lower=0.5), found)
+    assert wrong is not None
+    assert not wrong.repeats
+
+
+def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(260, samples=60)
+    spec = TraceSpec(60, limit=200.0, unit="Nm")
+    with played(open_store("sqlite", tmp_path), data, RECIPES["local"], trace=spec) as engine:
+        bump, dead, torn, loud = (np.array(data.X[0]) for _ in range(4))
+        bump[20:40] += 60.0
+        dead[:] = 4.0
+        torn[7] = np.nan
+        loud[30] = 200.0
+        novel, constant, cut, saturated = (engine.explain(engine.decide(x).id) for x in (bump, dead, torn, loud))
+        (audit,) = engine.history(last=1, reason="audit")
+        (first,) = list(engine.history())[:1]
+        audited, untrained = engine.explain(audit.id), engine.explain(first.id)
+        engine.report("lost", success=False, trace=data.X[3] + 0.01)
+        lost = engine.explain("lost")
+    assert novel.decision.reason is Reason.NOVEL
+    assert novel.novelty is not None
+    assert novel.novelty.is_novel
+    assert f"in level {novel.novelty.level:.2f} times the limit" in said_of(novel)
+    assert novel.bound is None
+    assert "every sample is 4 Nm: a dead sensor" in said_of(constant)
+    assert "1 of 60 samples are NaN or infinite" in said_of(cut)
+    assert "first after 0.060 s (channel 1)" in said_of(saturated)
+    for bad in (constant, cut, saturated):
+        assert bad.neighbours == ()
+        assert "The trace is quarantined" in said_of(bad)
+    assert "the model alone would have" in said_of(audited)
+    assert "below the audit rate 0.1" in said_of(audited)
+    assert 0.0 <= float(re.search(r"coin fell on ([\d.]+),", said_of(audited)).group(1)) < 0.1
+    assert audited.bound is not None
+    assert "no model had been trained yet" in said_of(untrained)
+    assert untrained.neighbours_version is not None
+    assert "no version answered then" in said_of(untrained)
+    assert "a stop whose decision was lost" in said_of(lost)
+    assert "The part turned out bad (stop)" in said_of(lost)
+
+
+def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    y = rng.random(330) < 0.6
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (330, 40))
+    X[300:] = 2 * X[300:] + 8 * np.sin(2 * np.arange(40))  # the sensor is hit by a wave
+    data = Dataset(X.astype(np.float32), y.astype(np.int8), name="changing")
+    policy = Policy(alpha=0.2, lower_bound=0.8, guarantee="pooled", stops="all")
+    with played(open_store("sqlite", tmp_path), data, Recipe.load("pca").with_settings(policy=policy)) as engine:
+        assert engine.safe_mode == "too many traces were novel"
+        usual = engine.decide(X[0].astype(np.float32) + 0.001)
+        assert usual.reason is Reason.SAFE_MODE
+        found = engine.explain(usual.id)
+        assert "in safe mode, in which every part is: too many traces were novel" in said_of(found)
+        assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(found)
+        before = next(past for past in engine.history() if past.reason is Reason.CERTAIN)
+        assert "safe mode" not in said_of(engine.explain(before.id))
+
+
+def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    class Mean:
+        """Accepts everything once it was trained."""
+
+        def fit(self, X: Any, y: Any) -> "Mean":
+            self.n = len(y)
+            return self
+
+        def add(self, x: Any, y: Any) -> "Mean":
+            return self
+
+        def count(self, X: Any) -> tuple[Any, Any]:
+            return np.full(len(X), self.n), np.zeros(len(X), int)
+
+        def predict_interval(self, X: Any) -> tuple[Any, Any]:
+            return np.full(len(X), 0.8), np.full(len(X), 1.0)
+
+        def decide(self, X: Any) -> Any:
+            return np.full(len(X), Action.ACCEPT, dtype=object)
+
+    with DataEngine(model=Mean(), store=str(tmp_path / "engine.db"), retrain_every=30, replaying=True) as engine:
+        for _ in engine.run(ReplayCell(make_data(60, samples=60)), 60):
+            pass
+        (past,) = engine.history(last=1, action="accept")
+        found = engine.explain(past.id)
+        assert "Mean gives 30 successes, 0 failures, bound 0.800 to 1.000" in said_of(found)
+        assert found.neighbours == ()
+        assert found.envelope is not None
+    with SqlStore(str(tmp_path / "engine.db")) as store:  # without the rival at hand
+        assert explain_stored(store, past.id).record() == found.record()
+
+
+def test_every_reason_has_words() -> None:
+    assert set(WHY) == set(Reason)
+
+
+def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset]) -> None:
+    with DataEngine("pca") as engine:
+        engine.decide(np.arange(30.0))
+        with pytest.raises(ReportError, match=r"got 'x', which its store does not hold; `dengine history STORE` lists"):
+            engine.explain("x")
+    with pytest.raises(StoreError, match="Expected a store that an engine has used"):
+        explain_stored(MemoryStore(), "x")
+    assert explain.__doc__
+
+
+# ---------------------------------------------------------------------------------------------------------- the envelope
+
+
+def successes(n: int = 200, channels: int = 2, samples: int = 50) -> np.ndarray:
+    return np.random.default_rng(0).normal(0.0, 1.0, (n, channels, samples)).astype(np.float32)
+
+
+def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
+    X = successes()
+    trace = np.median(X, axis=0)
+    trace[1, 20:25] = 6.0
+    trace[0, 40] = -5.0
+    found = envelope_of(X, trace, rate_hz=100.0)
+    assert found is not None
+    low, high = found.excesses
+    assert (low.channel, low.first, low.last, low.above) == (0, 40, 40, False)
+    assert (high.channel, high.first, high.last, high.above) == (1, 20, 24, True)
+    assert (high.from_s, high.to_s) == pytest.approx((0.20, 0.24))
+    widths = (6.0 - found.high[1, 20:25]) / (found.high - found.low)[1, 20:25]
+    assert high.widths == pytest.approx(widths.max(), rel=1e-5)
+    assert found.largest == high
+    assert found.outside == pytest.approx(6 / 100)
+
+
+def test_the_band_holds_95_percent_of_the_successes_at_each_sample() -> None:
+    X = successes(1000)
+    found = envelope_of(X, X[0], rate_hz=500.0)
+    assert found is not None
+    inside = ((found.low <= X) & (found.high >= X)).mean(axis=0)
+    assert inside.min() >= 0.945
+    assert inside.max() <= 0.955
+    assert 0.05 < found.usual < 0.15
+
+
+def test_an_excess_that_changes_sides_is_two() -> None:
+    X = successes(channels=1)
+    trace = np.zeros((1, 50), np.float32)
+    trace[0, 10:12], trace[0, 12:15] = 9.0, -9.0
+    found = envelope_of(X, trace, rate_hz=1.0)
+    assert found is not None
+    assert [(each.first, each.last, each.above) for each in found.excesses] == [(10, 11, True), (12, 14, False)]
+
+
+def test_samples_that_are_not_finite_lie_nowhere_and_are_counted() -> None:
+    trace = np.zeros((2, 50), np.float32)
+    trace[0, 3], trace[1, 4:6] = np.nan, np.inf
+    found = envelope_of(successes(), trace, rate_hz=1.0)
+    assert found is not None
+    assert (found.not_finite, found.excesses) == (3, ())
+
+
+def test_too_few_successes_or_others_have_no_band() -> None:
+    assert envelope_of(successes(19), np.zeros((2, 50), np.float32), 1.0) is None
+    assert envelope_of(successes(50), np.zeros((2, 49), np.float32), 1.0) is None
+
+
+def test_a_trace_is_not_held_against_itself(make_data: Callable[..., Dataset]) -> None:
+    data = make_data(60, samples=60, failures=0.0)
+    with DataEngine("pca") as engine:
+        for x in data.X:
+            engine.report(engine.decide(x).id, success=True)
+        found = engine.explain(next(engine.history()).id)
+        assert found.envelope is not None
+        assert found.envelope.n == len(set(content_hash(data.X))) - 1 == 59

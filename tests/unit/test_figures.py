@@ -1,0 +1,280 @@
+"""Tables and figures: what they say of replays that are known by hand."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from sklearn.decomposition import PCA
+
+from dengine import ConvReducer, Policy, Recipe, RetrainReport
+from dengine.cells.simulation.conditions import first_change
+from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
+from dengine.experiments.replay import Replay, RunLog, RunRecorder
+from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, write_csv
+
+RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
+
+
+def evidence(n: int, seed: int = 0) -> dict[str, Any]:
+    """What a picture of decisions does not look at, and where the parts lie."""
+    zeros = np.zeros(n, dtype=np.int64)
+    position = np.random.default_rng(seed).normal(size=(n, 2))
+    took = np.full(n, 1e-4)
+    never = np.zeros(n, dtype=bool)
+    return {"lower": np.zeros(n), "upper": np.ones(n), "n_success": zeros, "n_failure": zeros} | {
+        "position": position,
+        "decide_seconds": took,
+        "reason": np.full(n, "uncertain"),
+        "version": zeros,
+        "safe_mode": never,
+    }
+
+
+def replay_of(
+    action: list[str], truth: list[int], seed: int = 0, recipe: Recipe = RECIPE, name: str | None = None
+) -> Replay:
+    return Replay(
+        name=recipe.name if name is None else name,
+        recipe=recipe,
+        dataset="by hand",
+        index=np.arange(len(action)),
+        seed=seed,
+        action=np.array(action),
+        truth=np.array(truth, dtype=bool),
+        stopped=(np.array(action) == "accept") & ~np.array(truth, dtype=bool),
+        retrains=tuple(RetrainReport(i, seconds, 50, 0, True, "") for i, seconds in enumerate((0.1, 0.3))),
+        **evidence(len(action), seed),
+    )
+
+
+MANY_RIGHT = replay_of(["accept"] * 300, [1] * 290 + [0] * 10)
+ONE_WRONG = replay_of(["accept"] + ["verify"] * 298 + ["reject"], [0] + [1] * 299, seed=1)
+
+
+def test_pooled_precision_weighs_parts_not_replays() -> None:
+    (row,) = pool(frame_of([MANY_RIGHT, ONE_WRONG]))
+    assert row["precision"] == pytest.approx(1 - 11 / 301)  # the mean of the two ratios would be 0.483
+    assert row["npv"] == 0.0
+    assert (row["accepted"], row["total_accepted"], row["replays"]) == (150.5, 301, 2)
+    assert row["retrain_max_s"] == 0.3
+
+
+def test_nothing_accepted_has_no_precision_and_no_verdict() -> None:
+    (row,) = pool(frame_of([replay_of(["verify"] * 5, [1] * 5)]))
+    assert math.isnan(row["precision"])
+    assert promise_kept(row) is None
+    assert promise_line(row) == "pca (local): no part was accepted."
+
+
+@pytest.mark.parametrize(("bad", "kept"), [(30, True), (31, False)])
+def test_the_promise_is_kept_up_to_the_tolerance(bad: int, kept: bool) -> None:
+    (row,) = pool(frame_of([replay_of(["accept"] * 300, [0] * bad + [1] * (300 - bad))]))
+    assert promise_kept(row) is kept
+
+
+def test_names_keep_recipes_of_one_reducer_apart() -> None:
+    rows = pool(frame_of([replace(MANY_RIGHT, name="mine"), replace(ONE_WRONG, name="yours")]))
+    assert [row["recipe"] for row in rows] == ["mine", "yours"]
+
+
+def test_the_table_says_which_promise_it_shows() -> None:
+    table = pooled_table(pool(frame_of([MANY_RIGHT])))
+    assert "pooled precision is only measured" in str(table.caption)
+    assert "of accepted parts only stops are known" in str(table.caption)
+    assert list(table.columns[0].cells) == ["pca\nlocal, some"]
+
+
+def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
+    pooled = replay_of(["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all"))
+    rows = pool(frame_of([MANY_RIGHT, pooled]))
+    assert [(row["guarantee"], row["stops"]) for row in rows] == [("local", "some"), ("pooled", "all")]
+    table = pooled_table(rows)
+    assert list(table.columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
+    for said in ("is only measured", "keeps all accepted parts together", "no stop follows"):
+        assert said in str(table.caption)
+    assert promise_line(rows[1]).startswith("pca (pooled): 100.0 % of 300")
+
+
+def test_the_csv_has_a_row_a_replay(tmp_path) -> None:
+    path = write_csv(frame_of([MANY_RIGHT, ONE_WRONG]), tmp_path / "deep" / "replays.csv")
+    header, *rows = path.read_text().splitlines()
+    assert header.startswith("recipe,interval,alpha,lower_bound,guarantee,stops,confirm,seed")
+    assert len(rows) == 2
+
+
+@pytest.mark.parametrize("window", [1, 3, 10, 50])
+def test_a_sliding_sum_equals_the_sum_of_each_window(window: int) -> None:
+    values = np.random.default_rng(0).random((2, 20))
+    expected = [[row[max(0, i - window + 1) : i + 1].sum() for i in range(20)] for row in values]
+    np.testing.assert_allclose(sliding_sum(values, window), expected)
+
+
+def test_window_curves_are_shares_of_the_cycles_and_of_what_was_decided_in_the_window() -> None:
+    lines = window_curves([replay_of(["verify", "verify", "accept", "reject"], [1, 1, 0, 1])], window=2)
+    np.testing.assert_allclose(lines["certain"], [0, 0, 50, 100])
+    np.testing.assert_allclose(lines["precision"], [np.nan, np.nan, 0, 0])
+    np.testing.assert_allclose(lines["false_positive"], [np.nan, np.nan, 100, 100])
+    np.testing.assert_allclose(lines["false_negative"], [np.nan, np.nan, np.nan, 100])
+
+
+def test_the_errors_of_all_replays_are_pooled_before_they_are_divided() -> None:
+    lines = window_curves([MANY_RIGHT, ONE_WRONG], window=300)
+    assert lines["false_positive"][-1] == pytest.approx(100 * 11 / 301)  # the mean of the two shares would be 51.7
+
+
+def test_a_share_of_too_few_parts_is_left_out() -> None:
+    some = replay_of(["accept"] * 4 + ["verify"] * 4, [0] + [1] * 7)
+    assert np.isfinite(window_curves([some], window=4, fewest=3)["precision"]).tolist() == [0, 0, 1, 1, 1, 0, 0, 0]
+
+
+def test_errors_as_frequent_as_tolerated_lie_on_the_line_of_the_tolerance() -> None:
+    spent = replay_of(["accept"] * 100 + ["verify"] * 200, ([0] + [1] * 9) * 10 + [1] * 200)  # 10 % of the accepted
+    _, bottom = curves({"a": [spent]}, window=300).axes
+    errors, tolerance = bottom.lines[0].get_ydata(), bottom.lines[-1].get_ydata()
+    assert errors[99] == pytest.approx(10.0)
+    np.testing.assert_allclose(tolerance, 10.0)
+
+
+def test_the_curves_draw_the_lower_bound_and_the_tolerance_and_count_the_errors() -> None:
+    top, bottom = curves({"a": [MANY_RIGHT], "b": [ONE_WRONG]}).axes
+    assert any(np.allclose(line.get_ydata(), 90.0) and line.get_linestyle() == ":" for line in top.lines)
+    assert any(np.allclose(line.get_ydata(), 10.0) and line.get_linestyle() == ":" for line in bottom.lines)
+    assert {"a: certain, of all cycles", "b: certain, of all cycles"} <= {line.get_label() for line in top.lines}
+    assert {"a: 10 bad of 300 accepted", "b: 1 good of 1 rejected"} <= {line.get_label() for line in bottom.lines}
+
+
+# ---------------------------------------------------------------------------------------------------------- maps
+
+
+def ball_of(figure: Figure) -> Circle:
+    (ball,) = figure.axes[0].patches
+    return ball
+
+
+def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> None:
+    figure = embedding_map(MANY_RIGHT)
+    assert [axes.get_aspect() for axes in figure.axes] == [1.0, 1.0]
+    assert ball_of(figure).get_radius() == RECIPE.radius
+    np.testing.assert_array_equal(ball_of(figure).get_center(), MANY_RIGHT.position[-1])
+
+
+def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() -> None:
+    figure = embedding_map(replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05)))
+    assert figure.axes[0].get_xlabel() == "predicted probability of success"
+    assert "for the eye" in figure.axes[0].get_ylabel()
+    assert ball_of(figure).get_radius() == 0.05
+    assert "root mean square radius = 1" in embedding_map(MANY_RIGHT).axes[0].get_ylabel()
+
+
+@pytest.mark.parametrize(
+    ("reducer", "probability"),
+    [
+        ("rocket", True),
+        (ConvReducer(), True),
+        ("dengine.reducers.conv:ConvReducer", True),
+        (PCA(2), False),
+        ("sklearn.decomposition:PCA", False),
+    ],
+)
+def test_a_reducer_says_whether_its_axis_is_a_probability(reducer: Any, probability: bool) -> None:
+    assert is_probability(Recipe(reducer)) is probability
+
+
+def test_a_ball_that_grows_has_no_radius_to_draw() -> None:
+    grown = replay_of(["accept"] * 50, [1] * 50, recipe=replace(RECIPE, fraction=0.3))
+    assert len(embedding_map(grown).axes[0].patches) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------- runs
+
+
+def log_of(clock_s: np.ndarray | None) -> RunLog:
+    action = np.array(["verify"] * 60 + ["accept"] * 30 + ["reject"] * 10)
+    truth = np.array([1.0] * 59 + [0.0] + [1.0] * 29 + [0.0] + [0.0] * 9 + [1.0])
+    return RunLog(action=action, truth=truth, stopped=np.arange(100) == 89, clock_s=clock_s, **evidence(100))
+
+
+def test_a_run_is_summed_up_by_stretches_that_add_up() -> None:
+    log = log_of(np.cumsum(np.full(100, 36.0)))
+    total, parts = log.summary(), log.stretches(7)
+    for name in ("verified", "accepted", "rejected", "false_positive", "false_negative", "stops"):
+        assert total[name] == sum(part[name] for part in parts)
+    assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
+    assert total["parts_per_hour"] == pytest.approx(88.0)  # 59 verified good and 29 accepted good in an hour
+
+
+def test_a_cell_without_a_clock_has_no_rate_and_one_panel_less() -> None:
+    log = log_of(None)
+    assert log.summary()["parts_per_hour"] is None
+    assert len(run_picture(log).axes) == 2
+    assert len(run_picture(log_of(np.arange(1.0, 101.0))).axes) == 3
+
+
+def test_a_run_that_verified_every_part_lies_on_its_own_baseline() -> None:
+    clock_s, never = 52.0 * np.arange(1, 51), np.zeros(50, dtype=bool)
+    log = RunLog(action=np.array(["verify"] * 50), truth=np.ones(50), stopped=never, clock_s=clock_s, **evidence(50))
+    run, baseline = run_picture(log).axes[2].lines
+    np.testing.assert_allclose(run.get_ydata(), baseline.get_ydata())
+
+
+def blank() -> Replay:
+    """No model embedded anything."""
+    replay = replay_of(["verify"] * 5, [1] * 5)
+    replay.position[:] = np.nan
+    return replay
+
+
+def no_run(clock: float | None) -> RunLog:
+    return RunRecorder(SimpleNamespace(clock=clock)).log()
+
+
+PICTURES: dict[str, Callable[[], Figure]] = {
+    "curves": lambda: curves({"pca": [MANY_RIGHT], "conv": [ONE_WRONG]}, "a title"),
+    "curves of four": lambda: curves({name: [MANY_RIGHT] for name in ("pca", "conv", "umap", "rocket")}),
+    "curves of nothing": lambda: curves({"pca": [blank()]}),
+    "map": lambda: embedding_map(ONE_WRONG, title="a title"),
+    "map of a probability": lambda: embedding_map(replace(ONE_WRONG, recipe=Recipe("conv")), title="a title"),
+    "map of nothing": lambda: embedding_map(blank()),
+    "run": lambda: run_picture(log_of(np.arange(1.0, 101.0)), "a title"),
+    "run without a clock": lambda: run_picture(log_of(None)),
+    "run of a replay": lambda: run_picture(MANY_RIGHT),
+    "run of no cycle": lambda: run_picture(no_run(0.0)),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_every_figure_is_written_as_a_png_without_pyplot(name: str, tmp_path: Path) -> None:
+    path = save(PICTURES[name](), tmp_path / "deep" / "figure.png", dpi=40)
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_no_legend_lies_on_the_data(name: str) -> None:
+    figure = PICTURES[name]()
+    figure.draw_without_rendering()
+    legends = [each.get_legend() for each in figure.axes if each.get_legend()] + figure.legends
+    assert legends
+    for legend in legends:
+        box = legend.get_window_extent()
+        assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(figure.axes)
+        assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
+
+
+def test_novel_parts_and_cycles_of_safe_mode_are_counted_in_their_stretch() -> None:
+    novel, safe = np.arange(100) % 10 == 0, np.arange(100) >= 70
+    log = replace(log_of(None), reason=np.where(novel, "novel", "uncertain"), safe_mode=safe)
+    assert (log.summary()["novel"], log.summary()["safe_mode"]) == (10, 30)
+    assert [part["safe_mode"] for part in log.stretches(4)] == [0, 0, 5, 25]
+
+
+@pytest.mark.parametrize(("scenario", "cycle"), [("nominal", None), ("wear", 2), ("variant", 401), ("bias_jump", 401)])
+def test_a_change_is_marked_at_the_first_cycle_that_it_touches(scenario: str, cycle: int | None) -> None:
+    # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
+    assert first_change(scenario, 800) == cycle

@@ -1,0 +1,586 @@
+"""Cells of one product in one database: what they share, what stays their own, and what is never mixed."""
+
+import json
+import os
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from sklearn.decomposition import PCA
+
+from dengine import Action, DataEngine, Dataset, MemoryStore, Recipe, SqlStore
+from dengine.cli import main
+from dengine.errors import SettingError, StoreError, TraceError
+from dengine.store import queries as sql_queries
+from dengine.store.peers import address, list_cells
+from tests.conftest import insertion_like
+
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+DATABASES = [
+    "sqlite",
+    pytest.param(
+        "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+    ),
+]
+EVERY = 20
+RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
+CONV = Recipe.load("conv").with_settings(retrain_every=EVERY, max_steps=10)
+POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
+
+
+class Ticks:
+    """A clock that goes on by two seconds whenever it is asked, so that it is always time for news."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        self.now += 2.0
+        return self.now
+
+
+@dataclass
+class Fleet:
+    """A database, with names of cells and products that no other test has."""
+
+    url: str
+    tag: str = field(default_factory=lambda: uuid.uuid4().hex)
+    opened: list[DataEngine] = field(default_factory=list)
+
+    def store(self, cell: str, product: str | None = "gear", kind: Callable[..., SqlStore] = SqlStore) -> SqlStore:
+        return kind(self.url, f"{cell}-{self.tag}", product=product and f"{product}-{self.tag}")
+
+    def engine(self, cell: str, product: str | None = "gear", recipe: Any = RECIPE, **options: Any) -> DataEngine:
+        store = options.pop("store", None) or self.store(cell, product)
+        options = {"clock": Ticks(), "replaying": True} | options
+        self.opened.append(DataEngine.open_or_create(store, recipe=recipe, **options))
+        return self.opened[-1]
+
+
+@pytest.fixture(params=DATABASES)
+def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
+    made = Fleet(str(tmp_path / "fleet.db") if request.param == "sqlite" else str(POSTGRES))
+    yield made
+    for engine in made.opened:
+        engine.close()
+
+
+@pytest.fixture(scope="module")
+def parts() -> Dataset:
+    return insertion_like(260, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def probe() -> np.ndarray:
+    return insertion_like(40, seed=99, noise=0.3).X[:, None]
+
+
+def learn(engine: DataEngine, parts: Dataset, rows: Any) -> None:
+    """Decide on parts, and report all that may be reported."""
+    for i in rows:
+        decision = engine.decide(parts.X[i])
+        if decision.action is not Action.REJECT:
+            engine.report(decision.id, bool(parts.y[i]))
+
+
+def said(engine: DataEngine, probe: np.ndarray) -> list[Any]:
+    """What an engine says of traces that nobody learns from, to the last bit."""
+    return [(p.action, p.lower, p.upper, p.n_success, p.n_failure, p.embedding) for p in engine.model.predict_many(probe)]
+
+
+def counts(engine: DataEngine, probe: np.ndarray) -> list[tuple[int, int]]:
+    return [(p.n_success, p.n_failure) for p in engine.model.predict_many(probe)]
+
+
+def rule(engine: DataEngine) -> dict[str, list[float]]:
+    return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
+
+
+# ---------------------------------------------------------------------------------------------------- what is shared
+
+
+def test_a_new_sister_decides_at_once_and_as_its_sisters_do(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    first = fleet.engine("a")
+    learn(first, parts, range(100))
+    second = fleet.engine("b")
+    assert second.store.status()["labels"] == 0
+    assert second.version == first.version > 0
+    assert said(second, probe) == said(first, probe)
+    assert second.decide(parts.X[150]).action is not None
+    assert any(second.decide(x).action is Action.ACCEPT for x in parts.X[100:140])
+
+
+def test_labels_of_one_cell_become_references_of_the_other(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    learn(first, parts, range(25))
+    second.settle()
+    before = len(second.model.index)
+    learn(first, parts, range(25, 32))
+    assert len(second.model.index) == before
+    second.settle()
+    assert len(second.model.index) == len(first.model.index) > before
+    assert said(second, probe) == said(first, probe)
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, CONV], ids=["pca", "conv"])
+def test_one_retrain_serves_all(recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
+    for i in range(150):
+        learn(cells[i % 3], parts, [i])
+    for engine in cells:
+        engine.settle()
+    labels = sum(engine.store.status()["labels"] for engine in cells)
+    retrains = cells[0].store.retrains()
+    assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
+    assert {engine.version for engine in cells} == {len(retrains)}
+    assert said(cells[0], probe) == said(cells[1], probe) == said(cells[2], probe)
+    assert {len(engine.model.index) for engine in cells} == {labels}
+    assert {engine.new_labels for engine in cells} == {labels - EVERY * len(retrains)}
+
+
+def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000))
+    for start in range(0, 38, 2):
+        learn(first, parts, [start])
+        learn(second, parts, [start + 1])  # the label that makes it due is always of the one that waits for 1000
+    assert first.store.retrains() == []
+    learn(second, parts, [38])
+    learn(first, parts, [39, 40])
+    assert len(first.store.retrains()) == 1
+
+
+def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    learn(first, parts, range(15))
+    second._versions.fleet._asked = np.inf  # it asks for no news: it is at it
+    take, reports = second._versions._take, []
+
+    def late(trained: Any) -> None:
+        reports.append(first.retrain())  # meanwhile
+        take(trained)
+
+    second._versions._take = late  # type: ignore[method-assign]
+    reports.append(second.retrain())
+    assert [report.version for report in reports] == [1, 2]
+    first.settle()
+    assert first.version == second.version == 2
+    learn(first, parts, range(15, 20))
+    second._versions.fleet.take_in()
+    assert said(first, probe) == said(second, probe)
+
+
+def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        first, second = fleet.engine("a", executor=executor), fleet.engine("b")
+        learn(first, parts, range(30))
+        first.start_retrain()
+        learn(second, parts, range(30, 40))
+        learn(first, parts, range(40, 45))
+        first._versions.collect(wait=True)
+        for engine in (first, second, first):
+            engine.settle()
+        first._versions.collect(wait=True)
+        second.settle()
+        assert first.version == second.version
+        assert counts(first, probe) == counts(second, probe)
+        assert len(first.model.index) == len(second.model.index) == sum(e.store.status()["labels"] for e in (first, second))
+
+
+def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    first, second = (fleet.engine(name, recipe=Recipe(PCA(2), radius=0.4, retrain_every=EVERY)) for name in "ab")
+    learn(first, parts, range(50))
+    learn(second, parts, range(50, 55))
+    first.settle()
+    assert second.version == first.version > 0
+    np.testing.assert_array_equal(counts(first, probe), counts(second, probe))
+
+
+def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    learn(first, parts, range(30))
+    second.settle()
+    (before,) = counts(second, parts.X[100][None, None] + np.float32(0.01))
+    for engine in (first, second):
+        learn(engine, parts, [100])
+        engine.settle()
+    first.settle()
+    for engine in (first, second):
+        (after,) = counts(engine, parts.X[100][None, None] + np.float32(0.01))
+        assert sum(after) == sum(before) + 1
+
+
+def test_the_newest_labels_of_the_product_fill_the_window(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    small = RECIPE.with_settings(window=30)
+    first, second = fleet.engine("a", recipe=small), fleet.engine("b", recipe=small)
+    for i in range(70):
+        learn((first, second)[i % 2], parts, [i])
+    first.settle(), second.settle()
+    newest = first.store.labelled(30)
+    np.testing.assert_array_equal(newest.seq, second.store.labelled(30).seq)
+    assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
+    np.testing.assert_array_equal(newest.traces, second.store.labelled(30).traces)
+    assert counts(first, probe) == counts(second, probe)
+
+
+def test_bad_traces_leave_gaps_and_nothing_else(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    for i in range(40):
+        bad = first.decide(np.full(100, np.nan))
+        first.report(bad.id, False)
+        learn((first, second)[i % 2], parts, [i])
+    first.settle(), second.settle()
+    assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
+    assert said(first, probe) == said(second, probe)
+
+
+# ------------------------------------------------------------------------------------------------- what is put right
+
+
+def labelled_ids(engine: DataEngine) -> list[str]:
+    return [past.id for past in engine.history() if past.success is not None]
+
+
+def test_what_one_cell_puts_right_reaches_its_sisters_and_a_reopened_one(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    for i in range(70):
+        learn((first, second)[i % 2], parts, [i])
+    first.settle(), second.settle()
+    wrong, *gone = labelled_ids(first)[20:24]
+    first.correct(wrong, not first.store.get_decision(wrong).success)
+    first.forget(*gone)
+    second.settle()
+    assert first.version == second.version > 0
+    assert counts(first, probe) == counts(second, probe)
+    assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
+    assert second.new_labels == first.new_labels
+    before = counts(second, probe), rule(second)
+    again = fleet.engine("", recipe=None, store=reopened(fleet, second))
+    assert (counts(again, probe), rule(again)) == before
+
+
+def test_a_version_that_one_cell_goes_back_to_answers_in_all(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    for i in range(90):
+        learn((first, second)[i % 2], parts, [i])
+    first.settle(), second.settle()
+    newest = first.version
+    second.rollback(1)
+    first.settle()
+    assert first.version == second.version == newest + 1
+    assert said(first, probe) == said(second, probe)
+    assert [each.reason for each in first.store.versions()][-1] == "rolled back to version 1"
+
+
+def test_every_cell_of_a_product_has_a_ledger_of_its_own(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    for i in range(60):
+        learn((first, second)[i % 2], parts, [i])
+    first.forget(labelled_ids(first)[0])
+    found = [engine.store.verify() for engine in (first, second)]
+    assert [report.faults for report in found] == [(), ()]
+    assert found[0].cells[0].digest != found[1].cells[0].digest
+
+
+# ------------------------------------------------------------------------------------------------- what stays its own
+
+
+def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
+    learn(first, parts, range(120))
+    learn(second, parts, range(120, 160))
+    evidence = [len(engine.store.evidence_since(0).seq) for engine in (first, second)]
+    assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
+    assert rule(first) != rule(second)
+    assert first.store.outcomes() != second.store.outcomes()
+    assert rule(second)["members"] != rule(fleet.engine("c", recipe=POOLED))["members"]
+    assert second.store.get_decision("nobody") is None
+
+
+def test_a_sisters_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
+    learn(first, parts, range(60))
+    second.settle()
+    learn(second, parts, range(60, 75))
+    own = rule(second)
+    first.retrain()
+    second.settle()
+    assert second.version == first.version
+    assert rule(second) == own
+
+
+def test_policies_may_differ_by_cell(fleet: Fleet, parts: Dataset) -> None:
+    bold, careful = fleet.engine("a"), fleet.engine("b", recipe=RECIPE.with_policy(lower_bound=0.95, guarantee="pooled"))
+    learn(bold, parts, range(100))
+    careful.settle()
+    assert careful.version == bold.version
+    trace = parts.X[:60, None]
+    taken = [sum(p.action is Action.ACCEPT for p in engine.model.predict_many(trace)) for engine in (bold, careful)]
+    assert taken[0] > taken[1]
+    assert fleet.engine("b", recipe=None, store=reopened(fleet, careful)).policy.lower_bound == 0.95
+
+
+def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
+    cell_id = engine.store.cell_id
+    engine.close()
+    fleet.opened.remove(engine)
+    return SqlStore(fleet.url, cell_id)  # its product is known
+
+
+@pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
+def test_a_reopened_cell_decides_the_same_bit_for_bit(
+    recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    cells = [fleet.engine(name, recipe=recipe) for name in "ab"]
+    for i in range(130):
+        learn(cells[i % 2], parts, [i])
+    for engine in cells:
+        engine.settle()
+        before = said(engine, probe), rule(engine), engine.version, engine.new_labels
+        again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
+        assert (said(again, probe), rule(again), again.version, again.new_labels) == before
+
+
+def test_nothing_is_mixed_between_products_and_cells_without(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+    products = {"a": "gear", "b": "gear", "c": "nut", "d": None}
+    cells = {name: fleet.engine(name, product) for name, product in products.items()}
+    alone = DataEngine(recipe=RECIPE, store=MemoryStore(), clock=Ticks(), replaying=True)
+    for i in range(120):
+        name = "abcd"[i % 4]
+        learn(cells[name], parts, [i])
+        if name == "d":
+            learn(alone, parts, [i])
+    for engine in cells.values():
+        engine.settle()
+    assert said(cells["d"], probe) == said(alone, probe)
+    rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
+    for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
+        known = cells[name].store.labelled()
+        theirs = {parts.X[i].tobytes() for other in kin for i in rows[other]}
+        assert {trace.tobytes() for trace in known.traces} <= theirs
+        assert known.seq.tolist() == list(range(1, len(known.seq) + 1))
+        assert len(known.seq) == sum(cells[other].store.status()["labels"] for other in kin)
+
+
+def test_label_numbers_are_unique_and_increase_over_the_product(fleet: Fleet, parts: Dataset) -> None:
+    for name in "abcd":
+        fleet.engine(name, recipe=RECIPE.with_settings(retrain_every=10_000))
+    numbers: list[int] = []
+
+    def work(engine: DataEngine, start: int) -> None:
+        for i in range(start, start + 25):
+            decision = engine.decide(parts.X[i])
+            engine.report(decision.id, bool(parts.y[i]))
+        numbers.append(engine.store.status()["labels"])
+
+    threads = [threading.Thread(target=work, args=(engine, 25 * i)) for i, engine in enumerate(fleet.opened)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert numbers == [25] * 4
+    seen = fleet.opened[0].store.labelled()
+    assert seen.seq.tolist() == list(range(1, 101))
+    assert {trace.tobytes() for trace in seen.traces} == {x.tobytes() for x in parts.X[:100]}
+
+
+# --------------------------------------------------------------------------------------------------- a lost connection
+
+
+class ShakyStore(SqlStore):
+    """A store that cannot be asked for news while `lost`."""
+
+    lost = False
+
+    def news_since(self, seq: int, limit: int) -> Any:
+        if self.lost:
+            raise StoreError("The connection is gone.")
+        return super().news_since(seq, limit)
+
+
+def test_a_cell_without_news_goes_on_and_says_so_once(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    shaky = fleet.store("b", kind=ShakyStore)
+    first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
+    learn(first, parts, range(30))
+    second.settle()
+    ShakyStore.lost = True
+    try:
+        for i in range(40):
+            learn((first, second)[i % 2], parts, [100 + i])
+            second.settle()
+        second.retrain()
+        assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
+    finally:
+        ShakyStore.lost = False
+    for engine in (second, first, second):
+        engine.settle()
+    assert "comes again" in caplog.text
+    assert first.version == second.version
+    assert counts(first, probe) == counts(second, probe)
+    again = fleet.engine("", recipe=None, store=reopened(fleet, second))
+    assert counts(again, probe) == counts(first, probe)
+
+
+def test_decide_never_asks_for_news(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b", store=fleet.store("b", kind=ShakyStore))
+    learn(first, parts, range(25))
+    ShakyStore.lost = True
+    try:
+        second._versions.fleet._lost = False
+        for x in parts.X[:10]:
+            second.decide(x)
+        assert not second._versions.fleet._lost
+        second.settle()
+        assert second._versions.fleet._lost
+    finally:
+        ShakyStore.lost = False
+
+
+# ------------------------------------------------------------------------------------------------------- who may join
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"recipe": Recipe("umap")}, "reducer"),
+        ({"recipe": RECIPE.with_settings(folds=3)}, "folds"),
+        ({"recipe": RECIPE.with_settings(window=500)}, "window"),
+        ({"recipe": RECIPE.with_settings(novelty=0.0)}, "novelty"),
+        ({"recipe": RECIPE, "seed": 7}, "seed 0"),
+    ],
+    ids=["reducer", "folds", "window", "novelty", "seed"],
+)
+def test_what_decides_the_embedding_must_agree(change: dict[str, Any], named: str, fleet: Fleet) -> None:
+    fleet.engine("a")
+    with pytest.raises(SettingError, match=f"product.*{named}"):
+        fleet.engine("b", **change)
+
+
+def test_a_sister_that_asks_for_nothing_gets_what_the_others_have(fleet: Fleet) -> None:
+    fleet.engine("a", seed=3)
+    second = fleet.engine("b", recipe=None)
+    assert (second.recipe, second.seed) == (RECIPE, 3)
+
+
+def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Dataset) -> None:
+    first, second = fleet.engine("a"), fleet.engine("b")
+    first.decide(parts.X[0])
+    with pytest.raises(TraceError, match="100 samples"):
+        second.decide(np.arange(50.0))
+    assert second.trace == first.trace == fleet.engine("c").trace
+
+
+def test_a_cell_keeps_its_product(fleet: Fleet) -> None:
+    fleet.engine("a").close()
+    with pytest.raises(StoreError, match="leave it out"):
+        fleet.store("a", "nut")
+    with fleet.store("a", None) as store:
+        assert store.product == f"gear-{fleet.tag}"
+
+
+def test_a_cell_that_worked_alone_cannot_join_a_product(fleet: Fleet, parts: Dataset) -> None:
+    learn(fleet.engine("a", None), parts, [0])
+    fleet.opened.pop().close()
+    with pytest.raises(StoreError, match="name a new cell"):
+        fleet.store("a", "gear")
+    with fleet.store("a", None) as store:
+        assert store.product is None
+
+
+def test_a_refused_cell_leaves_nothing_behind(fleet: Fleet) -> None:
+    fleet.engine("a", None)
+    with pytest.raises(StoreError, match="printable"):
+        SqlStore(fleet.url, f"b-{fleet.tag}", product="\n")
+    assert [cell.cell_id for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id] == [f"a-{fleet.tag}"]
+
+
+# ------------------------------------------------------------------------------------------------------------ questions
+
+
+def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
+    with SqlStore(str(tmp_path / "a.db"), "a", product="gear") as store:
+        scope = store._database.scope
+        with store._database.transaction(write=False) as connection:
+            for query in (
+                sql_queries.news_query(scope, 5, 10),
+                sql_queries.trace_query(scope, 5, 10),
+                sql_queries.version_query(scope, 1),
+                sql_queries.correction_query(scope, 1),
+            ):
+                text = query.compile(connection, compile_kwargs={"literal_binds": True})
+                plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
+                tables = ("label", "trace", "model_version", "decision", "correction")
+                assert not [step for step in plan if step.startswith("SCAN") and step.split()[1] in tables], plan
+
+
+def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> None:
+    learn(fleet.engine("a"), parts, range(30))
+    fleet.engine("b")
+    fleet.engine("d", None)
+    for engine in fleet.opened:
+        engine.store.flush()
+    found = {cell.cell_id.split("-")[0]: cell for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
+    assert {name: cell.product for name, cell in found.items()} == dict.fromkeys("ab", f"gear-{fleet.tag}") | {"d": None}
+    assert (found["a"].decisions, found["b"].decisions) == (30, 0)
+    assert found["a"].labels == fleet.opened[0].store.status()["labels"]
+    assert (found["a"].version, found["b"].version, found["d"].version) == (1, 1, None)
+    assert found["a"].last_seen is not None
+    assert found["b"].last_seen is None
+
+
+def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset, tmp_path: Path) -> None:
+    np.savez(tmp_path / "parts.npz", X=parts.X[:60], y=parts.y[:60])
+    cell, product, data = f"a-{fleet.tag}", f"gear-{fleet.tag}", str(tmp_path / "parts.npz")
+    sister = f"b-{fleet.tag}"
+
+    def run(*words: str) -> Any:
+        done = CliRunner().invoke(main, list(words))
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    run("train", "--data", data, "--store", fleet.url, "--reducer", "pca", "--cell", cell, "--product", product)
+    run("run", "--cell", "replay", "--data", data, "--cycles", "60", "--store", fleet.url, "--cell-id", sister,
+        "--product", product)  # fmt: skip
+    status = json.loads(run("status", fleet.url, "--cell", sister, "--json"))
+    assert (status["cell_id"], status["decisions"], status["product"]) == (sister, 60, product)
+    assert cell in run("status", fleet.url, "--cell-id", cell)
+    run("export", fleet.url, "--cell", sister, "--out", str(tmp_path / "model.ts"))
+    listed = json.loads(run("cells", fleet.url, "--json"))["cells"]
+    assert [row["product"] for row in listed if row["cell_id"] in (cell, sister)] == [product, product]
+    assert cell[:10] in run("cells", fleet.url)
+    with SqlStore(fleet.url, sister) as store:
+        assert len(store.labelled().seq) > len(store.own_labelled().seq) > 0
+
+
+@pytest.mark.parametrize("verb", ["status", "export"])
+def test_a_cell_that_is_not_there_is_refused_and_not_made(verb: str, tmp_path: Path, parts: Dataset) -> None:
+    url = str(tmp_path / "a.db")
+    with DataEngine.open_or_create(address(url, "cell-7"), recipe=RECIPE) as engine:
+        learn(engine, parts, range(25))
+    words = [verb, url, "--cell", "cell-8"] + (["--out", str(tmp_path / "m.ts")] if verb == "export" else [])
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 1
+    assert "it holds cell-7" in done.output
+    assert [cell.cell_id for cell in list_cells(url)] == ["cell-7"]
+
+
+def test_cells_of_what_is_no_store_is_an_error(tmp_path: Path) -> None:
+    for name, text in (("empty.db", b""), ("other.db", b"no database")):
+        (tmp_path / name).write_bytes(text)
+        assert CliRunner().invoke(main, ["cells", str(tmp_path / name)]).exit_code == 1
+    assert CliRunner().invoke(main, ["cells", str(tmp_path / "none.db")]).exit_code == 1
+    assert not (tmp_path / "none.db").exists()

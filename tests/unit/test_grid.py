@@ -1,0 +1,264 @@
+"""Grids of replays: kept, gone on with, the same on every backend, and what they cost."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from importlib import import_module
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
+from dengine.cli import main
+from dengine.errors import SettingError
+from dengine.experiments.contenders import Contender
+from dengine.experiments.costs import Forecast, makespan
+from dengine.experiments.grid import KeptReplays, Task, grid_tasks, iterate_replays, run_replays
+from dengine.experiments.rivals import RIVALS
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
+TIMES = ("decide_seconds", "retrains", "seconds")
+TIMED = ["retrain_p50_s", "retrain_max_s", "decide_p50_us", "decide_p99_us", "seconds"]
+GRID = {"alphas": (0.1, 0.5), "lower_bounds": (0.9,), "intervals": ("wilson", "binomial"), "repeats": 2, "cycles": 70}
+
+
+def same(one: Replay, other: Replay) -> None:
+    for f in fields(Replay):
+        if f.name not in TIMES:
+            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
+    for a, b in zip(one.retrains, other.retrains, strict=True):
+        assert replace(a, seconds=0.0) == replace(b, seconds=0.0)
+
+
+def decisions_of(frame):
+    return frame.drop(columns=TIMED)
+
+
+# ------------------------------------------------------------------------------------------------------- on disk
+
+
+def test_a_kept_replay_comes_back_whole(data: Dataset, tmp_path: Path) -> None:
+    task = Task(Contender.load(RECIPE), seed=1, cycles=60)
+    played = replay(data, RECIPE, seed=1, cycles=60)
+    kept = KeptReplays(tmp_path, data)
+    assert kept.get(task) is None
+    kept.put(task, played)
+    back = kept.get(task)
+    same(played, back)
+    np.testing.assert_array_equal(back.decide_seconds, played.decide_seconds)
+    assert (back.retrains, back.seconds, back.recipe) == (played.retrains, played.seconds, played.recipe)
+    assert back.summary() == pytest.approx(played.summary(), nan_ok=True)
+
+
+def test_another_setting_seed_length_feedback_or_data_is_another_replay(data: Dataset, tmp_path: Path) -> None:
+    kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
+    task = Task(who, seed=1, cycles=60)
+    others = [
+        replace(task, seed=2),
+        replace(task, cycles=61),
+        replace(task, confirm=True),
+        replace(task, shuffle=False),
+        replace(task, contender=who.with_policy(alpha=0.2)),
+    ]
+    paths = {kept.path(each) for each in [task, *others]}
+    flipped = replace(data, y=1 - data.y)
+    assert len(paths | {KeptReplays(tmp_path, flipped).path(task)}) == 7
+    assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
+
+
+@pytest.mark.parametrize("within", [False, True])
+def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, within: bool
+) -> None:
+    source = "from sklearn.decomposition import PCA\n\nclass Own(PCA):\n    pass\n"
+    module = tmp_path / f"own_reducer_of_test_grid_{within}.py"
+    module.write_text(source, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    own = make_pipeline(StandardScaler(), import_module(module.stem).Own()) if within else f"{module.stem}:Own"
+    task, kept = Task(Contender.load(own), seed=1), KeptReplays(tmp_path / "kept", data)
+    before = kept.path(task)
+    module.write_text(source + "    # changed\n", encoding="utf-8")
+    assert kept.path(task) == before  # what is being played is what was imported, not what the file says by now
+    assert KeptReplays(tmp_path / "kept", data).path(task) != before
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", b"\x93NUMPY"])
+def test_a_damaged_file_is_a_replay_that_is_not_there(data: Dataset, tmp_path: Path, damage: bytes) -> None:
+    task, kept = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data)
+    kept.path(task).write_bytes(damage)
+    assert kept.get(task) is None
+    (played,) = iterate_replays(data, [task], keep=tmp_path)
+    assert not played.kept
+    same(kept.get(task), played.replay)
+
+
+def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
+    task, kept, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data), np.random.default_rng(0)
+    played = replay(data, RECIPE, seed=1, cycles=50)
+    kept.put(task, played)
+    whole = np.frombuffer(kept.path(task).read_bytes(), dtype=np.uint8)
+    found = []
+    for size in [1, 1, 3, 50] * 75:
+        damaged = whole.copy()
+        damaged[rng.integers(len(whole), size=size)] = rng.integers(256, size=size)
+        kept.path(task).write_bytes(damaged.tobytes())
+        found.append(kept.get(task))
+    assert found.count(None) > 200
+    for back in found:
+        if back is not None:  # what was hit is nothing that is read
+            np.testing.assert_array_equal(back.action, played.action)
+
+
+def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:
+    first = run_grid(data, [RECIPE], **GRID, n_jobs=1, keep=tmp_path)
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    again = run_grid(data, [RECIPE], **GRID, n_jobs=1, keep=tmp_path)
+    assert first.equals(again)  # times and all
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == files
+    assert len(files) == len(first) == 8
+    more = run_grid(data, [RECIPE], **GRID | {"repeats": 3}, n_jobs=1, keep=tmp_path)
+    assert len(list(tmp_path.iterdir())) == len(more) == 12
+
+
+def test_a_killed_grid_redoes_only_what_was_running(data: Dataset, tmp_path: Path) -> None:
+    np.savez(tmp_path / "data.npz", X=data.X, y=data.y)
+    command = [sys.executable, "-m", "dengine", "compare", "--data", "data.npz", "--reducers", "pca", "--alphas", "0.1,0.5"]
+    command += ["--lower-bounds", "0.8,0.9", "--repeats", "40", "--keep", "kept", "--json"]
+    running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    kept = tmp_path / "kept"
+    deadline = time.monotonic() + 120
+    while len(list(kept.glob("*.npz"))) < 3:
+        assert running.poll() is None, running.stderr.read().decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    finished = {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")}
+    loaded = replace(data, name="data", rate_hz=500.0)
+    tasks = grid_tasks([Contender.load("pca")], (0.1, 0.5), (0.8, 0.9), ("wilson",), range(2))
+    played = list(iterate_replays(loaded, tasks, keep=kept))
+    assert sum(each.kept for each in played) >= 3
+    assert {path: path.stat().st_mtime_ns for path in finished} == finished  # none of them was written again
+    assert sorted(each.position for each in played) == list(range(len(tasks)))
+
+
+def test_a_rival_without_its_library_is_refused_before_anything_is_played(
+    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RIVALS, "always", replace(RIVALS["always"], needs="no_such_library"))
+    with pytest.raises(SettingError, match="always needs no_such_library"):
+        run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------------------------------------------ backends
+
+
+@pytest.fixture(scope="module")
+def serial(data: Dataset):
+    return decisions_of(run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_grid_is_the_same_on_loky(data: Dataset, serial, workers: int) -> None:
+    with joblib.parallel_config(backend="loky"):
+        assert decisions_of(run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers)).equals(serial)
+
+
+def test_a_grid_is_the_same_on_a_dask_cluster(
+    data: Dataset, serial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster:
+        with distributed.Client(cluster), joblib.parallel_config(backend="dask"):
+            frame = run_grid(data, [RECIPE, "always"], **GRID, n_jobs=-1)
+        monkeypatch.chdir(tmp_path)
+        np.savez("data.npz", X=data.X, y=data.y)
+        Path("pca.toml").write_text(RECIPE.to_toml(), encoding="utf-8")
+        command = "compare --data data.npz --reducers pca.toml,always --alphas 0.1,0.5 --lower-bounds 0.9 --repeats 2"
+        command += f" --intervals wilson,binomial --cycles 70 --json --scheduler {cluster.scheduler_address}"
+        done = CliRunner().invoke(main, command.split())
+    assert decisions_of(frame).equals(serial)
+    assert done.exit_code == 0, done.output
+    certain = serial.groupby(["recipe", "interval", "alpha"], sort=False)["certain"].mean()
+    assert [row["certain"] for row in json.loads(done.stdout)["rows"]] == certain.tolist()
+
+
+# --------------------------------------------------------------------------------------------------------- tasks
+
+
+def test_guarantees_and_feedbacks_are_conditions_of_their_own(data: Dataset) -> None:
+    known = RECIPE.with_policy(stops="all")
+    frame = run_grid(
+        data,
+        [known],
+        (0.1,),
+        (0.9,),
+        repeats=1,
+        cycles=60,
+        n_jobs=1,
+        guarantees=("local", "pooled"),
+        confirms=(False, True),
+    )
+    assert list(zip(frame["guarantee"], frame["confirm"], strict=True)) == [
+        ("local", False), ("local", True), ("pooled", False), ("pooled", True)
+    ]  # fmt: skip
+
+
+def test_none_leaves_a_setting_to_the_recipe() -> None:
+    (task,) = grid_tasks([RECIPE], (None,), (None,), (None,), [7])
+    assert (task.contender.recipe, task.seed) == (RECIPE, 7)
+
+
+def test_replays_end_seed_by_seed_so_that_a_part_can_be_compared(data: Dataset) -> None:
+    tasks = grid_tasks([RECIPE, "always"], (0.1,), (0.9,), ("wilson",), range(2), cycles=40)
+    seeds = [tasks[played.position].seed for played in iterate_replays(data, tasks)]
+    assert seeds == [0, 0, 1, 1]
+
+
+def test_the_list_of_replays_is_in_the_order_in_which_they_were_asked_for(data: Dataset) -> None:
+    replays = run_replays(data, [RECIPE, "always"], (3, 2), cycles=40, n_jobs=2)
+    assert [(each.name, each.seed) for each in replays] == [("pca", 3), ("pca", 2), ("always", 3), ("always", 2)]
+
+
+# --------------------------------------------------------------------------------------------------------- costs
+
+
+@given(st.lists(st.floats(0.01, 100.0), min_size=1, max_size=30), st.integers(1, 40))
+def test_a_makespan_is_at_least_the_longest_job_and_the_fair_share_and_at_most_all_in_a_row(costs, workers) -> None:
+    took = makespan(costs, workers)
+    assert took >= max(max(costs), sum(costs) / workers) - 1e-9
+    assert took <= sum(costs) + 1e-9
+    assert took <= max(costs) + sum(costs) / workers + 1e-9
+
+
+def test_a_makespan_by_hand() -> None:
+    assert makespan([3, 3, 2, 2, 2], 2) == 7  # the best is 6: the longest first is not always the best
+    assert makespan([5, 1, 1, 1], 1000) == 5
+    assert makespan([1, 2, 3], 1) == 6
+
+
+def test_the_forecast_is_by_kind_and_says_when_a_kind_is_unknown() -> None:
+    forecast = Forecast(["fast"] * 4 + ["slow"] * 4, workers=2)
+    assert forecast.left() is None
+    forecast.done("fast", 1.0)
+    assert forecast.left() == (pytest.approx(3 * 1.0 / 2), True)
+    forecast.done("slow", 60.0)
+    assert forecast.left() == (pytest.approx((3 * 1.0 + 3 * 60.0) / 2), False)
+
+
+def test_the_last_replay_alone_is_not_shared_among_workers() -> None:
+    forecast = Forecast(["a"] * 2, workers=8)
+    forecast.done("a", 10.0)
+    assert forecast.left() == (10.0, False)

@@ -1,0 +1,117 @@
+"""A version that was trained beside the cell comes in by steps: none of them waits for the store or for many labels."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+
+from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.engine.versions import STEP
+from tests.support.driving import Counting
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
+
+
+class Slow(Counting):
+    """Needs half a step for each label, by a clock of its own."""
+
+    now = 0.0
+
+    def add(self, x, y):
+        super().add(x, y)
+        Slow.now += STEP / 2
+
+
+def learn(engine: DataEngine, data: Dataset, part: slice) -> None:
+    for x, y in zip(data.X[part], data.y[part], strict=True):
+        engine.report(engine.decide(x).id, bool(y))
+
+
+def said(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
+    return [(d.action, d.lower, d.n_success, d.n_failure, d.embedding) for d in map(engine.decide, probe)]
+
+
+class Held(ThreadPoolExecutor):
+    """Takes work and begins it when it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.go = Event()
+        super().submit(self.go.wait, 30)
+
+
+def trained_beside(engine: DataEngine, pool: Held, data: Dataset) -> None:
+    """Forty labels set a retrain off, sixteen come in meanwhile, and it ends; nobody has looked yet."""
+    learn(engine, data, slice(0, 56))
+    assert engine.retraining
+    assert not engine.swapping
+    pool.go.set()
+    pool.shutdown(wait=True)
+
+
+def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(data: Dataset) -> None:
+    pool = Held()
+    engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
+    trained_beside(engine, pool, data)
+    before = Slow.now
+    decisions = [engine.decide(x) for x in data.X[100:109]]
+    assert [d.model_version for d in decisions] == [0] * 8 + [1]  # it is taken; then sixteen labels, two a step
+    assert (decisions[-1].n_success, decisions[-1].n_failure) == (40, 16)
+    assert Slow.now - before == pytest.approx(16 * STEP / 2)
+    assert not engine.swapping
+
+
+def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(data: Dataset) -> None:
+    pool = Held()
+    engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
+    trained_beside(engine, pool, data)
+    assert engine.settle(brief=True) is None
+    assert engine.swapping
+    report = engine.settle()
+    assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
+
+
+def test_what_is_reported_while_a_version_is_being_stored_is_in_it_and_in_the_reopened_engine(
+    data: Dataset, tmp_path: Path
+) -> None:
+    pool, probe = Held(), data.X[150:170]
+    engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / "cell.db")
+    trained_beside(engine, pool, data)
+    while engine._versions._incoming is None or engine._versions._incoming.storing is None:
+        engine.settle(brief=True)
+    assert engine.version == 0
+    engine._versions.collect = lambda *args, **options: None  # nobody looks whether it is stored
+    learn(engine, data, slice(56, 70))
+    del engine._versions.collect
+    assert engine.version == 0
+    engine.settle()
+    assert engine.version == 1
+    assert len(engine.model.index) == 70
+    learn(engine, data, slice(70, 75))
+    expected = said(engine, probe)
+    engine.close()
+    with DataEngine.open(tmp_path / "cell.db") as again:
+        assert again.version == 1
+        assert said(again, probe) == expected
+
+
+def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
+    data: Dataset, tmp_path: Path
+) -> None:
+    probe = data.X[180:]
+    for n in (55, 83, 97, 121):
+        with ThreadPoolExecutor(1) as pool:
+            engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / f"{n}.db")
+            for i in range(n):
+                learn(engine, data, slice(i, i + 1))
+                engine.settle(brief=True)
+            engine.close()
+        with DataEngine.open(tmp_path / f"{n}.db") as first:
+            expected = said(first, probe)
+            assert len(first.model.index) == n
+        with DataEngine.open(tmp_path / f"{n}.db") as second:
+            assert said(second, probe) == expected

@@ -1,0 +1,296 @@
+"""A cell's journal comes back into the store once, bad traces into quarantine."""
+
+import shutil
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dengine import Dataset, Policy, Recipe, TraceSpec, load_exported
+from dengine.cli.export import export, import_labels
+from dengine.datasets.importing import import_journal
+from dengine.engine.engine import DataEngine
+from dengine.errors import DataError
+from dengine.export.cell_journal import read_journal
+from dengine.folds import content_hash, part_hash
+from dengine.records import Reason
+
+HEAD = "# dengine 2 0123\n"
+
+
+def new_store(data: Dataset, path: Path, **policy: Any) -> str:
+    """An engine's store, after its first retrain."""
+    recipe = Recipe(reducer="pca", retrain_every=1000, policy=Policy(alpha=0.1, lower_bound=0.9, **policy))
+    with DataEngine.from_recipe(recipe, str(path), replaying=True) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        engine.retrain()
+    return str(path)
+
+
+@pytest.fixture
+def store(data: Dataset, tmp_path: Path) -> str:
+    return new_store(data, tmp_path / "engine.db")
+
+
+def write(path: Path, X: np.ndarray, y: np.ndarray) -> Path:
+    rows = [f"{label}," + ",".join(f"{v:.9g}" for v in x) for x, label in zip(X, y, strict=True)]
+    path.write_text("# dengine 0123\n" + "\n".join(rows) + "\n")
+    return path
+
+
+def test_each_line_counts_once(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    new = make_data(30, seed=4)
+    new.X[3, 5] = np.nan
+    part = write(tmp_path / "cell.csv", new.X[:20], new.y[:20])
+    first = import_journal(store, part)
+    whole = import_journal(store, write(part, new.X, new.y))
+    assert (first.imported, first.quarantined, first.known) == (19, 1, 0)
+    assert (whole.imported, whole.quarantined, whole.known) == (10, 0, 20)
+    with DataEngine.open(store) as engine:
+        assert engine.retrain().n_traces == 200 + 29
+
+
+def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    new = make_data(10, 40, 3)
+    path = write(tmp_path / "cell.csv", new.X.reshape(10, -1), new.y)
+    back = read_journal(path, TraceSpec(40, channels=3)).lines
+    np.testing.assert_array_equal([line.trace for line in back], new.X)
+    assert [line.label for line in back] == new.y.astype(bool).tolist()
+    assert {line.reason for line in back} == {Reason.NO_MODEL}
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1,2,3", "Expected 100 samples in line 1 of .*, got 2; it is damaged, or of another cell"),
+        ("2" + ",1" * 100, "Expected a label of 1 or 0 in line 1 of .*, got '2'"),
+        ("1,x" + ",1" * 99, "line 1 of .* are no row of numbers: .*'x'"),
+        ("", "no labels"),
+        (HEAD + "1,P1,verify,verify,uncertain,0,1,0,0,7", "Expected 100 samples in line 2"),
+        (HEAD + "1", "The decision in line 2"),
+        (
+            HEAD + "1,P1,think,verify,uncertain,0,1,0,0" + ",1" * 100,
+            "The decision in line 2 .*'think' is not a valid Action",
+        ),
+        (HEAD + ",P1,verify,verify,uncertain,0,1,0,0" + ",1" * 100, "label of 1 or 0, or an accepted one, in line 2"),
+        (HEAD + "0,P1,reject,reject,certain,0,0.1,0,9" + ",1" * 100, "label of 1 or 0, or an accepted one, in line 2"),
+    ],
+)
+def test_a_line_that_does_not_fit_is_named(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "cell.csv"
+    path.write_text(line + "\n")
+    with pytest.raises(DataError, match=message):
+        read_journal(path, TraceSpec(100))
+
+
+def write_cell(path: Path, X: np.ndarray, lines: list[str]) -> Path:
+    """A journal of the second form; `lines` are what comes before the samples."""
+    rows = [f"{line}," + ",".join(f"{v:.9g}" for v in x) for x, line in zip(X, lines, strict=False)]
+    path.write_text(HEAD + "\n".join(rows) + "\n")
+    return path
+
+
+CELL = [
+    "1,P1,verify,verify,uncertain,0.25,0.75,5,5",
+    ",P2,accept,accept,certain,0.925,1,30,0",
+    "0,P3,accept,accept,certain,0.9375,1,31,0",
+    "1,,accept,accept,certain,0.9375,1,31,0",
+    "0,P4,verify,accept,audit,0.9375,1,31,0",
+    "0,P1,verify,verify,novel,0,1,0,0",
+    ",P5,accept,accept,certain,0.95,1,40,0",
+]
+
+
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_a_journal_brings_bounds_parts_and_sources(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path, stops: Any
+) -> None:
+    path = new_store(data, tmp_path / "engine.db", stops=stops, guarantee="pooled", audit_rate=0.1)
+    X = make_data(7, seed=4).X
+    journal = write_cell(tmp_path / "cell.csv", X, CELL)
+    for again in (False, True):  # the same file twice counts nothing twice
+        report = import_journal(path, journal)
+        n = 6 if stops == "all" else 5
+        assert (report.imported, report.quarantined, report.known) == ((0, 0, n) if again else (n, 0, 0))
+        with DataEngine.open(path) as engine:
+            known, last = engine.store.evidence_since(200), engine.store.labelled(n)
+            outcomes, sources = engine.store.outcomes(), engine.store.status()["sources"]
+            members = engine.model.rule.state_dict()["members"].clone()
+        lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
+        hashes = [part_hash(p) for p in ("P1", "P2", "P3", "", "P4", "P1")]
+        hashes[3] = int(content_hash(X[3:4])[0])
+        silent = [0, 0, 0, 0, 0, 0]
+        if stops == "some":  # of the second nothing is known
+            lower, success, hashes = (values[:1] + values[2:] for values in (lower, success, hashes))
+            silent = [0, 1, 0, 0, 0]
+        assert known.lower.tolist() == lower
+        assert known.success.tolist() == success
+        assert known.silent.tolist() == silent
+        assert known.novel.tolist() == [False] * (n - 1) + [True]
+        assert last.hashes.tolist() == hashes
+        assert (outcomes.stops, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
+        assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
+        assert sources == {"verification": 202, "audit": 1, "stop": 1, "confirmed": outcomes.confirmed}
+        assert int(members.sum()) > 0
+
+
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_a_journal_that_grew_adds_what_is_new(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path, stops: Any
+) -> None:
+    X, found = make_data(7, seed=4).X, {}
+    new = new_store(data, tmp_path / "new.db", stops=stops, audit_rate=0.1)
+    for cuts in ([7], [2, 3, 7], range(1, 8)):
+        path = shutil.copy(new, str(tmp_path / f"{len(cuts)}.db"))
+        for n in cuts:
+            import_journal(path, write_cell(tmp_path / "cell.csv", X, CELL[:n]))
+        with DataEngine.open(path) as engine:
+            known = engine.store.evidence_since(200)
+            found[len(cuts)] = (known.lower.tolist(), known.silent.tolist(), engine.store.outcomes())
+            engine.decide(X[0])
+            engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
+    assert found[1] == found[3] == found[7]
+
+
+def with_crc(line: str) -> str:
+    return f"{line},{zlib.crc32(line.encode()):08x}"
+
+
+def write_lines(path: Path, X: np.ndarray, lines: list[str]) -> Path:
+    """A journal of the third form: `part` lines without their samples, of one trace after the other, and `label` lines."""
+    traces = iter(X)
+    whole = [
+        f"{line},{','.join(f'{v:.9g}' for v in next(traces))}"
+        if line.startswith("part,") and ",reject," not in line
+        else line
+        for line in lines
+    ]
+    path.write_text("\n".join(["# dengine 3 0123", *map(with_crc, whole), ""]))
+    return path
+
+
+LATE = [
+    "part,a-1,,P1,verify,verify,uncertain,0.25,0.75,5,5",
+    "part,a-2,,P2,accept,accept,certain,0.925,1,30,0",
+    "label,a-1,1",
+    "part,a-3,,,reject,reject,certain,0,0.07,0,31",
+    "label,a-2,0",
+    "part,a-4,,P4,accept,accept,certain,0.9375,1,31,0",
+    "part,a-5,,P5,accept,accept,certain,0.95,1,40,0",
+    "label,a-5,1",
+    "label,a-4,1",
+    "part,a-6,,P6,verify,verify,uncertain,0.5,1,3,0",
+]
+
+
+def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    journal = read_journal(write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100))
+    found = [(line.id, line.label, line.late) for line in journal.lines]
+    assert found == [
+        ("a-1", True, True),
+        ("a-2", None, False),  # went on, when the next part came
+        ("a-2", False, True),  # its stop
+        ("a-4", None, False),
+        ("a-5", True, False),
+        ("a-4", True, True),
+    ]
+    assert (journal.version, journal.sum, journal.cut, journal.waits) == (3, "0123", 0, False)
+
+
+@pytest.mark.parametrize("stops", ["some", "all"])
+def test_late_labels_are_imported_once_by_their_own_ids(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path, stops: Any
+) -> None:
+    path, X = new_store(data, tmp_path / "engine.db", stops=stops), make_data(9, seed=4).X
+    for again in (False, True):
+        report = import_journal(path, write_lines(tmp_path / "cell.csv", X, LATE))
+        assert (report.imported, report.known, report.contradicted) == ((0, 4, 0) if again else (4, 0, 0))
+    with DataEngine.open(path) as engine:
+        held = {id_: engine.store.get_decision(id_) for id_ in ("a-1", "a-2", "a-3", "a-4", "a-5", "a-6")}
+        assert {id_: None if known is None else known.success for id_, known in held.items()} == {
+            "a-1": True,
+            "a-2": False,
+            "a-3": None,
+            "a-4": True,
+            "a-5": True,
+            "a-6": None,
+        }
+        outcomes = engine.store.outcomes()
+        assert (outcomes.accepted, outcomes.stops, outcomes.confirmed) == (3, 1, 2)
+    contrary = write_lines(tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE])
+    assert import_journal(path, contrary).contradicted == 1
+
+
+def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(
+    data: Dataset, make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    X, store = make_data(9, seed=4).X, new_store(data, tmp_path / "engine.db")
+    third, second = write_lines(tmp_path / "3.csv", X, LATE[:9]), write_cell(tmp_path / "2.csv", X, CELL)
+    first = write(tmp_path / "1.csv", X, np.ones(9, dtype=int))
+    for path, most in ((third, 6), (second, 7), (first, 9)):
+        text = path.read_text()
+        begin = text.rindex("\n", 0, -1) + 1
+        for end in range(begin, len(text), 7 if len(text) - begin > 100 else 1):  # a number in the middle is none
+            path.write_text(text[:end])
+            journal = read_journal(path, TraceSpec(100))
+            assert (len(journal.lines), journal.cut) == (most - 1, end - begin)
+    done = CliRunner().invoke(import_labels, [str(first), "--store", store], catch_exceptions=False)
+    assert "was not finished and was left out" in " ".join(done.output.split())
+
+
+def test_any_changed_byte_of_a_line_with_a_checksum_is_found_and_named(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    path = write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE)
+    content, rng = path.read_bytes(), np.random.default_rng(0)
+    begin, lines = content.index(b"\n") + 1, content.count(b"\n")
+    for place in rng.integers(begin, len(content) - 1, 300):
+        changed = bytearray(content)
+        changed[place] ^= 1 << int(rng.integers(8))
+        number = content[:place].count(b"\n") + 1
+        path.write_bytes(bytes(changed))
+        with pytest.raises(DataError, match=rf"line ({number}|{number + 1}|{lines + 1}) of"):
+            read_journal(path, TraceSpec(100))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"# dengine 2 0123\n1,\xff,verify\n", "Expected UTF-8 in line 2"),
+        (b"# dengine 2 0123\n\0\0\0\n", "NUL byte"),
+        (b"# dengine 3 0123\n1,P1,verify\n", "begins with part or label in line 2"),
+        (b"# dengine 3 0123\nlabel,a-1,1\n", "The checksum of line 2"),
+        (b"# dengine 3 0123\n" + with_crc("label,a-1,1").encode() + b"\n", "Expected an earlier part's id"),
+        (b"# dengine 9 0123\n", "of a newer program"),
+        (b"1,2,3", "holds no labels"),
+        (b"", "holds no labels"),
+        (HEAD.encode() + b"1,P1,verify,verify,uncertain,-1,1,0,0" + b",1" * 100 + b"\n", "Expected bounds between 0 and 1"),
+        (
+            HEAD.encode() + b"1,P1,verify,verify,uncertain,0,nan,0,0" + b",1" * 100 + b"\n",
+            "Expected bounds between 0 and 1",
+        ),
+        (HEAD.encode() + b"1,P1,verify,verify,uncertain,0,1,%d,0" % 2**70 + b",1" * 100 + b"\n", "and counts in line 2"),
+        (b"1,1_0" + b",1" * 99 + b"\n", "are no row of numbers"),
+    ],
+)
+def test_what_is_no_journal_is_a_clear_error(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "cell.csv"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_journal(path, TraceSpec(100))
+
+
+def test_the_verbs_export_and_import(store: str, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    out = tmp_path / "model.ts"
+    done = CliRunner().invoke(export, [store, "--out", str(out)], catch_exceptions=False)
+    assert "version 1 with 200 labelled references" in " ".join(done.output.split())
+    assert load_exported(out).metadata["references"] == 200
+    new = make_data(30, seed=4)
+    journal = write(tmp_path / "cell.csv", new.X, new.y)
+    done = CliRunner().invoke(import_labels, [str(journal), "--store", store, "--json"], catch_exceptions=False)
+    assert '"imported": 30' in done.output

@@ -1,0 +1,203 @@
+"""Versions that keep their states: which they are, how one is loaded, and what becomes of a damaged one."""
+
+import os
+import sqlite3
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dengine import DataEngine, Dataset
+from dengine.errors import StoreError
+from dengine.experiments.rivals.baselines import AgreeingNeighbours
+from dengine.records import RetrainReport
+from dengine.store import MemoryStore, SqlStore, Store
+from dengine.store.records import KEEP, keeps_state
+
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+
+
+@pytest.fixture(
+    params=[
+        "memory",
+        "sqlite",
+        pytest.param(
+            "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+        ),
+    ]
+)
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    if request.param == "memory":
+        yield MemoryStore(clock=lambda: 7.5)
+        return
+    url = str(tmp_path / "engine.db") if request.param == "sqlite" else str(POSTGRES)
+    with SqlStore(url, uuid.uuid4().hex, clock=lambda: 7.5) as made:
+        yield made
+
+
+def report(version: int, accepted: bool = True) -> RetrainReport:
+    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
+
+
+def put(store: Store, versions: int) -> None:
+    for version in range(1, versions + 1):
+        store.put_version(report(version), version, {"w": np.full(20, version, np.float32)})
+
+
+def kept(store: Store) -> list[int]:
+    return [row.version for row in store.versions() if row.kept]
+
+
+def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(store: Store) -> None:
+    put(store, 34)
+    assert kept(store) == [1, 10, 20, 30, 31, 32, 33, 34]
+
+
+def test_what_is_kept_grows_with_the_logarithm_of_what_was_trained() -> None:
+    held: set[int] = set()
+    most = {}
+    for newest in range(1, 20_001):
+        held = {version for version in held | {newest} if keeps_state(version, newest, KEEP)}
+        most[newest] = len(held)
+    assert held >= {1, 10_000, 19_000, 19_900, 19_990, 19_996, 20_000}
+    assert max(most.values()) <= KEEP + 1 + 4 * 10
+
+
+def test_a_version_is_loaded_by_its_number(store: Store) -> None:
+    put(store, 12)
+    for version in (1, 10, 12):
+        found = store.load_version(version)
+        assert (found.version, found.last_seq, found.state["w"].tolist()) == (version, version, [float(version)] * 20)
+    found.state["w"][:] = 0  # an array of its own
+    assert store.load_version(12).state["w"][0] == 12
+
+
+def test_one_that_is_not_kept_is_refused_and_those_that_are_are_named(store: Store) -> None:
+    put(store, 12)
+    for version in (2, 13, 0):
+        with pytest.raises(StoreError, match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12"):
+            store.load_version(version)
+
+
+def test_a_store_without_versions_has_none_to_load(store: Store) -> None:
+    assert store.versions() == []
+    with pytest.raises(StoreError, match="load one of these: none"):
+        store.load_version(1)
+
+
+def test_every_retrain_is_listed_for_ever(store: Store) -> None:
+    put(store, 7)
+    store.put_version(report(7, accepted=False), 9, None)
+    rows = store.versions()
+    assert [(row.version, row.accepted, row.kept) for row in rows] == [
+        (1, True, True),
+        (2, True, False),
+        *((version, True, True) for version in range(3, 8)),
+        (7, False, False),
+    ]
+    assert {row.time for row in rows} == {7.5}
+    assert [row.reason for row in rows[-2:]] == ["improved", "the gate held"]
+    assert [row.n_bytes > 0 for row in rows] == [row.kept for row in rows]
+
+
+def test_thinning_out_leaves_the_history_whole(tmp_path: Path) -> None:
+    with SqlStore(str(tmp_path / "a.db")) as store:
+        put(store, 15)
+        assert store.verify().ok
+
+
+def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(tmp_path: Path) -> None:
+    with SqlStore(str(tmp_path / "a.db"), keep_versions=None) as store:
+        put(store, 12)
+        assert len(kept(store)) == 12
+    with SqlStore(str(tmp_path / "b.db"), keep_versions=8) as store:
+        put(store, 12)
+        assert kept(store) == [1, 5, 6, 7, 8, 9, 10, 11, 12]
+    for keep in (1, 0, True, 2.5):
+        with pytest.raises(StoreError, match="keep_versions of 2 or more"):
+            SqlStore(str(tmp_path / "c.db"), keep_versions=keep)
+
+
+def damage(file: Path, *versions: int) -> None:
+    with sqlite3.connect(file) as connection:
+        for version in versions:
+            state = bytearray(
+                connection.execute("SELECT state FROM model_version WHERE version = ?", (version,)).fetchone()[0]
+            )
+            state[len(state) // 2] ^= 1
+            connection.execute("UPDATE model_version SET state = ? WHERE version = ?", (bytes(state), version))
+
+
+def test_a_damaged_version_is_passed_over_and_told_of_once(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    with SqlStore(str(file)) as store:
+        put(store, 12)
+    damage(file, 12, 11)
+    for _ in range(2):
+        with SqlStore(str(file)) as store:
+            assert store.last_version().version == 10
+            told = [event.text for event in store.events() if event.kind == "damaged"]
+            assert ["version 12" in told[0], "version 11" in told[1], len(told)] == [True, True, 2]
+            with pytest.raises(StoreError, match=r"state of version 12.*bytes have changed"):
+                store.load_version(12)
+
+
+def test_where_every_version_is_damaged_there_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    with SqlStore(str(file)) as store:
+        put(store, 2)
+    damage(file, 1, 2)
+    with SqlStore(str(file)) as store:
+        assert store.last_version() is None
+
+
+def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
+    data: Dataset, tmp_path: Path
+) -> None:
+    file = tmp_path / "engine.db"
+    with DataEngine("pca", store=file, retrain_every=30) as engine:
+        for x, y in zip(data.X[:100], data.y[:100], strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        assert engine.version == 3
+    damage(file, 3)
+    with DataEngine.open(str(file)) as engine:
+        assert engine.version == 2
+        assert engine.model is not None
+        decision = engine.decide(data.X[101])
+        assert decision.model_version == 2
+        assert engine.report(decision.id, True).version == 4  # with the labels that came after version 2
+        assert [event.kind for event in engine.store.events()] == ["damaged"]
+    with DataEngine.open(str(file)) as engine:
+        assert engine.version == 4
+
+
+def test_an_engine_whose_only_version_is_damaged_verifies_and_learns_anew(data: Dataset, tmp_path: Path) -> None:
+    file = tmp_path / "engine.db"
+    with DataEngine("pca", store=file, retrain_every=40) as engine:
+        for x, y in zip(data.X[:50], data.y[:50], strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        assert engine.version == 1
+    damage(file, 1)
+    with DataEngine.open(str(file)) as engine:
+        assert (engine.version, engine.model) == (0, None)
+        engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
+        assert engine.version == 2
+
+
+def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(data: Dataset, tmp_path: Path) -> None:
+    """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns anew."""
+    file = tmp_path / "engine.db"
+    rival = AgreeingNeighbours(0.1, 0.9)
+    with DataEngine(model=rival, store=file, retrain_every=40) as engine:
+        for x, y in zip(data.X[:50], data.y[:50], strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+        assert engine.version == 1
+    with sqlite3.connect(file) as connection:
+        connection.execute("UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
+    with DataEngine.open(str(file), model=AgreeingNeighbours(0.1, 0.9)) as engine:
+        assert (engine.version, engine.model) == (0, None)
+        assert [event.kind for event in engine.store.events()] == ["damaged"]
+        engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
+        assert engine.version == 2

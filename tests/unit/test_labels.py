@@ -1,0 +1,254 @@
+"""What a report may say: a label that is one, an id that is one; anything else is refused before it is stored."""
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dengine import Action, DataEngine, Outcome, Reason, ReplayCell, export_torchscript, load_exported
+from dengine.errors import DataError, ReportError, StoreError, TraceError
+from dengine.model.neighbours import ModelPrediction
+from dengine.records import LONGEST, Decision, Source, as_success
+from dengine.store import MemoryStore
+from dengine.store.base import NewLabel, open_store
+
+GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.array(1), np.array(True), Fraction(1)]
+BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
+NONE = [
+    *(100, -1, 255, 2**70, 0.5, 1.0000001, float("nan"), float("inf"), 1j, None, "0", "1", "NG", "True", b"\x01", ""),
+    *(np.array([1]), np.array([]), np.array("1"), np.nan, np.float16("nan"), [True], (), {}, {1}, torch.tensor(1)),
+]
+
+
+@pytest.mark.parametrize("value", GOOD)
+def test_true_and_exactly_one_are_a_success(value) -> None:
+    assert as_success(value) is True
+
+
+@pytest.mark.parametrize("value", BAD)
+def test_false_and_exactly_zero_are_a_failure(value) -> None:
+    assert as_success(value) is False
+
+
+@pytest.mark.parametrize("value", NONE, ids=lambda value: repr(value)[:20])
+def test_anything_else_is_no_label_and_the_error_says_what_to_do(value) -> None:
+    with pytest.raises(ReportError, match=r"Expected a label.*turn it into one of these"):
+        as_success(value)
+
+
+@pytest.mark.parametrize("value", ["x" * 2**20, 10**5000, list(range(10**5))], ids=["text", "integer", "list"])
+def test_what_is_refused_is_shown_in_one_line_however_long_it_is(value) -> None:
+    with pytest.raises(ReportError) as caught:
+        as_success(value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def engine(request: pytest.FixtureRequest, tmp_path: Path):
+    with DataEngine("pca", store=None if request.param == "memory" else tmp_path / "engine.db") as engine:
+        yield engine
+
+
+@pytest.mark.parametrize("value", NONE, ids=lambda value: repr(value)[:20])
+def test_a_report_of_no_label_writes_nothing_and_the_next_one_counts(engine: DataEngine, value, make_data) -> None:
+    decision = engine.decide(make_data(1).X[0])
+    with pytest.raises(ReportError):
+        engine.report(decision.id, value)
+    assert engine.store.status()["labels"] == 0
+    engine.report(decision.id, 0)
+    engine.flush()
+    assert engine.store.get_decision(decision.id).success is False
+    assert engine.new_labels == 1
+
+
+NO_IDS = [None, float("nan"), 7, b"a", "", "a\0b", "\ud800", "x" * (LONGEST + 1), "x" * 2**20, "line\nbreak", ["a"], {}]
+
+
+@pytest.mark.parametrize("id_", NO_IDS, ids=lambda value: repr(value)[:20])
+def test_a_stop_with_no_id_queues_nothing_and_the_store_goes_on(engine: DataEngine, id_, make_data) -> None:
+    x = make_data(2).X
+    with pytest.raises(ReportError, match="Expected the id of a decision"):
+        engine.report(id_, False, trace=x[0])
+    engine.flush()
+    assert engine.store.status()["decisions"] == 0
+    engine.report("lost-1", False, trace=x[0])
+    engine.report(engine.decide(x[1]).id, True)
+    assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0}
+
+
+NO_PARTS = ["", "x" * (LONGEST + 1), "SN\0", "\ud800", "a\nb", 10**4200, -(10**4200), 1.5, True, ["a"]]
+
+
+@pytest.mark.parametrize("part", NO_PARTS, ids=lambda value: repr(value)[:20])
+def test_a_part_that_no_label_bears_is_refused_before_anything_is_queued(engine: DataEngine, part, make_data) -> None:
+    x = make_data(1).X[0]
+    with pytest.raises(TraceError, match="part's number"):
+        engine.decide(x, part=part)
+    with pytest.raises(TraceError, match="part's number"):
+        engine.report("lost", False, trace=x, part=part)
+    assert engine.store.status()["decisions"] == 0
+
+
+@pytest.mark.parametrize("answer", ["NG", None, 100, -1, float("nan")])
+def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(answer, make_data) -> None:
+    class Muddled(ReplayCell):
+        def verify(self):
+            super().verify()
+            return answer
+
+    engine = DataEngine("pca")
+    with pytest.raises(ReportError, match=r"of decision \S+, by verify\(\)") as caught:
+        list(engine.run(Muddled(make_data(5)), 5))
+    (id_,) = [word.rstrip(",") for word in str(caught.value).split() if word.rstrip(",") in engine.store._open]
+    assert engine.store.status()["decisions"] == 1
+    engine.report(id_, True)  # what it really was, once somebody has looked
+    assert engine.store.status()["labels"] == 1
+
+
+@pytest.mark.parametrize("answer", ["STOP", None, True, 0])
+def test_a_cell_that_goes_on_with_no_outcome_is_told_so_and_the_stop_is_not_taken_for_silence(answer, make_data) -> None:
+    class Muddled(ReplayCell):
+        def proceed(self) -> Outcome:
+            super().proceed()
+            return answer
+
+    class Accepting:
+        fit = add = lambda self, *args: self
+        count = lambda self, X: (np.full(len(X), 9), np.zeros(len(X)))  # noqa: E731
+        predict_interval = lambda self, X: (np.ones(len(X)), np.ones(len(X)))  # noqa: E731
+        decide = lambda self, X: [Action.ACCEPT] * len(X)  # noqa: E731
+
+    engine = DataEngine(model=Accepting(), retrain_every=3)
+    with pytest.raises(ReportError, match=r"Expected an Outcome"):
+        list(engine.run(Muddled(make_data(9)), 9))
+
+
+class Rival:
+    """Answers with what it is told to."""
+
+    def __init__(self, n_success=3, n_failure=0, lower=0.4, upper=1.0, action="verify") -> None:
+        self.answers = n_success, n_failure, lower, upper, action
+
+    def fit(self, X, y):
+        return self
+
+    def add(self, x, y):
+        return self
+
+    def count(self, X):
+        return [self.answers[0]], [self.answers[1]]
+
+    def predict_interval(self, X):
+        return [self.answers[2]], [self.answers[3]]
+
+    def decide(self, X):
+        return [self.answers[4]]
+
+
+WRONG = [
+    *({"n_success": value} for value in (2**70, -1, 2.5, float("nan"), "x", None)),
+    *({"n_failure": value} for value in (2**63, -(2**70), float("inf"))),
+    *({"lower": value} for value in (float("nan"), -0.1, 1.1, 4.43, float("inf"), None)),
+    *({"upper": value} for value in (float("nan"), 0.1, 1.0001, -1)),
+    *({"action": value} for value in ("go", None, 1)),
+]
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=repr)
+def test_a_rival_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wrong, make_data, tmp_path: Path) -> None:
+    data = make_data(6)
+    with DataEngine(model=Rival(**wrong), retrain_every=3, store=tmp_path / "engine.db") as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            decision = engine.decide(x)
+            engine.report(decision.id, y)
+        assert (decision.action, decision.reason) == (Action.VERIFY, Reason.MODEL_ERROR)
+        assert engine.store.status()["labels"] == 6
+        assert engine.store.status()["write_failures"] == 0
+
+
+def test_a_rival_that_counts_in_floats_is_taken_at_its_word(make_data) -> None:
+    data = make_data(6)
+    with DataEngine(model=Rival(n_success=np.float64(3.0)), retrain_every=3) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            decision = engine.decide(x)
+            engine.report(decision.id, y)
+    assert (decision.n_success, decision.reason) == (3, Reason.UNCERTAIN)
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def store(request: pytest.FixtureRequest, tmp_path: Path):
+    opened = open_store(None if request.param == "memory" else tmp_path / "store.db")
+    yield opened
+    opened.close()
+
+
+FINE = Decision("a", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+UNSTORABLE = [
+    *({"id": value} for value in (None, 7, "", float("nan"), "x" * 2**20, "a\0")),
+    *({"lower": value} for value in (float("nan"), float("inf"), -1.0, None, "0")),
+    *({"upper": value} for value in (float("nan"), 2.0)),
+    *({"propensity": value} for value in (float("nan"), -0.5)),
+    *({"n_success": value} for value in (2**70, -1, 1.5, True, None)),
+    *({"model_version": value} for value in (2**63, -1)),
+    *({"action": value} for value in ("verify!", None, 0)),
+    *({"reason": value} for value in ("because", None)),
+    *({"embedding": value} for value in ("z", (({1},),), (("a",),), (1.0, 2.0))),
+    {"audit": 2},
+]
+
+
+@pytest.mark.parametrize("wrong", UNSTORABLE, ids=lambda wrong: repr(wrong)[:40])
+def test_a_row_that_no_database_holds_is_refused_when_it_is_put_and_the_next_is_stored(store, wrong) -> None:
+    x = np.zeros((1, 5), dtype=np.float32)
+    for put in (
+        lambda one: store.put_decision(one, x, 1, False),
+        lambda one: store.put_labelled([one], x[None], np.array([1]), np.array([1], dtype=np.int8), Source.VERIFICATION),
+    ):
+        with pytest.raises(StoreError, match="Expected a decision with"):
+            put(replace(FINE, **wrong))
+    store.put_decision(FINE, x, 1, False)
+    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert (store.status()["decisions"], store.status()["labels"]) == (1, 1)
+
+
+def test_no_store_takes_a_label_that_is_none(store) -> None:
+    x = np.zeros((1, 5), dtype=np.float32)
+    store.put_decision(FINE, x, 1, False)
+    for value in (100, -1, "NG", None, float("nan")):
+        with pytest.raises(ReportError, match="Expected a label"):
+            store.put_labels([NewLabel("a", value, Source.VERIFICATION, 0, None)])
+    with pytest.raises(ReportError, match="Expected a label"):
+        store.put_labelled([replace(FINE, id="b")], x[None], np.array([1]), np.array([100]), Source.VERIFICATION)
+    assert store.status()["labels"] == 0
+
+
+def test_an_exported_decision_learns_from_labels_alone(make_data, tmp_path: Path) -> None:
+    data = make_data(60)
+    with DataEngine("pca", retrain_every=50) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, y)
+        model = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
+    held = model.metadata["references"]
+    for value in (100, -1, "NG", None, float("nan")):
+        with pytest.raises(ReportError, match="Expected a label"):
+            model.learn(data.X[0] + 1, value)
+    assert model.learn(data.X[0] + 1, np.int8(1)) == held + 1
+
+
+def test_the_models_own_references_are_of_successes_and_failures_alone(make_data) -> None:
+    data = make_data(60)
+    model = ModelPrediction("pca")
+    with pytest.raises(DataError, match="Expected labels 1"):
+        model.fit(data.X, np.where(data.y == 1, 100, -4))
+    model.fit(data.X, data.y)
+    with pytest.raises(ReportError, match="Expected a label"):
+        model.add(data.X[0], 100)
+
+
+def test_memory_and_database_name_the_same_faults() -> None:
+    with pytest.raises(StoreError) as caught:
+        MemoryStore().put_decision(replace(FINE, n_success=2**70), np.zeros((1, 5), dtype=np.float32), 1, False)
+    assert "whole number from 0 to below 2**63" in str(caught.value)

@@ -1,0 +1,467 @@
+"""The ledger: whatever is changed, removed or added behind a store's back is found, and named."""
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import sqlite3
+import struct
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dengine.cli import main
+from dengine.errors import StoreError
+from dengine.records import Action, Decision, Reason, RetrainReport, Source
+from dengine.store import Change, NewLabel, SqlStore, verify_history
+from dengine.store.ledger import START, entry_digest, row_sum
+from dengine.store.schema import CHAINED
+
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+TABLES = ("decision", "trace", "label", "model_version", "event", "correction", "ledger", "setting")
+T = 200
+
+
+def decision(name: str) -> Decision:
+    return Decision(name, Action.VERIFY, Action.ACCEPT, 0.25, 1.0, 3, 1, ((0.5, 0.25),), 1, Reason.AUDIT, True, 0.02)
+
+
+def report(version: int, accepted: bool = True) -> RetrainReport:
+    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
+
+
+def write(store: SqlStore, n: int = 12) -> SqlStore:
+    """Something in every table, in entries of one row and of many."""
+    rng = np.random.default_rng(0)
+    traces = rng.normal(size=(n, 1, T)).astype(np.float32)
+    store.save_settings({"recipe": "a = 1", "trace": "{}"})
+    for i in range(n):
+        store.put_decision(decision(f"d{i}"), traces[i], i - 3, i == 5, f"SN-{i}")
+    store.flush()
+    points = rng.normal(size=(n, 2)).astype(np.float32)
+    store.put_label("d0", True, Source.VERIFICATION, 1, points[0], silent=2)
+    store.put_labels([NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, points[i]) for i in range(1, n - 2)])
+    imported = [decision(f"i{i}") for i in range(4)]
+    store.put_labelled(imported, traces[:4], np.arange(4), np.ones(4, np.int8), Source.VERIFICATION)
+    for version in (1, 2):
+        store.put_version(report(version), 5, {"w": rng.normal(size=40)})
+    store.put_version(report(2, accepted=False), 6, None)
+    store.save_settings({"recipe": "a = 2", "trace": "{}"})
+    store.put_event("note", "Prüfung wörtlich")
+    store.record(Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False))
+    store.record(Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None))
+    return store
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("history") / "engine.db"
+    write(SqlStore(str(file))).close()
+    with sqlite3.connect(file) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return file
+
+
+@pytest.fixture
+def file(written: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(written, tmp_path / "engine.db"))
+
+
+@pytest.fixture(
+    params=[
+        "sqlite",
+        pytest.param(
+            "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+        ),
+    ]
+)
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+    return (str(tmp_path / "engine.db") if request.param == "sqlite" else str(POSTGRES)), uuid.uuid4().hex
+
+
+def execute(file: Path, *statements: str) -> None:
+    with sqlite3.connect(file) as connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def faults(file: Path) -> list[tuple[str, str]]:
+    return [(fault.table, fault.key) for fault in verify_history(str(file)).faults]
+
+
+# ------------------------------------------------------------------------------------------------------ what is whole
+
+
+def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        write(store)
+        found = store.verify()
+        assert (found.ok, found.faults) == (True, ())
+        assert found.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
+    assert verify_history(*place) == found
+
+
+def test_the_digest_depends_on_what_was_written_and_not_on_the_database(place: tuple[str, str], tmp_path: Path) -> None:
+    at, cell = place
+    digests = []
+    for url in (at, str(tmp_path / "other.db")):
+        with SqlStore(url, cell, clock=lambda: 12.5) as store:
+            digests.append(write(store).verify().cells[0].digest)
+    assert digests[0] == digests[1]
+
+
+def test_every_transaction_is_an_entry_and_an_empty_one_is_none(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        store.flush()
+        assert store.verify().cells[0].entries == 0
+        store.put_event("note", "one")
+        store.flush()
+        assert store.verify().cells[0].entries == 1
+        store.put_decision(decision("a"), np.zeros(T, np.float32), 1, False)
+        store.put_label("a", True, Source.VERIFICATION, 0, None)
+        assert store.verify().cells[0].entries == 2
+
+
+def test_a_transaction_that_fails_leaves_no_entry(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        with pytest.raises(StoreError):
+            store.save_settings({"recipe": None})
+        assert store.verify().cells[0].entries == 0
+        store.put_event("note", "after")
+        assert (store.verify().ok, store.verify().cells[0].entries) == (True, 1)
+
+
+def test_two_stores_on_one_cell_write_one_chain(place: tuple[str, str]) -> None:
+    def log(store: SqlStore, name: str) -> None:
+        for i in range(10):
+            store.put_decision(decision(f"{name}{i}"), np.zeros(T, np.float32), i, False)
+            store.put_label(f"{name}{i}", True, Source.VERIFICATION, 0, None)
+
+    with SqlStore(*place) as one, SqlStore(*place) as two:
+        threads = [threading.Thread(target=log, args=pair) for pair in ((one, "x"), (two, "y"))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        found = one.verify()
+    assert found.ok
+    assert found.cells[0].rows == 60
+    assert found.cells[0].entries >= 20
+
+
+def test_values_that_databases_hold_in_their_own_way_are_whole(place: tuple[str, str]) -> None:
+    odd = Decision("Ünïcode ✓", Action.VERIFY, Action.VERIFY, -0.0, 1.0, 0, 0, None, 0, Reason.CONSTANT, False, 1.0)
+    with SqlStore(*place, clock=lambda: 7) as store:
+        store.put_decision(odd, np.array([np.nan, np.inf, -0.0], np.float32), -(2**63), True, "Stück 7\\0")
+        store.put_label(np.str_("Ünïcode ✓"), np.bool_(True), Source.VERIFICATION, np.int64(0), np.zeros(2, np.float32))
+        assert store.verify().ok
+
+
+def test_a_running_engine_does_not_keep_a_check_from_its_work(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        write(store)
+        stop = threading.Event()
+
+        def go_on() -> None:
+            while not stop.is_set():
+                store.put_event("note", "meanwhile")
+
+        thread = threading.Thread(target=go_on)
+        thread.start()
+        try:
+            assert all(verify_history(*place).ok for _ in range(5))
+        finally:
+            stop.set()
+            thread.join()
+
+
+# ----------------------------------------------------------------------------------------------------- what is changed
+
+
+def flipped(value: object, rng: random.Random) -> object:
+    """A stored value with one bit of one byte turned over; None where nothing comes of it."""
+    if isinstance(value, str | bytes):
+        data = bytearray(value.encode() if isinstance(value, str) else value)
+        if not data:
+            return None
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        return bytes(data)
+    if isinstance(value, float):
+        data = bytearray(struct.pack(">d", value))
+        data[rng.randrange(8)] ^= 1 << rng.randrange(8)
+        return struct.unpack(">d", data)[0]
+    return None if value is None else int(value) ^ (1 << rng.randrange(8))
+
+
+def changed_columns(file: Path) -> list[tuple[str, str]]:
+    with sqlite3.connect(file) as connection:
+        return [(table, row[1]) for table in TABLES for row in connection.execute(f"PRAGMA table_info({table})")]
+
+
+def found_wrong(file: Path) -> bool:
+    try:
+        return not verify_history(str(file)).ok
+    except StoreError:  # what is no store any more is not taken for one
+        return True
+
+
+def test_one_byte_changed_in_any_column_of_any_table_is_found(written: Path, tmp_path: Path) -> None:
+    rng, tried, missed = random.Random(0), 0, []
+    for table, column in changed_columns(written) * 3:
+        file = Path(shutil.copy(written, tmp_path / "changed.db"))
+        connection = sqlite3.connect(file)
+        rows = connection.execute(f'SELECT rowid, "{column}" FROM {table} WHERE "{column}" IS NOT NULL').fetchall()
+        row, value = rng.choice(rows)
+        new = flipped(value, rng)
+        if new is not None and new == new:
+            typed = "CAST(? AS TEXT)" if isinstance(value, str) else "?"
+            with suppress(sqlite3.IntegrityError):  # a key that is taken: SQLite itself refuses
+                connection.execute(f'UPDATE {table} SET "{column}" = {typed} WHERE rowid = ?', (new, row))
+                connection.commit()
+                tried += 1
+                missed += [] if found_wrong(file) else [(table, column, value, new)]
+        connection.close()
+    assert (missed, tried > 180) == ([], True)
+
+
+def test_one_byte_changed_in_the_files_pages_within_a_trace_is_found(written: Path, tmp_path: Path) -> None:
+    rng, stored = random.Random(1), written.read_bytes()
+    with sqlite3.connect(written) as connection:
+        traces = [row[0] for row in connection.execute("SELECT data FROM trace ORDER BY decision_id")]
+    places = [stored.find(trace[:64]) for trace in traces]
+    for _ in range(200):
+        at = places[rng.randrange(len(traces))] + rng.randrange(64)
+        changed = bytearray(stored)
+        changed[at] ^= 1 << rng.randrange(8)
+        (tmp_path / "changed.db").write_bytes(changed)
+        found = verify_history(str(tmp_path / "changed.db")).faults
+        assert [(fault.table, fault.what) for fault in found] == [("trace", "was changed")]
+
+
+def content(file: Path) -> dict[str, list[str]]:
+    """Every value of every table, as SQLite reads it."""
+    connection = sqlite3.connect(file)
+    connection.text_factory = bytes
+    found = {table: sorted(map(repr, connection.execute(f"SELECT * FROM {table}"))) for table in TABLES}
+    connection.close()
+    return found
+
+
+def test_one_byte_changed_anywhere_in_the_file_is_found_or_changed_no_value(written: Path, tmp_path: Path) -> None:
+    rng, stored, whole, found = random.Random(2), written.read_bytes(), content(written), 0
+    for i in range(200):
+        changed = bytearray(stored)
+        changed[rng.randrange(len(stored))] ^= 1 << rng.randrange(8)
+        file = tmp_path / f"changed{i}.db"
+        file.write_bytes(changed)
+        if found_wrong(file):
+            found += 1
+        else:
+            assert content(file) == whole
+        file.unlink()
+    assert found > 20
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_row_that_was_deleted_is_found(file: Path, table: str) -> None:
+    execute(file, f"DELETE FROM {table} WHERE rowid = (SELECT max(rowid) FROM {table})")
+    assert found_wrong(file)
+
+
+@pytest.mark.parametrize(
+    ("statement", "named"),
+    [
+        ("UPDATE label SET success = NOT success WHERE seq = 3", ("label", "d2")),
+        ("UPDATE decision SET upper = 0.875 WHERE id = 'd7'", ("decision", "d7")),
+        ("UPDATE model_version SET state = zeroblob(9) WHERE retrain = 2", ("model_version", "2")),
+        ("UPDATE correction SET success = 1 WHERE number = 2", ("correction", "2")),
+        ("DELETE FROM correction WHERE number = 1", ("correction", "number 1")),
+        ("UPDATE event SET text = 'another' WHERE number = 1", ("event", "1")),
+        ("UPDATE setting SET value = 'a = 3' WHERE key = 'recipe'", ("setting", "recipe")),
+        ("INSERT INTO setting VALUES ('cell', 'more', 'x')", ("setting", "more")),
+        ("DELETE FROM label WHERE seq = 4", ("label", "seq 4")),
+        ("DELETE FROM trace WHERE decision_id = 'd7'", ("trace", "d7")),
+        ("DELETE FROM decision WHERE id = 'd7'", ("decision", "d7")),
+        ("UPDATE ledger SET time = time + 1 WHERE number = 3", ("ledger", "entry 3")),
+        ("DELETE FROM ledger WHERE number = 3", ("ledger", "entry 3")),
+        ("INSERT INTO event VALUES ('cell', 4, 1.0, 'note', 'slipped in', NULL, '', NULL, NULL)", ("event", "4")),
+        ("UPDATE label SET entry = 2 WHERE seq = 3", ("label", "d2")),
+    ],
+)
+def test_what_is_wrong_is_named(file: Path, statement: str, named: tuple[str, str]) -> None:
+    execute(file, statement)
+    assert named in faults(file)
+
+
+def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file: Path) -> None:
+    """Whoever changes a row can work out its sum anew, and the entry tells all the same."""
+    with sqlite3.connect(file) as connection:
+        connection.row_factory = sqlite3.Row
+        row = dict(connection.execute("SELECT * FROM label WHERE seq = 2").fetchone())
+        row["success"] = 1 - row["success"]
+        connection.execute("UPDATE label SET success = ?, sum = ? WHERE seq = 2", (row["success"], row_sum("label", row)))
+    assert faults(file) == [("ledger", f"entry {row['entry']}")]
+
+
+def test_entries_after_a_changed_one_are_not_blamed(file: Path) -> None:
+    execute(file, "UPDATE ledger SET digest = zeroblob(32) WHERE number = 2")
+    assert faults(file) == [("ledger", "entry 2")]
+
+
+def cut_off(file: Path) -> None:
+    """Remove the newest entry with all that it chains: nothing in the store tells of it."""
+    with sqlite3.connect(file) as connection:
+        last = connection.execute("SELECT max(number) FROM ledger").fetchone()[0]
+        for table in CHAINED:
+            connection.execute(f"DELETE FROM {table} WHERE entry = {last}")
+        connection.execute(f"DELETE FROM ledger WHERE number = {last}")
+
+
+def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(file: Path) -> None:
+    kept = verify_history(str(file)).cells[0].digest
+    with SqlStore(str(file)) as store:
+        store.put_event("note", "later")
+    assert verify_history(str(file), expect=kept[:12]).ok
+    for _ in range(2):
+        cut_off(file)
+    assert verify_history(str(file)).ok
+    (fault,) = verify_history(str(file), expect=kept).faults
+    assert (fault.table, "cut off" in fault.what) == ("ledger", True)
+
+
+def test_a_digest_that_is_none_is_refused(file: Path) -> None:
+    with pytest.raises(StoreError, match="64 hexadecimal digits"):
+        verify_history(str(file), expect="newest")
+
+
+def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file: Path) -> None:
+    with sqlite3.connect(file) as connection:
+        root = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'event'").fetchone()[0]
+        size = connection.execute("PRAGMA page_size").fetchone()[0]
+    data = bytearray(file.read_bytes())
+    data[(root - 1) * size : (root - 1) * size + 100] = bytes(100)
+    file.write_bytes(data)
+    found = faults(file)
+    assert ("file", "") in found
+    assert ("event", "") in found
+
+
+def test_another_cells_faults_are_its_own(file: Path) -> None:
+    with SqlStore(str(file), "other") as store:
+        write(store)
+    execute(file, "UPDATE event SET text = 'x' WHERE cell_id = 'other'")
+    assert verify_history(str(file), "cell").ok
+    assert {fault.cell_id for fault in verify_history(str(file)).faults} == {"other"}
+    with pytest.raises(StoreError, match="cell, other"):
+        verify_history(str(file), "a third")
+
+
+@pytest.mark.parametrize("made", [lambda path: None, lambda path: sqlite3.connect(path).execute("CREATE TABLE t (id)")])
+def test_what_is_no_store_is_refused_and_nothing_is_made(made: Callable[[Path], object], tmp_path: Path) -> None:
+    made(tmp_path / "a.db")
+    before = (tmp_path / "a.db").exists()
+    with pytest.raises(StoreError, match="Expected a"):
+        verify_history(str(tmp_path / "a.db"))
+    assert (tmp_path / "a.db").exists() == before
+
+
+# -------------------------------------------------------------------------------------------------------- what is read
+
+
+def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file: Path) -> None:
+    with SqlStore(str(file)) as store:
+        whole = store.labelled()
+    execute(
+        file, "UPDATE trace SET data = zeroblob(800) WHERE decision_id = 'd3'", "DELETE FROM trace WHERE decision_id = 'd4'"
+    )
+    with SqlStore(str(file)) as store:
+        for _ in range(2):
+            found = store.labelled()
+            kept = ~np.isin(whole.seq, [4, 5])
+            np.testing.assert_array_equal(found.seq, whole.seq[kept])
+            np.testing.assert_array_equal(found.traces, whole.traces[kept])
+            np.testing.assert_array_equal(found.labels, whole.labels[kept])
+            np.testing.assert_array_equal(found.hashes, whole.hashes[kept])
+        told = [event.text for event in store.events() if event.kind == "damaged"]
+        assert len(told) == 1
+        assert "decision d3, d4" in told[0]
+        with pytest.raises(StoreError, match=r"'d3'.*bytes have changed"):
+            store.get_decision("d3")
+
+
+def test_where_every_trace_is_damaged_nothing_trains(file: Path) -> None:
+    execute(file, "UPDATE trace SET data = zeroblob(800)")
+    with SqlStore(str(file)) as store:
+        assert (len(store.labelled().seq), store.labelled().traces.shape[0]) == (0, 0)
+
+
+# ----------------------------------------------------------------------------------------------------------- the verb
+
+
+def verb(*words: object) -> tuple[int, str]:
+    done = CliRunner().invoke(main, ["verify", *map(str, words)])
+    return done.exit_code, done.output
+
+
+def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file: Path) -> None:
+    code, said = verb(file, "--json")
+    document = json.loads(said)
+    assert (code, document["ok"], document["faults"]) == (0, True, [])
+    digest = document["cells"][0]["digest"]
+    code, said = verb(file, "--expect", digest)
+    assert (code, digest in said) == (0, True)
+    execute(file, "UPDATE label SET success = NOT success WHERE seq = 3")
+    code, said = verb(file)
+    assert (code, "cell cell: label d2 was changed." in said) == (1, True)
+    code, said = verb(file, "--json", "--cell", "cell")
+    assert (code, json.loads(said)["faults"][0]["key"]) == (1, "d2")
+    assert verb(file.parent / "none.db")[0] == 1
+
+
+# ---------------------------------------------------------------------------------------------------------- the sums
+
+
+def rows() -> Iterator[tuple[dict[str, object], dict[str, object]]]:
+    """Rows that must not share their sum."""
+    yield {"a": "1"}, {"a": 1}
+    yield {"a": 1.0}, {"a": 1}
+    yield {"a": "x", "b": "y"}, {"a": "xy", "b": ""}
+    yield {"a": b"ab", "b": b"c"}, {"a": b"a", "b": b"bc"}
+    yield {"a": "b=s1:c"}, {"a": "", "b": "c"}
+    yield {"a": 1}, {"b": 1}
+    yield {"a": ""}, {}
+
+
+@pytest.mark.parametrize(("one", "other"), list(rows()))
+def test_rows_that_differ_have_sums_that_differ(one: dict[str, object], other: dict[str, object]) -> None:
+    assert row_sum("label", one) != row_sum("label", other)
+    assert row_sum("label", one) != row_sum("event", one)
+
+
+def test_a_sum_is_what_it_was() -> None:
+    """Stores hold sums that were made years ago: these numbers change never."""
+    row = {
+        "cell_id": "cell",
+        "number": 1,
+        "time": 1.5,
+        "kind": "note",
+        "text": "é",
+        "ok": True,
+        "none": None,
+        "data": b"\0",
+    }
+    plain = b"event\ncell_id=s4:celldata=b1:\0kind=s4:notenumber=i1;ok=i1;text=s2:\xc3\xa9time=f" + struct.pack(">d", 1.5)
+    assert row_sum("event", row) == hashlib.sha256(plain).digest()
+    later = row | {"column of a later schema": None, "sum": b"x", "state": b"y"}
+    assert row_sum("event", later) == row_sum("event", row)
+    digest = entry_digest(START, {"number": 1}, {"event": [b"b" * 32, b"a" * 32]})
+    head = hashlib.sha256(b"ledger\nnumber=i1;").digest()
+    chained = b"dengine ledger 1\n" + bytes(32) + head + b"event=2;" + b"a" * 32 + b"b" * 32
+    assert digest == hashlib.sha256(chained).digest()

@@ -1,0 +1,185 @@
+"""Counting around a query: exact, whatever the order, in every space, scripted or not."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dengine.decision.references import RadiusIndex, ReferenceRing, math_ceil
+from dengine.decision.rule import script
+
+
+def points(n: int, d: int = 2, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 1, (n, d)).astype(np.float32), rng.integers(0, 2, n)
+
+
+def distances(Z: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Squared, in float32, one dimension after the other: the arithmetic that the index promises."""
+    out = np.zeros(len(Z), dtype=np.float32)
+    for j in range(Z.shape[1]):
+        out += np.square(Z[:, j] - q[j])
+    return out
+
+
+def brute(Z: np.ndarray, y: np.ndarray, q: np.ndarray, radius: float) -> tuple[int, int]:
+    inside = distances(Z, q) <= np.float32(radius * radius)
+    return int(y[inside].sum()), int((1 - y[inside]).sum())
+
+
+def filled(Z: np.ndarray, y: np.ndarray, spaces: np.ndarray | None = None, capacity: int = 10_000) -> RadiusIndex:
+    index = RadiusIndex(Z.shape[1], capacity)
+    index.add(Z, y, spaces)
+    return index
+
+
+@settings(deadline=None)
+@given(n=st.integers(1, 200), d=st.integers(1, 5), radius=st.floats(0.01, 5.0), seed=st.integers(0, 2**16))
+def test_counts_equal_brute_force_in_float32(n: int, d: int, radius: float, seed: int) -> None:
+    Z, y = points(n, d, seed)
+    queries = np.concatenate([points(5, d, seed + 1)[0], Z[:3]])
+    expected = [brute(Z, y, q, radius) for q in queries]
+    assert list(zip(*filled(Z, y).count(queries, radius), strict=True)) == expected
+
+
+def test_the_surface_of_the_ball_counts() -> None:
+    index = filled(np.array([[3.0, 4.0], [0.0, 5.0], [0.0, 5.001]]), np.array([1, 0, 1]))
+    n_success, n_failure = index.count(np.zeros((1, 2)), radius=5.0)
+    assert (n_success[0], n_failure[0]) == (1, 1)
+
+
+def test_an_empty_index_counts_nothing() -> None:
+    n_success, n_failure = RadiusIndex(2).count(np.zeros((3, 2)), radius=1.0)
+    assert n_success.tolist() == n_failure.tolist() == [0, 0, 0]
+    assert n_success.dtype == n_failure.dtype == np.int64
+    assert RadiusIndex(2).count(np.zeros((1, 2)), radius=1.0, fraction=0.5)[0][0] == 0
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.2])
+def test_counts_do_not_depend_on_the_order_of_the_points(fraction: float) -> None:
+    Z, y = points(100)
+    Z[50:] = Z[:50]  # ties too
+    order = np.random.default_rng(1).permutation(100)
+    one, other = filled(Z, y), filled(Z[order], y[order])
+    np.testing.assert_array_equal(one.count(Z, 0.5, fraction), other.count(Z, 0.5, fraction))
+
+
+# ------------------------------------------------------------------------------------------------------- ring
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 25), min_size=1, max_size=8), st.integers(1, 20))
+def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacity: int) -> None:
+    Z, y = points(sum(batches))
+    index, start = RadiusIndex(2, capacity), 0
+    for size in batches:
+        index.add(Z[start : start + size], y[start : start + size])
+        start += size
+    kept = slice(max(0, start - capacity), start)
+    assert len(index) == min(start, capacity)
+    held = sorted(map(tuple, index.ring.points[:, : len(index)].T.tolist()))
+    assert held == sorted(map(tuple, Z[kept].tolist()))
+    expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
+    assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
+
+
+def test_adding_one_by_one_is_adding_at_once() -> None:
+    Z, y = points(30)
+    spaces = np.arange(30) % 3
+    at_once, ring = filled(Z, y, spaces, capacity=20), ReferenceRing(2, 20)
+    for z, label, space in zip(Z, y, spaces, strict=True):
+        ring.put(torch.from_numpy(z), float(label), int(space))
+    for name, buffer in at_once.ring.named_buffers():
+        assert torch.equal(buffer, ring.get_buffer(name)), name
+
+
+def test_the_caller_may_change_its_arrays_afterwards() -> None:
+    Z, y = points(20)
+    index, expected = filled(Z, y), brute(Z, y, np.zeros(2), 1.0)
+    Z[:], y[:] = 0.0, 0
+    assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), 1.0)) == expected
+
+
+@pytest.mark.parametrize(
+    ("Z", "y", "spaces"),
+    [(np.zeros((2, 3)), [0, 1], None), (np.zeros((2, 2)), [0], None), (np.zeros((2, 2)), [0, 1], [0])],
+)
+def test_points_labels_and_spaces_that_do_not_fit_together_are_refused(Z, y, spaces) -> None:
+    with pytest.raises(ValueError, match=r"Expected points \(n, 2\)"):
+        RadiusIndex(2).add(Z, y, spaces)
+
+
+# ------------------------------------------------------------------------------------------------------ spaces
+
+
+@settings(deadline=None)
+@given(K=st.integers(1, 4), radius=st.floats(0.1, 3.0), seed=st.integers(0, 2**16))
+def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, radius: float, seed: int) -> None:
+    Z, y = points(80, seed=seed)
+    spaces = np.random.default_rng(seed).integers(0, K, 80)
+    queries = np.random.default_rng(seed + 1).normal(0, 1, (6, K, 2)).astype(np.float32)
+    index = filled(Z, y, spaces)
+    for i, query in enumerate(queries):
+        each = [brute(Z[spaces == k], y[spaces == k], query[k], radius) for k in range(K)]
+        n_success, n_failure = index.count(queries[i : i + 1], radius)
+        assert (n_success[0], n_failure[0]) == tuple(np.sum(each, axis=0))
+
+
+def test_a_reference_is_never_met_in_another_space() -> None:
+    index = filled(np.zeros((10, 2)), np.ones(10), np.zeros(10, dtype=int))
+    far_in_0, far_in_1 = np.array([[[9.0, 9.0], [0.0, 0.0]]]), np.array([[[0.0, 0.0], [9.0, 9.0]]])
+    assert index.count(far_in_0, 1.0)[0][0] == 0
+    assert index.count(far_in_1, 1.0)[0][0] == 10
+
+
+# ---------------------------------------------------------------------------------------------------- fraction
+
+
+@settings(deadline=None)
+@given(n=st.integers(1, 120), fraction=st.floats(0.01, 1.0), seed=st.integers(0, 2**16))
+def test_a_fraction_counts_the_nearest_by_sorting_ties_included(n: int, fraction: float, seed: int) -> None:
+    Z, y = points(n, seed=seed)
+    Z = np.round(Z, 1)  # ties happen
+    query = np.round(points(1, seed=seed + 1)[0], 1)
+    d = distances(Z, query[0])
+    inside = d <= np.sort(d)[min(n, int(np.ceil(fraction * n))) - 1]
+    n_success, n_failure = filled(Z, y).count(query, 0.001, fraction)
+    assert (n_success[0], n_failure[0]) == (y[inside].sum(), (1 - y[inside]).sum())
+
+
+def test_a_query_beyond_all_measure_has_no_neighbours_even_by_fraction() -> None:
+    Z, y = points(50)
+    for query in (np.inf, np.nan, 1e30):  # squared, the last overflows float32
+        n_success, n_failure = filled(Z, y).count(np.full((1, 2), query), 0.5, fraction=0.3)
+        assert (n_success[0], n_failure[0]) == (0, 0)
+
+
+@given(st.floats(0.0, 1e6))
+def test_math_ceil_is_the_ceiling(x: float) -> None:
+    assert math_ceil(x) == int(np.ceil(x))
+
+
+# ---------------------------------------------------------------------------------------------------- scripted
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])
+def test_the_scripted_ring_counts_as_the_eager_one(fraction: float) -> None:
+    Z, y = points(200)
+    eager = filled(Z, y, np.arange(200) % 2, capacity=150).ring
+    scripted = script(eager)
+    for query in torch.randn(20, 2, 2, generator=torch.Generator().manual_seed(0)):
+        one, other = eager.squared_distances(query), scripted.squared_distances(query)
+        assert torch.equal(one, other)
+        assert eager.count_near(one, 0.7, fraction) == scripted.count_near(other, 0.7, fraction)
+
+
+def test_the_scripted_ring_learns_as_the_eager_one() -> None:
+    eager, scripted = ReferenceRing(2, 5), script(ReferenceRing(2, 5))
+    for i, z in enumerate(torch.randn(8, 2, generator=torch.Generator().manual_seed(0))):
+        eager.put(z, float(i % 2), i % 3)
+        scripted.put(z, float(i % 2), i % 3)
+    assert scripted.size() == 5
+    learned = dict(scripted.named_buffers())
+    for name, buffer in eager.named_buffers():
+        assert torch.equal(buffer, learned[name]), name

@@ -1,0 +1,98 @@
+"""What a user installs: small to import, complete, and nothing but `dengine`."""
+
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from pathlib import Path
+from statistics import median
+
+import pytest
+
+import dengine
+
+
+def fresh(code: str, **options) -> str:
+    """What code prints in a fresh interpreter."""
+    done = subprocess.run(
+        [sys.executable, *options.pop("flags", ()), "-c", code], capture_output=True, text=True, **options
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_importing_dengine_takes_less_than_three_tenths_of_a_second() -> None:
+    code = "import time; begin = time.perf_counter(); import dengine; print(time.perf_counter() - begin)"
+    assert median(float(fresh(code)) for _ in range(3)) < 0.3
+
+
+def test_importing_dengine_loads_nothing_but_the_standard_library_and_its_lazy_loader() -> None:
+    code = "import sys; before = set(sys.modules); import dengine; print(*sorted(set(sys.modules) - before))"
+    tops = {name.split(".")[0] for name in fresh(code).split()}
+    assert "dengine" in tops
+    assert tops - {"dengine", "lazy_loader"} <= set(sys.stdlib_module_names)
+
+
+def test_every_public_name_is_there_and_listed() -> None:
+    assert sorted(dengine.__all__) == sorted(set(dengine.__all__))
+    for name in dengine.__all__:
+        assert getattr(dengine, name) is not None
+        assert name in dir(dengine)
+    with pytest.raises(AttributeError, match=r"attribute '?Dataengine"):
+        dengine.Dataengine  # noqa: B018 -- the access is what is tested
+
+
+def test_the_version_is_the_projects(repo: Path) -> None:
+    assert tomllib.loads((repo / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"] == dengine.__version__
+
+
+@pytest.fixture(scope="module")
+def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    import shutil
+
+    # From a copy: setuptools leaves build/ behind and must not meet an old one.
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    shutil.copytree(repo / "dengine", source / "dengine", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in ("models", "training", "tests", "notebooks"):
+        (source / folder).mkdir()
+        (source / folder / "__init__.py").touch()  # a trap: none of these may be packaged
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(repo / name, source / name)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(source)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (built,) = out.glob("*.whl")
+    return built
+
+
+def test_the_wheel_has_dengine_and_no_other_top_level_name(wheel: Path) -> None:
+    tops = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert tops == {"dengine", f"dengine-{dengine.__version__}.dist-info"}
+
+
+def test_the_wheel_has_every_module_the_types_and_the_bundled_data(wheel: Path, repo: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
+    assert modules <= names
+    assert {"dengine/py.typed", "dengine/data/insertion.npz"} <= names
+    sources = {p.relative_to(repo).as_posix() for p in (repo / "dengine" / "export" / "cpp").rglob("*") if p.is_file()}
+    assert len(sources) > 10
+    assert sources <= names
+    assert f"dengine-{dengine.__version__}.dist-info/licenses/LICENSE" in names
+
+
+def test_the_wheel_works_where_there_is_no_checkout(wheel: Path, repo: Path, tmp_path: Path) -> None:
+    target = tmp_path / "site"
+    zipfile.ZipFile(wheel).extractall(target)  # what installing a pure wheel with --target does
+    code = (
+        f"import sys; sys.path[:0] = [{str(target)!r}, {sysconfig.get_path('purelib')!r}]\n"  # dependencies, no .pth files
+        "import dengine; print(dengine.__file__)\n"
+        "from dengine import Recipe, load_dataset, replay\n"
+        "data = load_dataset('insertion'); print(len(data), data.X.shape[1])\n"
+        "print(len(replay(data, 'pca', cycles=60).action))"
+    )
+    where, size, played = fresh(code, flags=("-I", "-S"), cwd=tmp_path).splitlines()
+    assert Path(where).is_relative_to(target)
+    assert not Path(where).is_relative_to(repo)
+    assert (size, played) == ("1503 1000", "60")

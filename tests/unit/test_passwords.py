@@ -1,0 +1,162 @@
+"""A database's password is shown nowhere: not in errors, tables, progress or JSON."""
+
+import json
+import os
+import pickle
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from click.testing import CliRunner
+
+from dengine import DataEngine
+from dengine import errors as all_errors
+from dengine.cli import main
+from dengine.cli.output import progress
+from dengine.errors import DengineError, StoreError, shortened, without_password
+from dengine.records import plain
+from dengine.store import SqlStore
+from dengine.store.connections import make_engine
+
+SECRET = "hunter2"
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES", "")
+NOBODY = f"postgresql+psycopg://robot:{SECRET}@127.0.0.1:1/cell"
+ERRORS = [each for each in vars(all_errors).values() if isinstance(each, type) and issubclass(each, DengineError)]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (f"a {NOBODY} b", "a postgresql+psycopg://robot:***@127.0.0.1:1/cell b"),
+        (f"'postgresql://u:a@b:{SECRET}/x@host/db'", "'postgresql://u:***@host/db'"),
+        (f"postgresql://:{SECRET}@host/db", "postgresql://:***@host/db"),
+        (f"postgresql://u:my {SECRET}@host/db", "postgresql://u:***@host/db"),
+        (f"postgresql://h/db?user=u&password={SECRET}&x=1", "postgresql://h/db?user=u&password=***&x=1"),
+        (f"host=h password={SECRET} user=u", "host=h password=*** user=u"),
+        ("postgresql://user@host:5432/db", "postgresql://user@host:5432/db"),
+        ("sqlite:///home/me/a.db and me@home", "sqlite:///home/me/a.db and me@home"),
+        ("C:\\cell.db, 12:30", "C:\\cell.db, 12:30"),
+    ],
+)
+def test_a_password_is_masked_and_all_else_stays(text: str, shown: str) -> None:
+    assert without_password(text) == shown
+
+
+@pytest.mark.parametrize("kind", ERRORS, ids=lambda kind: kind.__name__)
+def test_every_error_masks_what_it_says(kind: type[DengineError]) -> None:
+    for error in (kind(f"no {NOBODY}"), pickle.loads(pickle.dumps(kind(f"no {NOBODY}")))):
+        assert SECRET not in str(error) + repr(error) + repr(error.args)
+        assert "robot:***@" in str(error)
+
+
+@pytest.mark.parametrize("url", [f"postgresql://u:{SECRET}@a:{SECRET}@host/db", f"sqlite://u:{SECRET}@/a.db", NOBODY])
+def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_chain(url: str) -> None:
+    with pytest.raises(StoreError) as caught:
+        SqlStore(url)
+    error: BaseException | None = caught.value
+    while error is not None:
+        assert SECRET not in str(error)
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+
+
+VERBS = {  # every verb that takes a store
+    "status": ["status", NOBODY],
+    "status as JSON": ["status", NOBODY, "--json"],
+    "train": ["train", "--data", "insertion", "--store", NOBODY],
+    "run": ["run", "--cell", "replay", "--cycles", "1", "--store", NOBODY],
+    "serve": ["serve", "--port", "0", "--store", NOBODY],
+    "export": ["export", NOBODY, "--out", "{out}"],
+    "import-labels": ["import-labels", "{journal}", "--store", NOBODY],
+    **{
+        words[0]: [words[0], NOBODY, *words[1:]]
+        for words in (
+            *(["cells"], ["history"], ["explain", "last"], ["verify"], ["dump", "--out", "{out}"], ["correct", "a", "bad"]),
+            *(["forget", "a"], ["rollback", "1"], ["set-policy", "--alpha", "0.1"], ["shadow", "on"], ["retrain"]),
+        )
+    },
+    "an unknown verb": [NOBODY],
+    "an unknown option": ["status", f"--store={NOBODY}"],
+    "a journal that is none": ["import-labels", NOBODY, "--store", "a.db"],
+    "too many words": ["status", "a.db", NOBODY],
+    "data that is none": ["data", NOBODY],
+}
+
+
+@pytest.mark.parametrize("words", VERBS.values(), ids=VERBS)
+def test_no_verb_shows_the_password_of_what_it_cannot_use(words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "journal.csv").write_text("1,0.0\n")
+    paths = {"{out}": str(tmp_path / "model.ts"), "{journal}": str(tmp_path / "journal.csv")}
+    done = CliRunner().invoke(main, [paths.get(word, word) for word in words])
+    assert done.exit_code in (1, 2)
+    assert SECRET not in done.output
+
+
+def test_every_verb_that_takes_a_store_is_tried() -> None:
+    takes = {
+        name
+        for name, verb in main.commands.items()
+        for option in verb.params
+        if option.name == "store"  # an argument or an option
+    }
+    assert takes <= {words[0] for words in VERBS.values()}
+
+
+def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
+    assert SECRET not in json.dumps(plain({"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)}))
+    with progress(f"importing {NOBODY}", 3, False) as advance:
+        advance(3)
+    assert SECRET not in "".join(capsys.readouterr())
+
+
+def test_a_url_without_a_password_leaves_it_to_the_environment() -> None:
+    url = make_engine("postgresql://robot@host/cell").url
+    assert (url.username, url.password, url.host) == ("robot", None, "host")
+
+
+@pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+def test_the_environment_gives_the_password_and_a_used_store_is_shown_without_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_data
+) -> None:
+    with_it = sa.make_url(POSTGRES).set(password=SECRET)
+    monkeypatch.setenv("PGPASSWORD", SECRET)
+    without = with_it._replace(password=None)
+    with make_engine(without.render_as_string(hide_password=False)).connect() as connection:
+        assert connection.connection.driver_connection.info.password == SECRET
+    name = f"secret_{uuid.uuid4().hex}"
+    admin = sa.create_engine(with_it, isolation_level="AUTOCOMMIT")
+    with admin.connect() as connection:
+        connection.execute(sa.text(f"CREATE DATABASE {name}"))
+    url, data = with_it.set(database=name).render_as_string(hide_password=False), make_data(70)
+    with DataEngine("pca", retrain_every=60, store=url) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, y)
+        spec = engine.trace
+    journal, table = tmp_path / "journal.csv", tmp_path / "data.npz"
+    journal.write_text("1," + ",".join(map(str, range(spec.samples))) + "\n")
+    np.savez(table, X=data.X[:40] + 1, y=data.y[:40])
+    shown = ""
+    for words in (
+        ["status", url],
+        ["status", url, "--json"],
+        ["train", "--data", str(table), "--store", url, "--retrains", "1"],
+        ["train", "--data", str(table), "--store", url, "--retrains", "1", "--json"],
+        ["export", url, "--out", str(tmp_path / "model.ts")],
+        ["export", url, "--out", str(tmp_path / "model.ts"), "--json"],
+        ["import-labels", str(journal), "--store", url],
+        ["import-labels", str(journal), "--store", url, "--json"],
+    ):
+        done = CliRunner().invoke(main, words)
+        assert done.exit_code == 0, done.output
+        assert SECRET not in done.output
+        shown += done.output
+    assert "***" in shown
+    with admin.connect() as connection:
+        connection.execute(sa.text(f"DROP DATABASE {name}"))
+    admin.dispose()
+
+
+def test_a_value_is_shown_in_a_line() -> None:
+    assert shortened("short") == "'short'"
+    assert len(shortened("x" * 10**6)) < 100

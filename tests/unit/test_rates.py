@@ -1,0 +1,114 @@
+"""What decisions were worth: rates, errors with an interval, seconds."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.metrics import accuracy_score, precision_score
+
+from dengine import Recipe, wilson_interval
+from dengine.errors import SettingError
+from dengine.experiments.metrics import Costs, decided_rates, pooled_error
+from dengine.experiments.replay import Replay
+
+
+def played(action: np.ndarray, truth: np.ndarray, index: np.ndarray) -> Replay:
+    n = len(action)
+    return Replay(
+        action=action, truth=truth, index=index, name="a", recipe=Recipe("pca"), dataset="by hand", seed=0,
+        lower=np.zeros(n), upper=np.ones(n), n_success=np.zeros(n, int), n_failure=np.zeros(n, int),
+        position=np.zeros((n, 2)), decide_seconds=np.zeros(n), stopped=np.zeros(n, bool), reason=np.full(n, "certain"),
+        version=np.zeros(n, int), safe_mode=np.zeros(n, bool),
+    )  # fmt: skip
+
+
+@settings(deadline=None)  # torchmetrics is imported by the first
+@given(st.lists(st.tuples(st.sampled_from(["accept", "reject", "verify"]), st.booleans()), min_size=1, max_size=60))
+def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> None:
+    action, truth = np.array([a for a, _ in cycles]), np.array([t for _, t in cycles])
+    accepted, rejected = action == "accept", action == "reject"
+    rates, certain = decided_rates(accepted, rejected, truth), accepted | rejected
+    if not certain.any():
+        assert all(math.isnan(rate) for rate in rates.values())
+        return
+    assert rates["accuracy"] == pytest.approx(accuracy_score(truth[certain], accepted[certain]))
+    if accepted.any():
+        assert rates["precision"] == pytest.approx(precision_score(truth[certain], accepted[certain]))
+    else:
+        assert math.isnan(rates["precision"])
+    if rejected.any():
+        assert rates["npv"] == pytest.approx(precision_score(~truth[certain], rejected[certain]))
+    else:
+        assert math.isnan(rates["npv"])
+
+
+def test_one_replay_of_different_traces_has_nearly_wilsons_interval() -> None:
+    truth = np.arange(400) % 20 != 0
+    error = pooled_error([played(np.full(400, "accept"), truth, np.arange(400))])
+    assert (error.decided, error.wrong, error.traces, error.rate) == (400, 20, 400, 0.05)
+    assert (error.lower, error.upper) == pytest.approx(wilson_interval(20, 380), abs=1e-3)
+
+
+def test_shuffles_of_the_same_traces_make_the_interval_no_narrower() -> None:
+    truth = np.arange(400) % 20 != 0
+    one = played(np.full(400, "accept"), truth, np.arange(400))
+    once, often = pooled_error([one]), pooled_error([one] * 30)
+    assert (often.rate, often.decided) == (once.rate, 30 * 400)
+    assert (often.lower, often.upper) == pytest.approx((once.lower, once.upper), abs=1e-9)
+
+
+def test_no_error_leaves_what_as_many_different_traces_leave() -> None:
+    one = played(np.full(50, "accept"), np.ones(50, bool), np.arange(50))
+    error = pooled_error([one] * 30)
+    assert (error.rate, error.lower) == (0.0, 0.0)
+    assert error.upper == pytest.approx(wilson_interval(0, 50)[1])
+
+
+def test_nothing_accepted_says_nothing() -> None:
+    error = pooled_error([played(np.full(5, "verify"), np.ones(5, bool), np.arange(5))])
+    assert (error.decided, error.lower, error.upper) == (0, 0.0, 1.0)
+    assert math.isnan(error.rate)
+
+
+def test_rejects_are_a_side_of_their_own() -> None:
+    truth = np.array([True, False, False, False])
+    one = played(np.array(["reject", "reject", "reject", "accept"]), truth, np.arange(4))
+    assert pooled_error([one], "rejected").rate == pytest.approx(1 / 3)
+    assert pooled_error([one]).rate == 1.0
+    with pytest.raises(SettingError, match="accepted or rejected, got 'reject'"):
+        pooled_error([one], "reject")
+
+
+def test_the_interval_covers_the_true_share_of_other_parts() -> None:
+    """Of 300 worlds of 200 parts, each shuffled into five replays that accept three in four: 95 % up to noise."""
+    rng, share, covered = np.random.default_rng(0), 0.1, 0
+    for _ in range(300):
+        truth = rng.random(200) >= share
+        orders = [rng.permutation(200) for _ in range(5)]
+        replays = [played(np.where(rng.random(200) < 0.75, "accept", "verify"), truth[o], o) for o in orders]
+        error = pooled_error(replays)
+        covered += error.lower <= share <= error.upper
+    assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 300) <= covered / 300
+
+
+def test_what_is_saved_are_checks_less_stops_and_good_parts_done_again() -> None:
+    assert Costs().saved(100) == 500
+    assert Costs().saved(100, 2, 3) == 500 - 2 * 120 - 3 * 47.5
+    assert Costs(escape=0, false_reject=0).saved(100, 2, 3) == 500
+
+
+def test_an_accept_is_worth_the_risk_up_to_check_by_escape() -> None:
+    costs = Costs(check=5, escape=600)
+    assert costs.saved(600, false_positive=600 * costs.worst_accept) == pytest.approx(0.0)
+    assert Costs(check=5, escape=2).worst_accept == Costs(check=5, escape=0).worst_accept == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("check", 0), ("escape", -1), ("false_reject", math.inf), ("escape", math.nan), ("check", "5")]
+)
+def test_a_cost_that_is_none_is_refused_by_its_name(name: str, value: Any) -> None:
+    with pytest.raises(SettingError, match=name):
+        Costs(**{name: value})

@@ -1,0 +1,761 @@
+"""Recordings as people have them: every form gives the same traces, and what cannot be read is named and alone is lost."""
+
+from __future__ import annotations
+
+import io
+import runpy
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dengine import DataEngine, Dataset, TraceSpec, load_dataset
+from dengine.datasets.folders import natural
+from dengine.datasets.importing import import_labelled
+from dengine.datasets.labels import label_of, named
+from dengine.datasets.text import rate_of
+from dengine.errors import DataError, TraceError
+
+WORDS = {
+    1: ("True", "OK", "pass", "good", "success", "1", "not_failed"),
+    0: ("False", "NOK", "fail", "bad", "failure", "0"),
+}
+
+
+def write_csv(
+    path: Path, values: np.ndarray, names: tuple[str, ...] = ("FZ_Base",), rate_hz: float = 500.0, **how: Any
+) -> Path:
+    """(C, T) as a file with timestamps."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frame = pd.DataFrame(np.atleast_2d(values).T.astype(np.float64), columns=list(names))
+    frame.insert(0, "Timestamp", 17.0 + np.arange(len(frame)) / rate_hz)
+    frame.to_csv(path, index=False, **how)
+    return path
+
+
+def write_folder(folder: Path, data: Dataset, **how: Any) -> Path:
+    for i, (x, y) in enumerate(zip(data.X, data.y, strict=True)):
+        write_csv(folder / f"insertion_{i + 1}_{bool(y)}.csv", x, data.channels or ("FZ_Base",), **how)
+    return folder
+
+
+def wide(data: Dataset) -> pd.DataFrame:
+    names = [f"FZ_{i}" for i in range(data.X.shape[1])]
+    return pd.DataFrame(data.X.astype(np.float64), columns=names).assign(label=np.where(data.y == 1, "OK", "NOK"))
+
+
+@pytest.fixture(scope="module")
+def small(make_data: Callable[..., Dataset]) -> Dataset:
+    return make_data(24, samples=50)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory, repo: Path) -> tuple[Path, list[str]]:
+    """The 200 files that training/make_recordings.py writes, and which of them are broken."""
+    folder = tmp_path_factory.mktemp("recordings") / "cell"
+    return folder, runpy.run_path(str(repo / "training" / "make_recordings.py"))["write_recordings"](folder, 200, 3, 0)
+
+
+# ----------------------------------------------------------------------------------------------- the same in every form
+
+
+def as_folder(data: Dataset, tmp: Path) -> Any:
+    return write_folder(tmp / "cell", data)
+
+
+def as_semicolons(data: Dataset, tmp: Path) -> Any:
+    return write_folder(tmp / "excel", data, sep=";", decimal=",", encoding="utf-8-sig", lineterminator="\r\n")
+
+
+def as_wide_csv(data: Dataset, tmp: Path) -> Any:
+    wide(data).to_csv(tmp / "wide.csv", index=False)
+    return tmp / "wide.csv"
+
+
+def as_parquet(data: Dataset, tmp: Path) -> Any:
+    wide(data).to_parquet(tmp / "wide.parquet")
+    return tmp / "wide.parquet"
+
+
+def as_frame(data: Dataset, tmp: Path) -> Any:
+    return wide(data)
+
+
+def as_npz(data: Dataset, tmp: Path) -> Any:
+    np.savez(tmp / "data.npz", X=data.X, y=data.y)
+    return tmp / "data.npz"
+
+
+def as_hdf5(data: Dataset, tmp: Path) -> Any:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp / "data.h5", "w") as file:
+        file["X"], file["y"], file["unit"] = data.X, data.y, "N"
+    return tmp / "data.h5"
+
+
+def as_list(data: Dataset, tmp: Path) -> Any:
+    return list(data.X), [bool(y) for y in data.y]
+
+
+def as_series(data: Dataset, tmp: Path) -> Any:
+    return [pd.Series(x) for x in data.X], data.y
+
+
+def as_frames(data: Dataset, tmp: Path) -> Any:
+    return [pd.DataFrame({"Timestamp": np.arange(x.size) / 500, "FZ_Base": x}) for x in data.X], [
+        "ok" if y else "nok" for y in data.y
+    ]
+
+
+FORMS = (as_folder, as_semicolons, as_wide_csv, as_parquet, as_frame, as_npz, as_hdf5, as_list, as_series, as_frames)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_gives_the_same_traces_and_labels(form: Any, small: Dataset, tmp_path: Path) -> None:
+    data = load_dataset(form(small, tmp_path))
+    np.testing.assert_array_equal(data.X, small.X)
+    np.testing.assert_array_equal(data.y, small.y)
+    assert (data.X.dtype, data.y.dtype, data.fit, data.faults, data.rate_hz) == (np.float32, np.int8, "strict", (), 500.0)
+    assert data.spec.samples == 50
+
+
+@pytest.mark.parametrize("form", [as_folder, as_wide_csv, as_npz, as_list])
+def test_the_first_samples_are_those_of_every_form(form: Any, small: Dataset, tmp_path: Path) -> None:
+    data = load_dataset(form(small, tmp_path), samples=30)
+    np.testing.assert_array_equal(data.X, small.X[:, :30])
+    assert data.spec.samples == 30
+
+
+def test_several_channels_are_picked_by_name_in_any_order(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(6, samples=40, channels=3)
+    names = ("FX_Base", "FY_Base", "FZ_Base")
+    folder = write_folder(tmp_path / "cell", Dataset(data.X, data.y, channels=names))
+    both = load_dataset(folder, channel="FZ_Base,FX_Base")
+    np.testing.assert_array_equal(both.X, data.X[:, [2, 0]])
+    assert (both.channels, both.spec.channels, both.spec.columns) == (("FZ_Base", "FX_Base"), 2, ("FZ_Base", "FX_Base"))
+    np.testing.assert_array_equal(load_dataset(folder).X, data.X[:, 2])  # the force along the insertion
+    np.testing.assert_array_equal(load_dataset(both, channel="FX_Base").X, data.X[:, 0])
+    columns = {f"{name}_{i}": data.X[:, c, i] for c, name in enumerate(names) for i in range(40)}
+    table = pd.DataFrame(columns).assign(y=data.y)
+    np.testing.assert_array_equal(load_dataset(table, channel="FZ_Base,FX_Base").X, both.X)
+
+
+def test_without_a_force_and_without_a_choice_the_columns_are_listed(small: Dataset, tmp_path: Path) -> None:
+    write_csv(tmp_path / "a_True.csv", np.ones((2, 30)), ("left", "right"))
+    with pytest.raises(DataError, match=r"Expected the channel to be named.*are left, right"):
+        load_dataset(tmp_path)
+    write_csv(tmp_path / "one" / "a_True.csv", np.arange(30.0), ("left",))
+    assert load_dataset(tmp_path / "one").channels == ("left",)
+
+
+# -------------------------------------------------------------------------------------------------------- the folder
+
+
+def test_of_200_files_three_broken_ones_are_named_and_197_are_traces(recorded: tuple[Path, list[str]]) -> None:
+    folder, broken = recorded
+    data = load_dataset(folder, channel="FZ_Base")
+    assert len(broken) == 3
+    assert (len(data), sorted(f.source for f in data.faults)) == (197, sorted(broken))
+    empty, cut, no_force = (next(f for f in data.faults if f.source == name) for name in broken)
+    assert (empty.line, empty.what) == (0, "Expected a header and rows, it is empty")
+    assert (cut.line, cut.what) == (
+        1 + len((folder / broken[1]).read_text().splitlines()) - 1,
+        "Expected 13 columns, got 12",
+    )
+    assert (no_force.line, no_force.what[:42]) == (1, "Expected a column FZ_Base, got Timestamp, ")
+    names = [name for name in sorted((p.name for p in folder.iterdir()), key=natural) if name not in broken]
+    assert data.source.tolist() == names
+    assert data.y.tolist() == [int("True" in name) for name in names]
+    assert (data.rate_hz, data.fit, data.unit) == (500.0, "pad", "N")
+    assert 960 <= data.lengths.min() < data.lengths.max() <= 1040
+    for i in (0, 50, 196):
+        raw = pd.read_csv(folder / names[i])["FZ_Base"].to_numpy(dtype=np.float32)
+        n = min(len(raw), data.X.shape[1])
+        np.testing.assert_array_equal(data.X[i, :n], raw[:n])
+        assert (data.X[i, n:] == raw[-1]).all()
+
+
+def test_the_same_seed_writes_the_same_recordings(recorded: tuple[Path, list[str]], repo: Path, tmp_path: Path) -> None:
+    write = runpy.run_path(str(repo / "training" / "make_recordings.py"))["write_recordings"]
+    assert write(tmp_path / "a", 5, 2, 4) == write(tmp_path / "b", 5, 2, 4)
+    texts = [[p.read_bytes() for p in sorted((tmp_path / name).iterdir())] for name in "ab"]
+    assert texts[0] == texts[1]
+    write(tmp_path / "c", 5, 2, 5)
+    assert texts[0] != [p.read_bytes() for p in sorted((tmp_path / "c").iterdir())]
+
+
+def test_a_raw_recording_of_any_length_is_decided_on_by_an_engine_of_the_same_form(
+    recorded: tuple[Path, list[str]],
+) -> None:
+    folder, _ = recorded
+    data = load_dataset(folder, channel="FZ_Base,FX_Base")
+    with DataEngine("pca", trace=data.spec, retrain_every=1000) as engine:
+        for i, name in enumerate(data.source[:20]):
+            frame = pd.read_csv(folder / name)
+            decision = engine.decide(frame[list(frame.columns[::-1])])  # the columns' order does not matter
+            np.testing.assert_array_equal(engine.store.get_decision(decision.id).trace, data.X[i])
+
+
+def broken_files(folder: Path) -> dict[str, tuple[int, str]]:
+    """Eight files that cannot be read, each in its own way, among good ones -> line and words of the fault."""
+    x = np.linspace(0.0, 20.0, 40)
+    write_csv(folder / "text_True.csv", x)
+    lines = (folder / "text_True.csv").read_text().splitlines()
+    texts = {
+        "text_True.csv": [*lines[:7], lines[7].split(",")[0] + ",12N", *lines[8:]],
+        "short_row_True.csv": [*lines[:-1], lines[-1].split(",")[0]],
+        "long_row_True.csv": [*lines[:5], lines[5] + ",1", *lines[6:]],
+        "header_False.csv": lines[:1],
+        "back_True.csv": [*lines[:20], lines[19], *lines[20:]],
+        "gap_True.csv": [*lines[:10], *lines[25:]],
+        "too_short_True.csv": lines[:12],
+        "unlabelled.csv": lines,
+    }
+    for name, text in texts.items():
+        (folder / name).write_text("\n".join(text) + "\n")
+    (folder / "latin_OK.csv").write_bytes("\n".join([*lines[:3], "0,1 \xb5m", *lines[3:]]).encode("latin-1"))
+    write_csv(folder / "slow_True.csv", x, rate_hz=250.0)
+    return {
+        "text_True.csv": (8, "Expected a number in column FZ_Base, got '12N'"),
+        "short_row_True.csv": (41, "Expected 2 columns, got 1"),
+        "long_row_True.csv": (6, "Expected 2 columns, got 3"),
+        "header_False.csv": (1, "Expected samples below the header, found none"),
+        "back_True.csv": (21, "Expected a later time than that of the row before"),
+        "gap_True.csv": (11, "Expected a step of 0.002 s in time, got a gap of 0.032 s"),
+        "too_short_True.csv": (0, "Expected 20 to 80 samples, to pad them to 40, got 11"),
+        "unlabelled.csv": (0, "Expected a label at the end of the name"),
+        "latin_OK.csv": (4, "Expected UTF-8 text, got the byte 0xb5"),
+        "slow_True.csv": (0, "Expected timestamps at 500 Hz, as the others have, got 250 Hz"),
+    }
+
+
+def test_each_fault_is_named_with_file_and_line_and_nothing_else_is_lost(
+    make_data: Callable[..., Dataset], tmp_path: Path
+) -> None:
+    data = make_data(30, samples=40)
+    expected = broken_files(write_folder(tmp_path, data))
+    loaded = load_dataset(tmp_path)
+    assert {f.source for f in loaded.faults} == set(expected)
+    for fault in loaded.faults:
+        line, words = expected[fault.source]
+        assert fault.line == line, fault
+        assert fault.what.startswith(words), fault
+    np.testing.assert_array_equal(loaded.X, data.X)
+
+
+def test_a_folder_of_faults_alone_names_the_first_ones(tmp_path: Path) -> None:
+    for i in range(5):
+        (tmp_path / f"{i}_True.csv").write_text("")
+    with pytest.raises(DataError, match=r"found none of 5: 0_True.csv: Expected a header.*; 2_True"):
+        load_dataset(tmp_path, channel="FZ_Base")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="Expected CSV files, one an insertion"):
+        load_dataset(tmp_path / "empty")
+
+
+def test_a_cell_without_a_number_is_kept_as_nan_for_the_engine_to_find(tmp_path: Path) -> None:
+    for i in range(4):
+        write_csv(tmp_path / f"{i}_OK.csv", np.linspace(0.0, 9.0, 30))
+    text = (tmp_path / "2_OK.csv").read_text().splitlines()
+    text[5], text[9] = text[5].split(",")[0] + ",", text[9].split(",")[0] + ",nan"
+    (tmp_path / "2_OK.csv").write_text("\n".join(text))
+    data = load_dataset(tmp_path)
+    assert (len(data), data.faults) == (4, ())
+    assert np.flatnonzero(np.isnan(data.X[2])).tolist() == [4, 8]
+    assert np.isfinite(np.delete(data.X, 2, axis=0)).all()
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=2, max_size=30, unique=True))
+@settings(max_examples=50, deadline=None)
+def test_files_come_in_the_order_of_their_numbers(numbers: list[int]) -> None:
+    names = [f"run_{number}_True.csv" for number in numbers]
+    assert sorted(names, key=natural) == [f"run_{number}_True.csv" for number in sorted(numbers)]
+
+
+# ------------------------------------------------------------------------------------------------------------ labels
+
+
+@pytest.mark.parametrize(("label", "word"), [(label, word) for label, words in WORDS.items() for word in words])
+def test_a_label_is_read_at_the_end_of_a_name_in_any_case(label: int, word: str) -> None:
+    for written in (word, word.upper(), word.lower()):
+        for name in (f"insertion_0001_{written}.csv", f"{written}.csv", f"a-{written}.CSV", f"sub/x {written}.csv"):
+            assert named(None).label(name) == (label, None), name
+        assert label_of(written) == label
+
+
+@pytest.mark.parametrize("name", ["insertion_0001.csv", "run_10.csv", "token.csv", "ok_then.csv", "maybe.csv"])
+def test_a_name_without_a_label_has_none(name: str) -> None:
+    with pytest.raises(DataError, match="Expected a label"):
+        named(None).label(name)
+
+
+def test_a_folder_may_be_the_label_and_must_not_contradict_the_name() -> None:
+    label = named(None).label
+    assert [label(name)[0] for name in ("good/0.csv", "NOK/1.csv", "fail/run 7.csv", "1/x_nok.csv", "OK/x_true.csv")] == [
+        *(1, 0, 0, 0, 1)
+    ]
+    with pytest.raises(DataError, match="its name and its folder good contradict"):
+        label("good/x_NOK.csv")
+
+
+def test_not_ok_is_not_ok() -> None:
+    assert [named(None).label(f"run_7_{word}.csv")[0] for word in ("not_ok", "not-OK", "NOTOK", "ok", "nok")] == [
+        0,
+        0,
+        0,
+        1,
+        0,
+    ]
+
+
+def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: Path) -> None:
+    names, rows = [], []
+    for i, (x, y) in enumerate(zip(small.X, small.y, strict=True)):
+        write_csv(tmp_path / "sorted" / ("good" if y else "bad") / f"{i}.csv", x)
+        write_csv(tmp_path / "coded" / f"{i}_{'q1' if y else 'q0'}_cell3.csv", x)
+        names.append(write_csv(tmp_path / "plain" / f"{i}.csv", x).name)
+        rows.append({"file": names[-1], "operator": "a", "result": "pass" if y else "fail", "part": f"P{i // 2}"})
+    pd.DataFrame(rows).to_csv(tmp_path / "plain" / "labels.csv", index=False)
+    order = [int(p.split("/")[1][:-4]) for p in load_dataset(tmp_path / "sorted").source]
+    assert load_dataset(tmp_path / "sorted").y.tolist() == small.y[order].tolist()
+    assert load_dataset(tmp_path / "coded", label="_q([01])_").y.tolist() == small.y.tolist()
+    listed = load_dataset(tmp_path / "plain", labels=tmp_path / "plain" / "labels.csv")
+    assert listed.y.tolist() == small.y.tolist()
+    assert listed.part.tolist() == [f"P{i // 2}" for i in range(24)]
+    assert listed.faults == ()
+
+
+def test_a_labels_file_that_does_not_fit_is_named_line_by_line(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:8]):
+        write_csv(tmp_path / "cell" / f"{i}.csv", x)
+    rows = ["0.csv,OK", "1,NOK", "2.csv,perhaps", "3.csv", "ghost.csv,OK", "4.csv,OK", "4.csv,NOK", "5.csv,1", "6.csv,0"]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
+    assert (data.source.tolist(), data.y.tolist()) == ([f"{i}.csv" for i in (0, 1, 4, 5, 6)], [1, 0, 1, 1, 0])
+    said = [(f.source, f.line) for f in data.faults]
+    assert said == [("labels.csv", 5), ("labels.csv", 8), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0), ("labels.csv", 6)]
+    assert "in labels.csv, line 4" in data.faults[2].what
+
+
+def test_a_folder_without_labels_asks_for_them(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X):
+        write_csv(tmp_path / f"run_{i}.csv", x)  # run_0 and run_1 would be labels by themselves
+    with pytest.raises(DataError, match=r"22 of 24 have none.*give the pattern of it"):
+        load_dataset(tmp_path)
+    for pattern, words in (("(", "regular expression"), ("ok", "one group")):
+        with pytest.raises(DataError, match=words):
+            load_dataset(tmp_path, label=pattern)
+
+
+# --------------------------------------------------------------------------------------------------- lengths and rates
+
+
+@pytest.fixture(scope="module")
+def uneven() -> tuple[list[np.ndarray], list[int]]:
+    rng = np.random.default_rng(0)
+    return [np.linspace(0.0, 20.0, n) + rng.normal(0, 0.1, n) for n in rng.integers(90, 111, 15)], [1, 0, 1] * 5
+
+
+@pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
+def test_lengths_are_fitted_in_a_file_as_they_are_live(fit: str, uneven: tuple[list[np.ndarray], list[int]]) -> None:
+    data = load_dataset(uneven, fit=fit)
+    lengths = [len(x) for x in uneven[0]]
+    assert data.X.shape == (15, min(lengths) if fit == "cut" else int(np.median(lengths)))
+    assert data.lengths.tolist() == lengths
+    with DataEngine("pca", trace=data.spec) as engine:
+        for i, x in enumerate(uneven[0]):
+            kept = engine.store.get_decision(engine.decide(x).id).trace
+            np.testing.assert_array_equal(kept, data.X[i : i + 1])
+
+
+def test_unasked_lengths_that_differ_are_padded_and_never_resampled(uneven: tuple[list[np.ndarray], list[int]]) -> None:
+    assert load_dataset(uneven).fit == "pad"
+    assert (load_dataset(uneven, samples=60).spec, load_dataset(uneven, samples=60).X.shape) == (
+        TraceSpec(60, fit="cut"),
+        (15, 60),
+    )
+    with pytest.raises(DataError, match=r"Expected recordings of one length, got 9\d to 110 samples; choose fit='pad'"):
+        load_dataset(uneven, fit="strict")
+
+
+def test_what_cannot_honestly_be_fitted_is_a_fault(uneven: tuple[list[np.ndarray], list[int]]) -> None:
+    X, y = [*uneven[0], np.ones(20), np.ones(300), np.array([])], [*uneven[1], 1, 1, 1]
+    data = load_dataset((X, y))
+    assert len(data) == 15
+    assert [(f.source, f.line) for f in data.faults] == [("data", 18), ("trace 16", 0), ("trace 17", 0)]
+    assert np.isfinite(data.X).all()
+    with pytest.raises(DataError, match="found none of 18"):
+        load_dataset((X, y), samples=5000)
+
+
+def test_timestamps_tell_the_rate_whatever_their_unit(tmp_path: Path) -> None:
+    steps = np.arange(50)
+    clocks = {
+        "Timestamp": 1000 + steps * 0.004,
+        "time_ms": steps * 4,
+        "time [us]": steps * 4000.0,
+        "t": 1.7e12 + steps * 4.0,  # milliseconds of the day's clock
+        "Time": pd.Timestamp("2026-03-01 12:00:00") + pd.to_timedelta(steps * 4, unit="ms"),
+    }
+    for name, clock in clocks.items():
+        folder = tmp_path / name.strip("[]")
+        folder.mkdir()
+        pd.DataFrame({name: clock, "FZ_Base": np.sin(steps)}).to_csv(folder / "a_OK.csv", index=False)
+        assert (load_dataset(folder).rate_hz, load_dataset(folder).channels) == (250.0, ("FZ_Base",)), name
+        assert load_dataset(folder, rate_hz=100.0).rate_hz == 100.0
+
+
+@given(st.floats(1.0, 5000.0), st.integers(3, 200), st.floats(0.0, 1e6))
+@settings(max_examples=60, deadline=None)
+def test_a_steady_clock_gives_its_rate(rate: float, n: int, start: float) -> None:
+    assert rate_of(start + np.arange(n) / rate) == pytest.approx(rate, rel=1e-3)
+
+
+def test_a_stated_rate_overrides_timestamps_that_are_broken(tmp_path: Path) -> None:
+    pd.DataFrame({"Timestamp": [0.0, 0.0, 0.0, 5.0] * 10, "FZ_Base": np.arange(40.0)}).to_csv(
+        tmp_path / "a_OK.csv", index=False
+    )
+    with pytest.raises(DataError, match="line 3: Expected a later time"):
+        load_dataset(tmp_path)
+    assert load_dataset(tmp_path, rate_hz=500.0).X.shape == (1, 40)
+
+
+# ------------------------------------------------------------------------------------------------------------- tables
+
+
+def test_rows_of_a_table_that_cannot_be_read_are_named(small: Dataset, tmp_path: Path) -> None:
+    path = as_wide_csv(small, tmp_path)
+    lines = path.read_text().splitlines()
+    lines[3] = lines[3].rsplit(",", 5)[0]  # truncated
+    lines[6] = "abc," + lines[6].split(",", 1)[1]
+    lines[9] = lines[9].rsplit(",", 1)[0] + ",perhaps"
+    lines[12] = "," + lines[12].split(",", 1)[1]  # an empty cell is a NaN
+    path.write_text("\n".join(lines) + "\n")
+    data = load_dataset(path)
+    assert [(f.source, f.line) for f in data.faults] == [("wide.csv", 4), ("wide.csv", 7), ("wide.csv", 10)]
+    assert "Expected 51 columns, got 46" in data.faults[0].what
+    assert "Expected a number in column FZ_0, got 'abc'" in data.faults[1].what
+    kept = [i for i in range(24) if i not in (2, 5, 8)]
+    np.testing.assert_array_equal(data.y, small.y[kept])
+    expected = small.X[kept].copy()
+    expected[kept.index(11), 0] = np.nan
+    np.testing.assert_array_equal(data.X, expected)
+    assert data.source[kept.index(11)] == "wide.csv, line 13"
+
+
+def test_a_tables_label_and_part_columns_can_be_named(small: Dataset) -> None:
+    table = wide(small).rename(columns={"label": "Height check"}).assign(workpiece=[f"W{i // 2}" for i in range(24)])
+    data = load_dataset(table, part="workpiece", label="Height check")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.part.tolist() == [f"W{i // 2}" for i in range(24)]
+    with pytest.raises(DataError, match="Expected a column of labels, y or label, found FZ_0"):
+        load_dataset(table)
+    with pytest.raises(DataError, match="Expected samples in numbered columns"):
+        load_dataset(pd.DataFrame({"FZ": [1.0], "label": [1]}))
+
+
+def test_options_that_say_nothing_to_a_source_are_refused(small: Dataset, tmp_path: Path) -> None:
+    for source in (small, (small.X, small.y), as_npz(small, tmp_path), "insertion"):
+        with pytest.raises(DataError, match="Expected no label for"):
+            load_dataset(source, label="_(OK)_")
+    for options, words in (
+        ({"fit": "stretch"}, "Expected fit"),
+        ({"rate_hz": 0.0}, "rate above 0"),
+        ({"samples": 0}, "1 or more"),
+    ):
+        with pytest.raises(DataError, match=words):
+            load_dataset(small, **options)
+
+
+def test_transposed_arrays_are_refused() -> None:
+    with pytest.raises(DataError, match=r"looks transposed; pass X\.transpose"):
+        load_dataset((np.zeros((5, 100, 2)), [1] * 5))
+    with pytest.raises(DataError, match="looks transposed"):
+        load_dataset(([np.zeros((100, 2))] * 3, [1, 0, 1]))
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".h5", ".npz"])
+def test_a_damaged_file_is_a_data_error(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"damaged{suffix}"
+    path.write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(DataError, match="Cannot read"):
+        load_dataset(path)
+
+
+# ------------------------------------------------------------------------------------------------- folders as they are
+
+
+def text_of(path: Path) -> str:
+    """A written recording, its text."""
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def few(small: Dataset, tmp_path: Path) -> Path:
+    """Four recordings of one channel."""
+    return write_folder(tmp_path / "cell", Dataset(small.X[:4], small.y[:4]))
+
+
+def test_a_header_is_found_in_any_case_and_a_comma_at_the_end_of_lines_is_no_column(few: Path, small: Dataset) -> None:
+    for path, (head, row) in zip(sorted(few.iterdir()), (("", ""), (",", ","), ("", ","), (",", "")), strict=True):
+        first, *lines = text_of(path).splitlines()
+        path.write_text("\n".join([first.lower() + head, *(line + row for line in lines)]) + "\n")
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    assert data.faults == ()
+    np.testing.assert_array_equal(load_dataset(few, channel="fz_base").X, small.X[:4])
+
+
+def test_a_channel_that_is_there_twice_is_a_fault(few: Path) -> None:
+    path = next(few.iterdir())
+    path.write_text("\n".join(line + "," + line.split(",")[1] for line in text_of(path).splitlines()) + "\n")
+    data = load_dataset(few)
+    assert [(f.source, f.line) for f in data.faults] == [(path.name, 1)]
+    assert "got it twice or more" in data.faults[0].what
+
+
+def test_hidden_folders_are_not_looked_into_and_a_link_to_nothing_is_a_fault(few: Path, small: Dataset) -> None:
+    write_csv(few / ".ipynb_checkpoints" / "x_True.csv", small.X[5])
+    write_csv(few / "__MACOSX" / "._x_True.csv", small.X[5])
+    (few / "readme.txt").write_text("of cell 3")
+    (few / "y_True.csv").mkdir()
+    (few / "z_True.csv").symlink_to(few / "gone.csv")
+    data = load_dataset(few)
+    np.testing.assert_array_equal(data.X, small.X[:4])
+    assert [f.source for f in data.faults] == ["z_True.csv"]
+
+
+@pytest.mark.parametrize("added", [" (2)", "(1)", " - Copy", " - Kopie (3)"])
+def test_a_copy_has_the_label_of_its_original(added: str) -> None:
+    assert named(None).label(f"run_7_true{added}.csv") == (1, None)
+    assert named(None).label(f"run_7_NOK{added}.csv") == (0, None)
+
+
+def test_a_folder_above_may_be_the_label() -> None:
+    assert [named(None).label(name)[0] for name in ("ok/monday/7.csv", "nok/1/x.csv", "cell/nok/b/3.csv")] == [1, 0, 0]
+
+
+def test_a_labels_file_names_recordings_as_people_write_paths(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:6]):
+        write_csv(tmp_path / "cell" / "sub" / f"Run_{i}.CSV", x)
+    files = [
+        "run_0.csv",
+        "./sub/Run_1.csv",
+        "C:\\data\\sub\\Run_2.CSV",
+        "/old/cell/sub/Run_3.csv",
+        "Run_4",
+        '"sub/Run_5.csv"',
+    ]
+    rows = [f'"a, b",{file},{word}' for file, word in zip(files, ("ok", "nok") * 3, strict=True)]
+    (tmp_path / "labels.csv").write_text("\n".join(["note,path,verdict", *rows]) + "\n")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
+    assert (data.y.tolist(), data.faults) == ([1, 0] * 3, ())
+    (tmp_path / "turned.csv").write_text("verdict,Datei\n" + "".join(f"ok,run_{i}\n" for i in range(6)))
+    assert load_dataset(tmp_path / "cell", labels=tmp_path / "turned.csv").y.tolist() == [1] * 6
+    bare = [f"{file},{word}" for file, word in zip(files, ("ok", "nok") * 3, strict=True)]
+    (tmp_path / "bare.csv").write_text("\n".join(bare) + "\n")
+    assert load_dataset(tmp_path / "cell", labels=tmp_path / "bare.csv").y.tolist() == [1, 0] * 3
+
+
+def test_a_row_of_a_labels_file_is_not_used_for_two_recordings(small: Dataset, tmp_path: Path) -> None:
+    for name in ("a/1.csv", "b/1.csv", "a/2.csv", "a/3.csv", "c/4.csv", "4.csv"):
+        write_csv(tmp_path / "cell" / name, small.X[0])
+    rows = ["1.csv,OK", "2.csv,NOK", "3.csv,OK", "c/4.csv,NOK", "4.csv,OK"]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
+    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
+    assert dict(zip(data.source.tolist(), data.y.tolist(), strict=True)) == {
+        "4.csv": 1,
+        "a/2.csv": 0,
+        "a/3.csv": 1,
+        "c/4.csv": 0,
+    }
+    assert [(f.source, f.what) for f in data.faults] == [
+        ("a/1.csv", "Expected its folder in labels.csv, line 2, which names b/1.csv too"),
+        ("b/1.csv", "Expected its folder in labels.csv, line 2, which names a/1.csv too"),
+    ]
+
+
+def test_what_a_labels_file_does_not_have_is_said(few: Path, tmp_path: Path) -> None:
+    (tmp_path / "labels.csv").write_text("a,b\nOK,1\nNOK,2\n")
+    with pytest.raises(DataError, match=r"4 of 4 have none.*labels\.csv names OK, NOK: call its columns file and label"):
+        load_dataset(few, labels=tmp_path / "labels.csv")
+    with pytest.raises(DataError, match="Expected a column workpiece of parts' numbers in"):
+        load_dataset(few, labels=tmp_path / "labels.csv", part="workpiece")
+    with pytest.raises(DataError, match="Expected a file of labels with a column workpiece"):
+        load_dataset(few, part="workpiece")
+    with pytest.raises(DataError, match="got both; leave one out"):
+        load_dataset(few, labels=tmp_path / "labels.csv", label="_(OK)_")
+
+
+def test_of_two_rates_the_one_of_more_recordings_is_kept(small: Dataset, tmp_path: Path) -> None:
+    for i, x in enumerate(small.X[:7]):
+        write_csv(tmp_path / f"{i}_OK.csv", x, rate_hz=500.0 if i < 4 else 125.0)
+    data = load_dataset(tmp_path)
+    assert (len(data), data.rate_hz, len(data.faults)) == (4, 500.0, 3)
+    (tmp_path / "3_OK.csv").unlink()
+    assert len(load_dataset(tmp_path)) == 3  # half of each: no rate lies between them
+
+
+@pytest.mark.parametrize(("step", "rate"), [(2, 500.0), (8, 125.0), (2000, 500.0), (2_000_000, 500.0), (0.02, 50.0)])
+def test_a_clock_without_a_unit_is_taken_for_what_a_recorder_may_count(step: float, rate: float, tmp_path: Path) -> None:
+    pd.DataFrame({"Timestamp": np.arange(50) * step, "FZ_Base": np.arange(50.0)}).to_csv(tmp_path / "a_OK.csv", index=False)
+    assert load_dataset(tmp_path).rate_hz == rate
+
+
+def test_one_time_that_is_no_number_is_named_by_its_own_line(few: Path) -> None:
+    path = sorted(few.iterdir())[0]
+    lines = text_of(path).splitlines()
+    lines[8] = "late," + lines[8].split(",")[1]
+    path.write_text("\n".join(lines))
+    (fault,) = load_dataset(few).faults
+    assert (fault.source, fault.line) == (path.name, 9)
+    assert "got 'late'; a stated rate (rate_hz) leaves times unread" in fault.what
+
+
+# -------------------------------------------------------------------------------------------------- tables and arrays
+
+
+def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(small: Dataset) -> None:
+    names = [None, *(f"P{i // 2}" for i in range(1, 24))]
+    part = load_dataset(wide(small).assign(part=names)).part.tolist()
+    assert part == ["row, line 1", *names[1:]]
+    numbers = [np.nan, *(float(i) for i in range(1, 24))]
+    assert load_dataset(wide(small).assign(part=numbers)).part.tolist() == ["row, line 1", *map(str, range(1, 24))]
+
+
+def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(small: Dataset, tmp_path: Path) -> None:
+    table = wide(small)
+    lengths = [45 + i % 6 for i in range(24)]
+    for i, length in enumerate(lengths):
+        table.iloc[i, length:50] = np.nan
+    table.to_csv(tmp_path / "wide.csv", index=False)
+    for source in (table, tmp_path / "wide.csv"):
+        data = load_dataset(source)
+        assert (data.fit, data.lengths.tolist(), data.X.shape) == ("pad", lengths, (24, 47))
+        assert np.isfinite(data.X).all()
+        np.testing.assert_array_equal(
+            data.X, load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X
+        )
+
+
+def test_columns_of_lists_are_channels(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
+    data = make_data(6, samples=40, channels=2)
+    cells = {name: [x.tolist() for x in data.X[:, c]] for c, name in enumerate(("FX_Base", "FZ_Base"))}
+    table = pd.DataFrame(cells).assign(label=data.y)
+    table.to_parquet(tmp_path / "lists.parquet")
+    for source in (table, tmp_path / "lists.parquet"):
+        np.testing.assert_array_equal(load_dataset(source, channel="FX_Base,FZ_Base").X, data.X)
+        np.testing.assert_array_equal(load_dataset(source).X, data.X[:, 1])
+    table["FX_Base"] = [cell[:2] if i == 2 else cell for i, cell in enumerate(table["FX_Base"])]
+    (fault,) = load_dataset(table, channel="FX_Base,FZ_Base").faults
+    assert (fault.line, fault.what[:40]) == (3, "Expected a list of numbers in each chann")
+
+
+def test_tables_that_would_be_misread_are_refused(small: Dataset, tmp_path: Path) -> None:
+    table = wide(small)
+    table.to_csv(tmp_path / "bare.csv", index=False, header=False)
+    for source, words in (
+        (table.drop(columns="FZ_5"), "after FZ_4 comes FZ_6"),
+        (pd.concat([table, table], axis=1), "Expected each column once"),
+        (tmp_path / "bare.csv", "its first line is of numbers"),
+        (write_csv(tmp_path / "one_True.csv", small.X[0]), "as in one recording; give its folder"),
+    ):
+        with pytest.raises(DataError, match=words):
+            load_dataset(source)
+
+
+def test_a_comma_at_the_end_of_a_tables_rows_is_no_column(small: Dataset, tmp_path: Path) -> None:
+    lines = text_of(as_wide_csv(small, tmp_path)).splitlines()
+    (tmp_path / "wide.csv").write_text("\n".join([lines[0], *(line + "," for line in lines[1:])]))
+    data = load_dataset(tmp_path / "wide.csv")
+    assert data.faults == ()
+    np.testing.assert_array_equal(data.X, small.X)
+
+
+def test_labels_of_an_array_may_be_words(small: Dataset, tmp_path: Path) -> None:
+    words = np.where(small.y == 1, "OK", "NOK")
+    np.savez(tmp_path / "words.npz", X=small.X, y=words)
+    for source in ((small.X, words), (small.X, pd.Series(words)), (small.X.astype(object), words), tmp_path / "words.npz"):
+        data = load_dataset(source)
+        np.testing.assert_array_equal(data.X, small.X)
+        np.testing.assert_array_equal(data.y, small.y)
+    with pytest.raises(DataError, match=r"Expected a label, as True/False.*got 'perhaps'"):
+        load_dataset((small.X[:2], ["OK", "perhaps"]))
+    with pytest.raises(DataError, match="got 'None'"):
+        load_dataset((small.X[:2], [1, None]))
+
+
+@pytest.mark.parametrize("X", [np.zeros((3, 9), dtype=complex), np.zeros((3, 9)).astype(str), (x for x in range(3))])
+def test_what_holds_no_real_numbers_is_refused(X: Any) -> None:
+    with pytest.raises(DataError, match="Expected X of real numbers"):
+        load_dataset((X, [1, 0, 1]))
+
+
+def test_frames_tell_their_rate_and_give_the_force(small: Dataset) -> None:
+    steps = np.arange(50)
+    frames = [pd.DataFrame({"Timestamp": 7 + steps / 125, "FX_Base": 0.0 * x, "FZ_Base": x}) for x in small.X[:5]]
+    frames[2]["Timestamp"] = 7 + steps / 500
+    frames[3].loc[9, "Timestamp"] = 0.0
+    data = load_dataset((frames, small.y[:5]))
+    assert (data.rate_hz, data.channels) == (125.0, ("FZ_Base",))
+    np.testing.assert_array_equal(data.X, small.X[[0, 1, 4]])
+    assert [f.source for f in data.faults] == ["data", "trace 3"]
+    assert len(load_dataset((frames, small.y[:5]), rate_hz=125.0)) == 5
+
+
+def test_an_archive_that_claims_more_than_there_is_memory_is_a_data_error(small: Dataset, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with zipfile.ZipFile(tmp_path / "claim.npz", "w") as archive:
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**7, 10**6)})
+        archive.writestr("X.npy", header.getvalue())
+    with h5py.File(tmp_path / "claim.h5", "w") as file:
+        file.create_dataset("X", shape=(10**6, 10**7), chunks=(10, 1000), dtype="f4")
+        file["y"] = small.y
+    for name in ("claim.npz", "claim.h5"):
+        with pytest.raises(DataError, match=r"has another size|at most .* GB of arrays"):
+            load_dataset(tmp_path / name)
+
+
+def test_an_archives_facts_are_checked(small: Dataset, tmp_path: Path) -> None:
+    for number, (about, words) in enumerate(
+        (
+            ({"rate_hz": 0.0}, "rate above 0"),
+            ({"rate_hz": [1.0, 2.0]}, "Cannot read"),
+            ({"channels": ["a", "b"]}, "a name for each of 1 channels"),
+        )
+    ):
+        np.savez(tmp_path / f"{number}.npz", X=small.X, y=small.y, **about)
+        with pytest.raises(DataError, match=words):
+            load_dataset(tmp_path / f"{number}.npz")
+
+
+def test_a_file_of_another_kind_lists_those_that_are_read(tmp_path: Path) -> None:
+    for name in ("data.xlsx", "data.txt", "data.npy"):
+        (tmp_path / name).write_text("FZ_0,FZ_1,label")
+        with pytest.raises(DataError, match=r"Expected a file \.npz, \.csv, \.parquet, \.h5 or \.mcap, got"):
+            load_dataset(tmp_path / name)
+
+
+# --------------------------------------------------------------------------------------------------------- in a store
+
+
+def test_recordings_that_are_added_do_not_make_those_before_count_again(tmp_path: Path) -> None:
+    rng, store = np.random.default_rng(0), tmp_path / "cell.db"
+    for i in range(9):
+        write_csv(tmp_path / "cell" / f"{i}_OK.csv", rng.normal(size=100 + i))
+    first = import_labelled(store, tmp_path / "cell", "pca")
+    for i in range(9, 29):
+        write_csv(tmp_path / "cell" / f"{i}_NOK.csv", rng.normal(size=96))
+    again = import_labelled(store, tmp_path / "cell")
+    assert (first.imported, again.imported, again.known) == (9, 20, 9)
+    with pytest.raises(TraceError, match="to 104 samples by pad, cell was to 96 by pad; load it with samples=104"):
+        import_labelled(store, load_dataset(tmp_path / "cell"))
+    with pytest.raises(TraceError, match="was to 104 by resample"):
+        import_labelled(store, load_dataset(tmp_path / "cell", samples=104, fit="resample"))

@@ -1,0 +1,318 @@
+"""Recorded streams through the same loop: exact under a seed, and counted right."""
+
+from contextlib import suppress
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from sklearn.decomposition import PCA
+
+from dengine import Action, DataEngine, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
+from dengine.errors import DataError, SettingError
+from dengine.experiments.contenders import Contender
+from dengine.experiments.grid import run_replays
+from dengine.experiments.replay import RunLog, RunRecorder, watch
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
+TIMES = ("decide_seconds", "retrains", "seconds")
+
+
+def same(one: Replay, other: Replay) -> None:
+    for f in fields(Replay):
+        if f.name not in TIMES:
+            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
+    for a, b in zip(one.retrains, other.retrains, strict=True):
+        assert replace(a, seconds=0.0) == replace(b, seconds=0.0)
+
+
+@pytest.fixture(scope="module")
+def played(data: Dataset) -> Replay:
+    return replay(data, RECIPE, seed=1)
+
+
+def test_a_seed_repeats_exactly(data: Dataset, played: Replay) -> None:
+    same(replay(data, RECIPE, seed=1), played)
+
+
+def test_an_audited_replay_repeats_exactly_too(data: Dataset) -> None:
+    audited = RECIPE.with_policy(audit_rate=0.3)
+    same(replay(data, audited, seed=2), replay(data, audited, seed=2))
+
+
+def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data: Dataset, played: Replay) -> None:
+    hurried = replay(data, replace(RECIPE, budget=1e-9), seed=1)
+    same(replace(hurried, recipe=RECIPE), played)
+
+
+def test_another_seed_is_another_order(data: Dataset, played: Replay) -> None:
+    other = replay(data, RECIPE, seed=2)
+    assert not np.array_equal(other.truth, played.truth)
+    assert other.truth.sum() == played.truth.sum()
+
+
+def test_unshuffled_plays_the_stream_as_recorded(data: Dataset) -> None:
+    for seed in (0, 1):
+        np.testing.assert_array_equal(replay(data, RECIPE, seed, shuffle=False).truth, data.y.astype(bool))
+
+
+def test_fewer_cycles_are_the_beginning_of_the_same_pass(data: Dataset, played: Replay) -> None:
+    short = replay(data, RECIPE, seed=1, cycles=90)
+    np.testing.assert_array_equal(short.action, played.action[:90])
+    np.testing.assert_array_equal(short.lower, played.lower[:90])
+    for cycles in (0, 201):
+        with pytest.raises(SettingError, match="Expected 1 to 200 cycles"):
+            replay(data, RECIPE, cycles=cycles)
+
+
+def test_actions_follow_from_the_recorded_bounds(played: Replay) -> None:
+    actions = RECIPE.policy.actions(played.lower, played.upper)
+    np.testing.assert_array_equal(played.action, actions.astype(str))
+    lower, upper = RECIPE.policy.bound(played.n_success, played.n_failure)
+    np.testing.assert_allclose((played.lower, played.upper), (lower, upper), atol=1e-12)
+
+
+def test_the_summary_counts_what_happened(played: Replay) -> None:
+    row, pairs = played.summary(), list(zip(played.action, played.truth, strict=True))
+    assert row["accepted"] == sum(a == "accept" for a, _ in pairs) > 50
+    assert row["rejected"] == sum(a == "reject" for a, _ in pairs)
+    assert row["certain"] == row["accepted"] + row["rejected"]
+    assert row["false_positive"] == sum(a == "accept" and not y for a, y in pairs)
+    assert row["false_negative"] == sum(a == "reject" and bool(y) for a, y in pairs)
+    assert row["precision"] == pytest.approx(1 - row["false_positive"] / row["accepted"])
+    assert row["saved_s"] == 5.0 * row["certain"]
+    assert (row["cycles"], row["seed"], row["retrains"]) == (200, 1, len(played.retrains))
+
+
+def test_what_was_never_decided_has_no_precision(data: Dataset) -> None:
+    row = replay(data, RECIPE, cycles=30).summary()
+    assert row["certain"] == 0
+    assert np.isnan([row["precision"], row["npv"], row["retrain_max_s"]]).all()
+
+
+def test_positions_are_kept_where_a_model_embedded_the_trace(played: Replay) -> None:
+    before = 40
+    assert played.position.shape == (200, 2)
+    assert np.isnan(played.position[:before]).all()
+    assert np.isfinite(played.position[before:]).all()
+
+
+def test_confirmed_parts_are_learned_from(data: Dataset, played: Replay) -> None:
+    told = replay(data, RECIPE, seed=1, confirm=True)
+    assert told.n_success[-1] + told.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
+
+
+def test_progress_is_told_cycle_by_cycle(data: Dataset) -> None:
+    seen: list[int] = []
+    replay(data, RECIPE, cycles=20, on_cycle=seen.append)
+    assert seen == list(range(1, 21))
+
+
+# ------------------------------------------------------------------------------------- guarantees and what is known
+
+KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
+
+
+def test_where_all_bad_parts_stop_the_system_a_seed_repeats_exactly(data: Dataset) -> None:
+    told = replay(data, KNOWN, seed=1)
+    assert told.accepted.sum() > 20
+    same(replay(data, KNOWN, seed=1), told)
+
+
+def test_silence_counts_as_a_success_where_all_bad_parts_stop_the_system(data: Dataset, played: Replay) -> None:
+    local = replay(data, RECIPE.with_policy(stops="all"), seed=1)
+    first = int(np.flatnonzero(played.accepted)[0])
+    np.testing.assert_array_equal(local.action[: first + 1], played.action[: first + 1])
+    assert local.n_success[-1] + local.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
+
+
+def test_a_long_stretch_of_accepted_parts_retrains_as_any_other(make_data) -> None:
+    """After the first 120 parts all are good, so that nearly all are accepted and no report comes."""
+    some, good = make_data(120, failures=0.3, noise=0.2), make_data(200, seed=1, failures=0.0, noise=0.2)
+    stream = Dataset(np.concatenate([some.X, good.X]), np.concatenate([some.y, good.y]), "mostly good")
+    told = replay(stream, KNOWN, shuffle=False)
+    stretch = np.flatnonzero(~told.accepted)[-1] + 1  # after the last check
+    assert len(told) - stretch > 2 * KNOWN.retrain_every
+    assert told.retrains[-1].n_traces > stretch
+    assert sum(report.accepted for report in told.retrains) >= 320 // KNOWN.retrain_every - 1
+
+
+@pytest.fixture(scope="module")
+def changed(make_data) -> Replay:
+    """After 300 parts the force doubles and a wave comes upon it: the parts are others, their labels as before."""
+    before, after = make_data(300, noise=0.2), make_data(300, seed=1, noise=0.2)
+    X = 2.0 * after.X + 5.0 * np.sin(np.arange(after.X.shape[1])).astype(np.float32)
+    stream = Dataset(np.concatenate([before.X, X]), np.concatenate([before.y, after.y]), "changed")
+    return replay(stream, KNOWN, shuffle=False)
+
+
+def test_novel_parts_and_the_safe_mode_are_in_the_record(changed: Replay) -> None:
+    assert changed.novel[:300].mean() < 0.05
+    assert changed.novel[300:320].all()
+    assert (changed.action[changed.novel] == "verify").all()
+    assert not changed.safe_mode[:300].any()
+    assert changed.safe_mode[300:330].any()
+    assert not changed.safe_mode[-1]
+    (first,) = np.flatnonzero(changed.safe_mode)[:1]
+    assert (changed.action[first + 1 :][changed.safe_mode[first:-1]] == "verify").all()  # from the next part on
+
+
+def test_the_summary_says_what_was_guaranteed_and_counts_novel_parts_and_cycles_of_safe_mode(changed: Replay) -> None:
+    row = changed.summary()
+    assert (row["guarantee"], row["stops"]) == ("pooled", "all")
+    assert (row["novel"], row["safe_mode"]) == (changed.novel.sum(), changed.safe_mode.sum())
+    assert row["saved_s"] == 5.0 * row["certain"]
+
+
+def test_novelty_can_be_turned_off(data: Dataset) -> None:
+    assert not replay(data, replace(RECIPE, novelty=0.0), seed=1).novel.any()
+
+
+# ------------------------------------------------------------------------------------------------------- records
+
+
+class Silent:
+    """A cell as real ones are: it tells nothing but what it is asked for."""
+
+    def __init__(self, cell: ReplayCell) -> None:
+        self.insert, self.verify, self.proceed, self.reject = cell.insert, cell.verify, cell.proceed, cell.reject
+
+
+class Broken(ReplayCell):
+    """Someone presses Ctrl-C while part 31 is inserted."""
+
+    def insert(self):
+        if self.position == 29:
+            raise KeyboardInterrupt
+        return super().insert()
+
+
+def engine() -> DataEngine:
+    return DataEngine.from_recipe(RECIPE, seed=1, replaying=True)
+
+
+@pytest.fixture(scope="module")
+def order(data: Dataset) -> np.ndarray:
+    return np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
+
+
+def test_a_live_run_and_a_replay_of_the_same_parts_keep_the_same_record(data: Dataset, played: Replay, order) -> None:
+    log = watch(engine(), ReplayCell(data, order), 200)
+    for f in fields(RunLog):
+        if f.name not in TIMES:
+            np.testing.assert_array_equal(getattr(log, f.name), getattr(played, f.name), err_msg=f.name)
+    assert played.stretches(4) == log.stretches(4)
+
+
+def test_what_a_cell_does_not_tell_stays_unknown(data: Dataset, played: Replay, order) -> None:
+    log = watch(engine(), Silent(ReplayCell(data, order)), 200)
+    told = log.verified | log.stopped
+    assert 0 < told.sum() < 200
+    np.testing.assert_array_equal(log.truth[told], played.truth[told])
+    assert np.isnan(log.truth[~told]).all()
+    assert log.clock_s is None
+
+
+def test_a_run_that_is_broken_off_hands_over_what_was_finished(data: Dataset, played: Replay, order) -> None:
+    recorder = RunRecorder(Broken(data, order))
+    with suppress(KeyboardInterrupt):
+        recorder.follow(engine(), 200)
+    np.testing.assert_array_equal(recorder.log().action, played.action[:30])
+    assert recorder.log().summary()["last_cycle"] == 30
+
+
+def test_a_run_of_no_cycle_has_an_empty_record(data: Dataset) -> None:
+    log = watch(engine(), ReplayCell(data), 0)
+    assert (len(log), log.position.shape, log.stretches(6), log.retrain_seconds.shape) == (0, (0, 2), [], (0,))
+    row = log.summary()
+    assert (row["first_cycle"], row["last_cycle"], row["verified"], row["parts_per_hour"]) == (1, 0, 0, None)
+
+
+def test_a_run_is_told_cycle_by_cycle(data: Dataset) -> None:
+    seen: list[int] = []
+    watch(engine(), ReplayCell(data), 5, on_cycle=lambda cycle: seen.append(cycle.index))
+    assert seen == [0, 1, 2, 3, 4]
+
+
+def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(played: Replay) -> None:
+    frame, row = played.to_frame(), played.summary()
+    assert frame.index.tolist() == list(range(1, len(played) + 1))
+    assert (frame["action"] != "verify").sum() == row["certain"] > 0
+    assert ((frame["action"] == "accept") & ~frame["truth"]).sum() == row["false_positive"]
+    assert (frame["reason"] == "certain").sum() == row["certain"]
+    assert frame["reason"].eq("no_model").sum() == 40 == frame["version"].eq(0).sum()
+    assert frame.loc[row["first_certain"], "action"] != "verify"
+    np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
+
+
+# --------------------------------------------------------------------------------------------------------- grids
+
+
+def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(RECIPE.to_toml(), encoding="utf-8")
+    asked = ["paper", str(path), path, RECIPE, PCA(2), "sklearn.decomposition:PCA", Recipe(PCA(2))]
+    names = ["paper", "mine", "mine", "pca", "PCA", "sklearn.decomposition:PCA", "PCA"]
+    assert [Contender.load(recipe).name for recipe in asked] == names
+    assert replay(data, PCA(2), cycles=30).summary()["recipe"] == "PCA"
+
+
+def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:
+    table = run_grid(data, [RECIPE], (0.1, 0.5), (0.8, 0.9), ("wilson", "binomial"), repeats=2, n_jobs=1, cycles=80)
+    keys = ["recipe", "interval", "alpha", "lower_bound", "seed"]
+    assert len(table) == 16
+    assert len(table.drop_duplicates(keys)) == 16
+    assert set(table["seed"]) == {0, 1}
+    row = table.query("interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9 and seed == 1").iloc[0]
+    alone = replay(data, RECIPE, seed=1, cycles=80).summary()
+    assert {k: row[k] for k in ("certain", "accepted", "rejected")} == {
+        k: alone[k] for k in ("certain", "accepted", "rejected")
+    }
+
+
+def test_a_grid_keeps_a_recipes_guarantee_and_stops(data: Dataset) -> None:
+    table = run_grid(data, [RECIPE, KNOWN], (0.1,), (0.9,), repeats=1, n_jobs=1, cycles=60)
+    assert table["guarantee"].tolist() == ["local", "pooled"]
+    assert table["stops"].tolist() == ["some", "all"]
+
+
+def test_parallel_replays_equal_serial_ones(data: Dataset) -> None:
+    serial = run_replays(data, [RECIPE], (0, 1), cycles=80)
+    for one, other in zip(serial, run_replays(data, [RECIPE], (0, 1), cycles=80, n_jobs=2), strict=True):
+        same(one, other)
+
+
+# ------------------------------------------------------------------------------------------------------ the cell
+
+
+def test_a_replay_cell_plays_its_order_and_says_when_all_is_played(data: Dataset) -> None:
+    cell = ReplayCell(data, np.array([5, 3]))
+    np.testing.assert_array_equal(cell.insert(), data.X[5])
+    assert cell.verify() == bool(data.y[5])
+    np.testing.assert_array_equal(cell.insert(), data.X[3])
+    with pytest.raises(IndexError, match="has 2 cycles, and all were played"):
+        cell.insert()
+
+
+@pytest.mark.parametrize(
+    ("label", "confirm", "outcome"),
+    [
+        (0, False, Outcome.STOPPED),
+        (0, True, Outcome.STOPPED),
+        (1, False, Outcome.UNKNOWN),
+        (1, True, Outcome.CONFIRMED),
+    ],
+)
+def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(label, confirm, outcome, data) -> None:
+    cell = ReplayCell(data, np.flatnonzero(data.y == label), confirm)
+    cell.insert()
+    assert cell.proceed() is outcome
+
+
+def test_a_pair_of_arrays_replays_as_a_dataset_does(data: Dataset, played: Replay) -> None:
+    np.testing.assert_array_equal(replay((data.X, data.y), RECIPE, seed=1).action, played.action)
+    with pytest.raises(DataError, match="neither"):
+        replay("no-such-set", RECIPE)
+
+
+def test_the_actions_are_the_three_words(played: Replay) -> None:
+    assert set(played.action) <= {str(a) for a in Action}

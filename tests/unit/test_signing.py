@@ -1,0 +1,134 @@
+"""Keys and signatures: made once, checked before a file is run, never half replaced."""
+
+import hashlib
+import hmac
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import dengine.export.torchscript
+from dengine import Dataset, ModelPrediction, TraceSpec, export_torchscript, load_exported
+from dengine.cli.export import make_key as make_key_verb
+from dengine.errors import ExportError
+from dengine.export import make_key, read_metadata
+from dengine.export.bundle import write_checked, write_export
+from dengine.files import Kind
+
+ANY = Kind("file of a test", lambda file: True)
+
+
+@pytest.fixture(scope="module")
+def model(make_data: Callable[..., Dataset]) -> ModelPrediction:
+    data = make_data(60, 40)
+    return ModelPrediction("pca").fit(data.X, data.y)
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    return make_key(tmp_path / "cell.key")
+
+
+def test_a_key_is_new_secret_and_never_replaced(key: Path, tmp_path: Path) -> None:
+    assert key.stat().st_mode & 0o777 == 0o600
+    assert len(bytes.fromhex(key.read_text().strip())) == 32
+    assert make_key(tmp_path / "other.key").read_text() != key.read_text()
+    kept = key.read_text()
+    with pytest.raises(ExportError, match="is there already"):
+        make_key(key)
+    (tmp_path / "link.key").symlink_to(tmp_path / "planted")
+    with pytest.raises(ExportError, match="is there already"):
+        make_key(tmp_path / "link.key")
+    done = CliRunner().invoke(make_key_verb, [str(tmp_path / "nowhere" / "cell.key")])
+    assert isinstance(done.exception, ExportError)
+    assert key.read_text() == kept
+    assert not (tmp_path / "planted").exists()
+
+
+def test_the_signature_is_that_of_the_standard(model: ModelPrediction, key: Path, tmp_path: Path) -> None:
+    file = export_torchscript(model, tmp_path / "model.ts", key=key)
+    expected = hmac.new(key.read_text().strip().encode(), file.read_bytes(), hashlib.sha256).hexdigest()
+    assert (tmp_path / "model.ts.sig").read_text() == f"hmac-sha256:{expected}  model.ts\n"
+    assert load_exported(file, key=key).trace == TraceSpec(40)
+    again = load_exported(file, key=key).save(tmp_path / "saved.ts", key=key)
+    assert read_metadata(again, key=key)["references"] == 60
+
+
+@pytest.mark.parametrize("kind", ["unsigned", "another key", "changed", "a short key", "no key", "not text"])
+def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(
+    model: ModelPrediction, key: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = export_torchscript(model, tmp_path / "model.ts", key=key)
+    if kind == "unsigned":
+        file.with_name("model.ts.sig").unlink()
+    elif kind == "another key":
+        key = make_key(tmp_path / "other.key")
+    elif kind == "changed":  # by someone who mends the sum
+        content = bytearray(file.read_bytes())
+        content[100] ^= 1
+        file.write_bytes(content)
+        file.with_name("model.ts.sha256").write_text(f"{hashlib.sha256(content).hexdigest()}  model.ts\n")
+    elif kind == "a short key":
+        key.write_text("secret\n")
+    elif kind == "no key":
+        key.unlink()
+    else:
+        file.with_name("model.ts.sig").write_bytes(b"\xff\xfe")
+    loads: list[object] = []
+    monkeypatch.setattr(dengine.export.torchscript.torch.jit, "load", loads.append)
+    with pytest.raises(ExportError, match=r"(?i)signature|key"):
+        load_exported(file, key=key)
+    assert loads == []
+
+
+def test_a_file_that_is_replaced_has_a_signature_that_fits_at_every_moment(key: Path, tmp_path: Path) -> None:
+    file, signatures = tmp_path / "model.ts", tmp_path / "model.ts.sig"
+    write_export(file, b"one", ANY, key=key)
+    one = signatures.read_text()
+    write_export(file, b"two", ANY, key=key)
+    assert signatures.read_text() != one
+
+    class KilledError(Exception):
+        """As if the process ended when the new signature was there and the new file was not."""
+
+    def killed(kind: str, text: str) -> None:
+        raise KilledError
+
+    from dengine.model.base import Exportable
+
+    both = signatures.read_text()
+    with pytest.raises(KilledError):
+        write_export(file, b"three", ANY, key=key, source=Exportable(None, TraceSpec(40), note=killed))
+    assert file.read_bytes() == b"two"
+    assert both in signatures.read_text()
+    assert signatures.read_text().count("\n") == 2
+    write_export(file, b"four", ANY)
+    assert not signatures.exists()  # it was of the file that was replaced
+
+
+def test_a_signature_of_another_tool_is_not_replaced(key: Path, tmp_path: Path) -> None:
+    own = tmp_path / "model.ts.sig"
+    own.write_text("-----BEGIN PGP SIGNATURE-----\n")
+    with pytest.raises(ExportError, match="is no signature of dengine's"):
+        write_export(tmp_path / "model.ts", b"one", ANY, key=key)
+    assert own.read_text().startswith("-----BEGIN")
+    assert not (tmp_path / "model.ts").exists()
+
+
+def test_either_of_two_sums_is_accepted_while_a_file_is_replaced(model: ModelPrediction, tmp_path: Path) -> None:
+    file = export_torchscript(model, tmp_path / "model.ts")
+    total = tmp_path / "model.ts.sha256"
+    line = total.read_text()
+    other = write_checked(tmp_path / "other", b"other", ANY)
+    wrong = f"{hashlib.sha256(other.read_bytes()).hexdigest()}  model.ts\n"
+    for text in (line + wrong, wrong + line, line.split()[0], line.replace("  ", " *"), line.replace("model.ts", "old.ts")):
+        total.write_text(text)
+        assert read_metadata(file)["references"] == 60
+    for text in (wrong, wrong + line.replace("model.ts", "other.ts"), wrong + wrong):
+        total.write_text(text)
+        with pytest.raises(ExportError, match="is damaged or truncated"):
+            read_metadata(file)
+    total.write_text(line.replace("model.ts", "one.ts") + line.replace("model.ts", "two.ts"))
+    with pytest.raises(ExportError, match="holds no SHA-256 sum of"):
+        read_metadata(file)

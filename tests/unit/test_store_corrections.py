@@ -1,0 +1,262 @@
+"""One contract over every store: a correction is a later row, and the newest one of a decision counts."""
+
+import os
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dengine.errors import ReportError, StoreError
+from dengine.records import Action, Decision, Reason, RetrainReport, Source
+from dengine.store import Change, MemoryStore, NewLabel, SqlStore, Store
+from dengine.store import queries as ask
+from dengine.store.queries import Scope
+
+C, T = 1, 30
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+DATABASES = [
+    "sqlite",
+    pytest.param(
+        "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
+    ),
+]
+
+
+def url_of(kind: str, directory: Path) -> str:
+    return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
+
+
+@pytest.fixture(params=["memory", *DATABASES])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
+    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=DATABASES)
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+    """A URL and a cell of its own, to open again and again."""
+    return url_of(request.param, tmp_path), uuid.uuid4().hex
+
+
+def trace(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(C, T)).astype(np.float32)
+
+
+def put(store: Store, name: str, seed: int = 0, content_hash: int = 7) -> None:
+    made = Decision(name, Action.VERIFY, Action.VERIFY, 0.2, 1.0, 1, 0, None, 0, Reason.UNCERTAIN, False, 1.0)
+    store.put_decision(made, trace(seed), content_hash, False)
+
+
+def label(name: str, success: bool = True) -> NewLabel:
+    return NewLabel(name, success, Source.VERIFICATION, 0, None)
+
+
+def fill(store: Store, n: int = 5) -> None:
+    """Decisions "0", "1", ... with the labels True, False, True, ..."""
+    for i in range(n):
+        put(store, str(i), seed=i, content_hash=100 + i)
+        store.put_labels([label(str(i), i % 2 == 0)])
+
+
+def correct(store: Store, success: bool | None, *names: str, author: str = "kim") -> int:
+    kind = "forget" if success is None else "correct"
+    return store.record(Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success))
+
+
+# ------------------------------------------------------------------------------------------------------- corrections
+
+
+def test_the_newest_correction_of_a_decision_counts_and_the_label_stays_where_it_was(store: Store) -> None:
+    fill(store)
+    correct(store, False, "0")
+    correct(store, True, "1", "0")
+    correct(store, False, "2")
+    found = store.labelled()
+    assert (found.seq.tolist(), found.labels.tolist()) == ([1, 2, 3, 4, 5], [1, 1, 0, 0, 1])
+    assert [store.get_decision(name).success for name in "0123"] == [True, True, False, False]
+    assert store.evidence_since(0).success.tolist() == [True, True, False, False, True]
+
+
+def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: Store) -> None:
+    fill(store)
+    correct(store, None, "1", "3")
+    found = store.labelled()
+    assert (found.seq.tolist(), found.labels.tolist(), found.hashes.tolist()) == ([1, 3, 5], [1, 1, 1], [100, 102, 104])
+    np.testing.assert_array_equal(found.traces, np.stack([trace(i) for i in (0, 2, 4)]))
+    assert store.labelled(2).seq.tolist() == [3, 5]
+    assert store.evidence_since(0).seq.tolist() == [1, 3, 5]
+    held = store.get_decision("1")
+    assert (held.success, held.source, held.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
+    assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (3, 2, 0)
+    with pytest.raises(ReportError, match="'1'"):
+        store.put_labels([label("1")])
+
+
+def test_what_was_forgotten_can_be_corrected_again(store: Store) -> None:
+    fill(store)
+    correct(store, None, "1")
+    correct(store, True, "1")
+    assert store.labelled().labels.tolist() == [1, 1, 1, 0, 1]
+    assert (store.status()["forgotten"], store.status()["corrected"]) == (0, 1)
+
+
+def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(store: Store) -> None:
+    fill(store)
+    correct(store, False, "0")
+    correct(store, None, "0", "2")
+    assert store.labelled(corrected_to=0).labels.tolist() == [1, 0, 1, 0, 1]
+    assert store.labelled(corrected_to=1).labels.tolist() == [0, 0, 1, 0, 1]
+    assert store.labelled(corrected_to=2).seq.tolist() == [2, 3, 4, 5]
+    assert store.labelled(first=2, last=4).seq.tolist() == [2, 4]
+    assert store.labelled(1, first=2, last=4, corrected_to=0).seq.tolist() == [4]
+
+
+def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: Store) -> None:
+    fill(store, 3)
+    store.put_event("note", "before")
+    assert correct(store, False, "2", "0", author="kim") == 2
+    put(store, "late")
+    store.put_labels([label("late")])
+    assert correct(store, None, "late", author="") == 3
+    found = store.corrections()
+    assert [(c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in found] == [
+        (1, "2", False, "kim", 2, 3, 3),
+        (2, "0", False, "kim", 2, 3, 1),
+        (3, "late", None, "", 3, 4, 4),
+    ]
+    assert [c.number for c in store.corrections(2)] == [3]
+    correct(store, False, "late")
+    assert [c.was for c in store.corrections()] == [True, True, True, None]
+    event = store.events()[1]
+    assert (event.kind, event.data, event.author) == ("correct", {"names": ["2", "0"]}, "kim")
+    assert (store.events()[0].data, store.events()[0].author) == (None, "")
+
+
+@pytest.mark.parametrize(("name", "said"), [("nobody", "does not hold"), ("open", "report its label")])
+def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(
+    store: Store, name: str, said: str
+) -> None:
+    fill(store, 2)
+    put(store, "open")
+    store.save_settings({"a": "1"})
+    with pytest.raises(ReportError, match=said):
+        store.record(Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"}))
+    assert (store.events(), store.corrections(), store.settings()) == ([], [], {"a": "1"})
+    assert store.labelled().labels.tolist() == [1, 0]
+
+
+def test_an_event_a_version_and_settings_are_kept_together(store: Store) -> None:
+    report = RetrainReport(1, 0.0, 2, 0, True, "rolled back")
+    store.record(Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"}))
+    assert (store.retrains(), store.settings(), store.last_version().last_seq) == ([report], {"b": "2"}, 7)
+
+
+def test_an_events_data_that_json_has_not_is_refused(store: Store) -> None:
+    with pytest.raises(StoreError, match="as JSON has it"):
+        store.put_event("note", "", {"x": float("nan")})
+    assert store.events() == []
+
+
+def test_a_version_is_loaded_by_its_number_and_another_names_those_that_are_kept(store: Store) -> None:
+    with pytest.raises(StoreError, match="load one of these: none"):
+        store.load_version(1)
+    for number in (1, 2, 3):
+        report = RetrainReport(number, 0.1, 10, 1, number != 3, "")
+        store.put_version(report, number, {"w": np.full(2, number)} if number != 3 else None)
+    assert (store.load_version(1).last_seq, store.load_version(1).state["w"].tolist()) == (1, [1, 1])
+    with pytest.raises(StoreError, match="got 3, which is not kept; load one of these: 1, 2"):
+        store.load_version(3)
+
+
+def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(store: Store) -> None:
+    kinds = [
+        (Action.ACCEPT, Action.ACCEPT, False),
+        (Action.VERIFY, Action.ACCEPT, True),
+        (Action.VERIFY, Action.REJECT, True),
+    ]
+    for i, (action, predicted, audit) in enumerate(kinds * 2):
+        made = Decision(str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1)
+        store.put_decision(made, trace(i), i, False)
+        store.put_labels([NewLabel(str(i), True, Source.AUDIT, 0, None)])
+    correct(store, False, "0", "1", "2")
+    correct(store, None, "3", "4", "5")
+    o = store.outcomes()
+    assert (o.accepted, o.stops, o.confirmed, o.forgotten_accepts) == (2, 1, 0, 1)
+    assert (o.audited_accepts, o.audited_accepts_bad, o.forgotten_audited_accepts) == (1, 1, 1)
+    assert (o.audited_rejects, o.audited_rejects_good, o.forgotten_audited_rejects) == (1, 0, 1)
+    later = store.outcomes(since_version=1)
+    assert (later.accepted, later.stops, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
+
+
+def test_what_an_earlier_version_decided_can_be_left_out(store: Store) -> None:
+    for version in (1, 2):
+        for i in range(3):
+            name = f"{version}-{i}"
+            accept = Decision(name, Action.ACCEPT, Action.ACCEPT, 0.9, 1.0, 9, 0, None, version, Reason.CERTAIN, False, 0.1)
+            store.put_decision(accept, trace(i), i, False)
+        store.put_labels([NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version)])
+    assert store.unreported_accepts(2) == ["2-1", "2-2"]
+    assert (store.silent_total(2), store.silent_total()) == (2, 3)
+    assert (store.evidence_since(0, 2).seq.tolist(), len(store.evidence_since(0).seq)) == ([2], 2)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(said=st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
+def test_any_corrections_leave_what_plain_python_would(store: Store, said: list[tuple[int, bool | None]]) -> None:
+    run = uuid.uuid4().hex[:8]
+    begin = store.status()["labels"] + store.status()["forgotten"]
+    before = len(store.corrections())
+    for i in range(6):
+        put(store, f"{run}-{i}")
+        store.put_labels([label(f"{run}-{i}", i % 2 == 0)])
+    now: dict[int, bool | None] = {i: i % 2 == 0 for i in range(6)}
+    for i, success in said:
+        correct(store, success, f"{run}-{i}")
+        now[i] = success
+    kept = {begin + 1 + i: success for i, success in now.items() if success is not None}
+    found = store.labelled(first=begin + 1)
+    assert dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True)) == kept
+    as_reported = store.labelled(first=begin + 1, corrected_to=before)
+    assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]
+
+
+# ---------------------------------------------------------------------------------------------------------- databases
+
+
+def test_corrections_survive_closing_and_belong_to_their_cell(place: tuple[str, str]) -> None:
+    with SqlStore(*place) as store:
+        fill(store)
+        correct(store, None, "0")
+    with SqlStore(*place) as store, SqlStore(place[0], uuid.uuid4().hex) as other:
+        assert store.labelled().seq.tolist() == [2, 3, 4, 5]
+        assert (other.corrections(), other.labelled().seq.tolist()) == ([], [])
+
+
+def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(tmp_path: Path) -> None:
+    with SqlStore(url_of("sqlite", tmp_path), "cell") as store:
+        fill(store)
+        correct(store, None, "0")
+        with store._database.transaction(write=False) as connection:
+            text = str(
+                ask.newest_query(Scope("cell"), 3).compile(connection.engine, compile_kwargs={"literal_binds": True})
+            )
+            plan = " | ".join(row.detail for row in connection.execute(sa.text(f"EXPLAIN QUERY PLAN {text}")))
+    assert "USING INDEX label_training" in plan
+    assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan
+    assert "SCAN" not in plan
+    assert "TEMP B-TREE" not in plan
+
+
+def test_a_store_in_memory_keeps_the_first_version_and_the_newest_ones() -> None:
+    store = MemoryStore()
+    for number in range(1, 9):
+        store.put_version(RetrainReport(number, 0.1, 10, 1, True, ""), number, {"w": np.ones(T)})
+    with pytest.raises(StoreError, match="load one of these: 1, 4, 5, 6, 7, 8"):
+        store.load_version(2)

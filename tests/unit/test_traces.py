@@ -1,0 +1,361 @@
+"""Where a trace enters: shapes and types are the caller's, faults are the world's."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dengine import (
+    Action,
+    DataEngine,
+    Dataset,
+    DengineError,
+    Reason,
+    TraceError,
+    TraceSpec,
+    export_torchscript,
+    load_exported,
+)
+from dengine.datasets.importing import read_journal
+from dengine.decision.rule import script
+from dengine.records import FITS
+from dengine.traces import REASONS, TraceGate, as_trace, as_traces, fits, fitted, spec_of
+
+LENGTHS, CHANNELS = (152, 800, 1000), (1, 2, 3, 6)
+
+
+def ramp(samples: int = 100, channels: int = 1) -> np.ndarray:
+    return np.tile(np.linspace(0, 20, samples, dtype=np.float32), (channels, 1))
+
+
+def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False) -> Reason:
+    gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0], limit=limit))
+    return REASONS[(script(gate) if compiled else gate)(torch.from_numpy(x))[0]]
+
+
+# --------------------------------------------------------------------------------------------- shapes and types
+
+
+@pytest.mark.parametrize("samples", LENGTHS)
+@pytest.mark.parametrize("channels", CHANNELS)
+def test_any_length_and_number_of_channels_becomes_channels_by_samples(samples: int, channels: int) -> None:
+    x = ramp(samples, channels)
+    spec = TraceSpec(samples=samples, channels=channels)
+    assert as_trace(x, None).shape == as_trace(x, spec).shape == (channels, samples)
+    assert spec_of(as_trace(x, None)) == spec
+    assert as_traces(np.stack([x, x, x]), spec).shape == (3, channels, samples)
+
+
+def test_a_flat_trace_is_one_channel() -> None:
+    np.testing.assert_array_equal(as_trace(ramp()[0], None), ramp())
+    np.testing.assert_array_equal(as_traces(ramp(channels=4), None), ramp(channels=4)[:, None, :])
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
+def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
+    x = np.arange(100).astype(dtype)
+    got = as_trace(x, None)
+    assert got.dtype == np.float32
+    assert got.flags.c_contiguous
+    np.testing.assert_array_equal(got[0], x.astype(np.float32))
+
+
+def test_lists_and_strided_views_are_traces_too() -> None:
+    x = ramp(200)
+    np.testing.assert_array_equal(as_trace(x[0].tolist(), None), x)
+    np.testing.assert_array_equal(as_trace(x[0, ::-2], None)[0], x[0, ::-2])
+
+
+def test_a_float64_beyond_float32_becomes_an_infinity_that_the_gate_finds() -> None:
+    x = ramp(10).astype(np.float64)
+    x[0, 3] = 1e300
+    assert reason_of(as_trace(x, None)) is Reason.NOT_FINITE
+
+
+@pytest.mark.parametrize("bad", [np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5))])
+def test_what_is_not_one_trace_says_what_was_expected_and_what_came(bad) -> None:
+    with pytest.raises(TraceError, match=r"Expected one trace, \(samples,\) or \(channels, samples\), got shape"):
+        as_trace(bad, None)
+
+
+@pytest.mark.parametrize("bad", [np.zeros(5), np.zeros((2, 0)), np.zeros((1, 2, 3, 4))])
+def test_what_is_not_a_block_of_traces_says_so(bad) -> None:
+    with pytest.raises(TraceError, match=r"Expected traces \(n, samples\)"):
+        as_traces(bad)
+
+
+@pytest.mark.parametrize("bad", [np.array(["a", "b"]), np.array([1 + 2j]), np.array([None, 1]), "force"])
+def test_what_is_not_real_numbers_names_its_dtype(bad) -> None:
+    with pytest.raises(TraceError, match="Expected real numbers, got dtype"):
+        as_trace(bad, None)
+
+
+def test_a_wrong_length_says_what_was_expected_what_came_and_what_to_do() -> None:
+    with pytest.raises(TraceError, match=r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s\.$"):
+        as_trace(np.ones(998), TraceSpec(samples=1000))
+
+
+def test_a_wrong_number_of_channels_says_what_was_expected_what_came_and_what_to_do() -> None:
+    with pytest.raises(TraceError, match=r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"):
+        as_trace(np.ones(100), TraceSpec(samples=100, channels=6))
+
+
+# -------------------------------------------------------------------------------------------------- the world
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("where", [0, 57, 99])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_one_sample_that_is_not_finite_is_found_anywhere(value, where, channels, compiled) -> None:
+    x = ramp(100, channels)
+    x[-1, where] = value
+    assert reason_of(x, compiled=compiled) is Reason.NOT_FINITE
+
+
+@pytest.mark.parametrize("level", [0.0, -3.5, 25.0])
+@pytest.mark.parametrize("channels", [1, 2])
+def test_a_trace_constant_as_a_whole_is_a_dead_sensor(level: float, channels: int) -> None:
+    assert reason_of(np.full((channels, 50), level, dtype=np.float32)) is Reason.CONSTANT
+
+
+def test_a_plateau_is_no_fault_and_neither_is_one_quiet_channel() -> None:
+    plateau = ramp(100)
+    plateau[0, 40:] = plateau[0, 40]
+    quiet = ramp(100, 2)
+    quiet[1] = 0.0
+    assert reason_of(plateau) is Reason.CERTAIN
+    assert reason_of(quiet) is Reason.CERTAIN
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_sample_at_the_sensors_range_saturates_on_either_side(sign: float) -> None:
+    x = sign * ramp(100)  # reaches 20
+    assert reason_of(x, limit=20.0) is Reason.SATURATED
+    assert reason_of(x, limit=20.5) is Reason.CERTAIN
+    assert reason_of(x) is Reason.CERTAIN
+
+
+# ------------------------------------------------------------------------------------------------------ other lengths
+
+SAMPLES = 100
+
+
+def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
+    x = ramp(160)[0]
+    np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="cut"))[0], x[:SAMPLES])
+    np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="pad"))[0], x[:SAMPLES])
+    padded = as_trace(x[:60], TraceSpec(SAMPLES, fit="pad"))[0]
+    np.testing.assert_array_equal(padded[:60], x[:60])
+    assert (padded[60:] == x[59]).all()
+
+
+@given(have=st.integers(50, 200), channels=st.integers(1, 3), seed=st.integers(0, 99))
+@settings(max_examples=60, deadline=None)
+def test_resample_is_linear_interpolation_over_the_whole(have: int, channels: int, seed: int) -> None:
+    x = np.random.default_rng(seed).normal(size=(channels, have)).astype(np.float32)
+    got = as_trace(x, TraceSpec(SAMPLES, channels=channels, fit="resample"))
+    grid = np.linspace(0, have - 1, SAMPLES)
+    expected = np.stack([np.interp(grid, np.arange(have), row.astype(np.float64)) for row in x])
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    np.testing.assert_array_equal(got[:, 0], x[:, 0])
+
+
+@given(have=st.integers(1, 500), samples=st.integers(1, 120), fit=st.integers(1, 3), seed=st.integers(0, 99))
+@settings(max_examples=150, deadline=None)
+def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(
+    have: int, samples: int, fit: int, seed: int
+) -> None:
+    x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
+    got = fitted(x, samples, fit)
+    assert got.shape == (2, samples)
+    assert bool(got.isfinite().all()) == fits(have, samples, fit)
+    honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
+    assert fits(have, samples, fit) == honest
+    if not honest:  # it keeps what there is
+        kept = min(have, samples - 1)
+        assert torch.equal(got[:, :kept], x[:, :kept])
+        assert got[:, kept:].isnan().all()
+
+
+@pytest.mark.parametrize("fit", FITS[1:])
+@pytest.mark.parametrize("bad", [np.zeros(0), np.zeros((1, 0)), np.ones((2, 90)), np.ones((90, 1))])
+def test_an_empty_trace_or_a_wrong_number_of_channels_is_never_fitted(fit: str, bad: np.ndarray) -> None:
+    with pytest.raises(TraceError, match="Expected"):
+        as_trace(bad, TraceSpec(SAMPLES, fit=fit))
+
+
+def other_lengths(data: Dataset) -> list[np.ndarray]:
+    """Traces of 1 to 420 samples: cut, held, stretched, and some with faults of their own."""
+    rng = np.random.default_rng(4)
+    out = []
+    for i, x in enumerate(data.X):
+        n = (98, 100, 103, 60, 150, 199, 200, 50, 49, 201, 1, 2, 420)[i % 13]
+        y = np.interp(np.linspace(0, len(x) - 1, n), np.arange(len(x)), x) + rng.normal(0, 0.1, n)
+        y[: i % 20 == 19] = np.nan
+        out.append(y.astype(np.float32))
+    return out
+
+
+@pytest.fixture(scope="module", params=FITS[1:])
+def live(request: pytest.FixtureRequest, make_data, tmp_path_factory) -> tuple[DataEngine, Path, list[np.ndarray]]:
+    data = make_data(300, samples=SAMPLES)
+    engine = DataEngine("pca", trace=TraceSpec(SAMPLES, fit=request.param), retrain_every=10**6)
+    for x, y in zip(data.X, data.y, strict=True):
+        engine.report(engine.decide(x).id, bool(y))
+    engine.retrain()
+    path = export_torchscript(engine, tmp_path_factory.mktemp("fit") / f"{request.param}.ts")
+    return engine, path, other_lengths(make_data(130, samples=SAMPLES, seed=7))
+
+
+def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(live) -> None:
+    engine, path, traces = live
+    exported, decided = load_exported(path), []
+    assert exported.trace == engine.trace
+    for x in traces:
+        ours, theirs = engine.decide(x), exported.decide(x)
+        raw = exported.module.decide(torch.from_numpy(x))  # the compiled fit, as a cell program calls it
+        for name in ("action", "reason", "lower", "upper", "n_success", "n_failure"):
+            assert getattr(ours, name) == getattr(theirs, name)
+        assert (raw[2], raw[3], raw[4], raw[5]) == (ours.lower, ours.upper, ours.n_success, ours.n_failure)
+        if ours.embedding is not None:
+            np.testing.assert_array_equal(np.array(ours.embedding, dtype=np.float32), theirs.embedding)
+            np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
+        decided.append((x, ours))
+    fit = FITS.index(engine.trace.fit)
+    for x, one in decided:
+        lost = not fits(len(x), SAMPLES, fit) or np.isnan(x[:SAMPLES]).any()
+        assert (one.reason is Reason.NOT_FINITE) == lost
+    assert {one.action for _, one in decided} >= {Action.VERIFY, Action.ACCEPT}
+
+
+def test_a_trace_that_cannot_be_fitted_is_verified_kept_and_never_learned_from(live) -> None:
+    engine, _, _ = live
+    labels = engine.new_labels
+    decision = engine.decide(np.linspace(0, 9, 30))
+    assert (decision.action, decision.reason) == (Action.VERIFY, Reason.NOT_FINITE)
+    engine.report(decision.id, True)
+    kept = engine.store.get_decision(decision.id)
+    assert kept.quarantined
+    np.testing.assert_array_equal(kept.trace[0, :30], np.linspace(0, 9, 30, dtype=np.float32))
+    assert engine.new_labels == labels
+    assert engine.decide(np.linspace(0, 9, SAMPLES)).reason is not Reason.NOT_FINITE
+
+
+def test_what_the_file_learns_of_another_length_is_what_it_learns_of_the_fitted_one(live) -> None:
+    engine, path, traces = live
+    raw, ready = load_exported(path), load_exported(path)
+    for i, x in enumerate(traces[:40]):
+        assert raw.learn(x, i % 3 > 0) == ready.learn(as_trace(x, engine.trace), i % 3 > 0)
+    for x in traces[40:80]:
+        assert raw.decide(x)[:6] == ready.decide(as_trace(x, engine.trace))[:6]
+
+
+def test_a_journal_of_traces_of_other_lengths_is_read_as_the_engine_would(tmp_path: Path) -> None:
+    x = ramp(97, 2)
+    path, spec = tmp_path / "cell.csv", TraceSpec(SAMPLES, channels=2, fit="pad")
+    path.write_text("1," + ",".join(f"{value:.9g}" for value in x.ravel()) + "\n")
+    np.testing.assert_array_equal(read_journal(path, spec).lines[0].trace, as_trace(x, spec))
+    for bad in (TraceSpec(SAMPLES, channels=2), TraceSpec(SAMPLES, channels=3, fit="pad")):
+        with pytest.raises(DengineError, match="Expected"):
+            read_journal(path, bad)
+
+
+# --------------------------------------------------------------------------------------------------------- the contract
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": 0}, "at least 1 sample"),
+        ({"samples": 10, "channels": 0}, "at least 1 sample"),
+        ({"samples": 10, "rate_hz": 0.0}, "rate above 0"),
+        ({"samples": 10, "fit": "stretch"}, "Expected fit to be one of strict, cut, pad, resample"),
+        ({"samples": 10, "columns": ("a", "b")}, "Expected 1 different columns"),
+        ({"samples": 10, "channels": 2, "columns": ("a", "a")}, "Expected 2 different columns"),
+    ],
+)
+def test_a_contract_that_no_trace_can_keep_is_refused(settings: dict, message: str) -> None:
+    with pytest.raises(DengineError, match=message):
+        TraceSpec(**settings)
+
+
+def test_a_contract_comes_back_from_json_and_from_what_an_earlier_version_wrote() -> None:
+    spec = TraceSpec(10, channels=2, fit="pad", columns=("a", "b"))
+    assert TraceSpec(**json.loads(json.dumps(asdict(spec)))) == spec
+    old = {"samples": 10, "rate_hz": 500.0, "channels": 2, "unit": "N", "limit": None}
+    assert TraceSpec(**old) == TraceSpec(10, channels=2)
+
+
+# --------------------------------------------------------------------------------------------------------- DataFrames
+
+
+def recording(samples: int = 60) -> pd.DataFrame:
+    x = ramp(samples, 3) * np.array([[1.0], [2.0], [3.0]], dtype=np.float32)
+    return pd.DataFrame({"Timestamp": np.arange(samples) / 500, "FX": x[0], "FY": x[1], "FZ": x[2]})
+
+
+def test_a_dataframe_has_samples_in_rows_and_channels_in_columns() -> None:
+    frame = recording()
+    got = as_trace(frame, None)
+    np.testing.assert_array_equal(got, frame[["FX", "FY", "FZ"]].to_numpy(dtype=np.float32).T)
+    assert spec_of(got, frame) == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
+    np.testing.assert_array_equal(as_trace(frame, TraceSpec(60, channels=3)), got)
+    np.testing.assert_array_equal(as_trace(frame["FZ"], None), got[2:])
+
+
+def test_named_columns_are_picked_whatever_their_order() -> None:
+    spec = TraceSpec(60, channels=2, columns=("FZ", "FX"))
+    expected = recording()[["FZ", "FX"]].to_numpy(dtype=np.float32).T
+    np.testing.assert_array_equal(as_trace(recording()[["FX", "FY", "Timestamp", "FZ"]], spec), expected)
+    with pytest.raises(TraceError, match="Expected the columns FZ, FX, got Timestamp, FX, FY"):
+        as_trace(recording().drop(columns="FZ"), spec)
+
+
+def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
+    with pytest.raises(
+        TraceError, match=r"Expected a DataFrame with 2 channel\(s\).*got the columns Timestamp, FX, FY, FZ"
+    ):
+        as_trace(recording(), TraceSpec(60, channels=2))
+    dated = recording().rename(columns={"Timestamp": "When"}).assign(When=pd.Timestamp("2026-01-01"))
+    assert as_trace(dated, None).shape == (3, 60)
+    with pytest.raises(TraceError, match="at least one channel"):
+        as_trace(recording()[["Timestamp"]], None)
+
+
+def test_an_engine_takes_recordings_as_they_are_and_keeps_to_the_firsts_columns() -> None:
+    with DataEngine("pca") as engine:
+        engine.decide(recording())
+        assert engine.trace == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
+        engine.decide(recording()[["FZ", "FY", "FX"]])
+        with pytest.raises(TraceError, match="Expected 60 samples, got 58"):
+            engine.decide(recording(58))
+
+
+def test_a_first_array_with_more_channels_than_samples_looks_transposed() -> None:
+    with pytest.raises(TraceError, match=r"got 1000 channels of 2 samples, which looks transposed; pass trace\.T"):
+        DataEngine("pca").decide(np.ones((1000, 2)))
+    with pytest.raises(TraceError, match=r"looks transposed: pass trace\.T"):
+        as_trace(np.ones((1000, 2)), TraceSpec(1000, channels=2))
+    assert as_trace(np.ones((5, 2)), TraceSpec(2, channels=5)).shape == (5, 2)
+
+
+def test_traces_need_no_pandas() -> None:
+    source = Path(as_trace.__code__.co_filename).read_text(encoding="utf-8")
+    assert "import pandas" not in source
+
+
+def test_a_first_dataframe_with_a_row_a_trace_is_refused_and_not_taken_for_many_channels() -> None:
+    wide = pd.DataFrame(np.random.default_rng(0).normal(size=(2, 1000)))
+    with DataEngine("pca") as engine:
+        with pytest.raises(TraceError, match="got 2 rows of 1000 columns; pass one row, as a Series"):
+            engine.decide(wide)
+        assert engine.trace is None
+        engine.decide(wide.iloc[0])
+        assert (engine.trace.channels, engine.trace.samples) == (1, 1000)

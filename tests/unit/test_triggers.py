@@ -1,0 +1,110 @@
+"""When an insertion begins, and where its samples go: the same for a live stream and a file."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dengine.datasets.cutting import Start, StartFinder, gaps_of, place
+from dengine.datasets.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger, Trigger, as_trigger
+from dengine.errors import SettingError
+
+STEP = 0.002
+BITS = "actual_digital_output_bits"
+
+
+@pytest.mark.parametrize(
+    ("trigger", "signals", "on"),
+    [
+        (BitTrigger(2), {BITS: [0, 4, 3, 7]}, [0, 1, 0, 1]),
+        (BitTrigger(17), {BITS: [0, 2**17, np.nan]}, [0, 1, 0]),
+        (RegisterTrigger("r"), {"r": [0, 3, -1, np.nan]}, [0, 1, 1, 0]),
+        (RegisterTrigger("r", 3), {"r": [0, 3, -1]}, [0, 1, 0]),
+        (ContactTrigger(5.0), {"FZ_Base": [4.9, 5.0, -5.0, np.nan]}, [0, 1, 1, 0]),
+        (MotionTrigger(0.1), {f"actual_TCP_speed[{i}]": [0.0, 0.06, 0.08] for i in range(3)}, [0, 1, 1]),
+    ],
+    ids=lambda each: type(each).__name__ if isinstance(each, Trigger) else None,
+)
+def test_a_trigger_is_on_where_its_signals_say_so(trigger: Trigger, signals: dict, on: list) -> None:
+    assert set(trigger.signals) == set(signals)
+    seen = trigger.active({name: np.array(values, dtype=float) for name, values in signals.items()})
+    assert seen.tolist() == [bool(each) for each in on]
+
+
+@pytest.mark.parametrize(
+    ("text", "trigger"),
+    [
+        ("bit=0", BitTrigger(0)),
+        ("bit=3@output_bit_registers0_to_31", BitTrigger(3, "output_bit_registers0_to_31")),
+        ("register", RegisterTrigger()),
+        ("register@/phase", RegisterTrigger("/phase")),
+        ("register=2@output_int_register_30", RegisterTrigger("output_int_register_30", 2.0)),
+        ("contact=5", ContactTrigger(5.0)),
+        ("contact=7.5@FX_Base", ContactTrigger(7.5, "FX_Base")),
+        ("motion", MotionTrigger()),
+        ("motion=0.01", MotionTrigger(0.01)),
+    ],
+)
+def test_a_trigger_is_named_in_a_few_words(text: str, trigger: Trigger) -> None:
+    assert as_trigger(text) == trigger
+    assert as_trigger(trigger) is trigger
+
+
+@pytest.mark.parametrize(
+    "text", ["", "contact", "bit", "bit=-1", "bit=40", "contact=0", "nothing=3", "contact=x", "motion=0", 5]
+)
+def test_what_is_no_trigger_is_refused_with_examples(text: object) -> None:
+    with pytest.raises(SettingError, match="Expected a"):
+        as_trigger(text)
+
+
+def starts(active: str, quiet_s: float = 0.0) -> list[float]:
+    finder = StartFinder(STEP, quiet_s)
+    found = [finder.feed(i * STEP, each == "x") for i, each in enumerate(active)]
+    assert all(each.seen for each in found if each is not None)
+    return [round(each.time / STEP, 6) for each in found if each is not None]
+
+
+def test_an_insertion_begins_where_the_trigger_goes_on() -> None:
+    assert starts("..xx..xx") == [2, 6]
+
+
+def test_what_is_on_from_the_first_sample_is_no_start() -> None:
+    assert starts("xxx..x") == [5]
+
+
+def test_a_trigger_must_have_been_quiet_for_as_long_as_it_says() -> None:
+    assert starts("..x.x....x", quiet_s=4 * STEP) == [9]
+    assert starts("....x.x", quiet_s=4 * STEP) == [4]
+
+
+def test_a_start_in_a_gap_is_known_to_be_unseen() -> None:
+    finder = StartFinder(STEP)
+    for time in (0.0, STEP):
+        assert finder.feed(time, False) is None
+    assert finder.feed(6 * STEP, True) == Start(2 * STEP, seen=False)
+    assert finder.feed(7 * STEP, True) is None
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sets(st.integers(0, 39)), st.integers(0, 5), st.floats(-0.3, 0.3))
+def test_every_sample_is_in_its_place_and_every_gap_is_said(lost: set[int], before: int, jitter: float) -> None:
+    have = [i for i in range(40) if i not in lost]
+    values = np.array([[float(i), -float(i)] for i in have]).reshape(-1, 2)
+    placed = place([1000.0 + (i + jitter) * STEP for i in have], values, 1000.0 + before * STEP, 30, STEP)
+    expected = [np.nan if i in lost else float(i) for i in range(before, before + 30)]
+    np.testing.assert_array_equal(placed.trace[0], np.array(expected, dtype=np.float32))
+    np.testing.assert_array_equal(placed.trace[1], -np.array(expected, dtype=np.float32))
+    assert placed.missing == np.isnan(expected).sum() == sum(length for _, length in placed.gaps)
+    assert placed.repeated == 0
+
+
+def test_of_a_sample_that_comes_twice_the_first_counts() -> None:
+    placed = place([0.0, STEP, STEP, 2 * STEP], np.array([[1.0], [2.0], [9.0], [3.0]]), 0.0, 3, STEP)
+    assert placed.trace.tolist() == [[1.0, 2.0, 3.0]]
+    assert (placed.repeated, placed.missing) == (1, 0)
+
+
+def test_gaps_are_named_by_their_first_sample_and_length() -> None:
+    assert gaps_of(np.array([0, 1, 0, 0, 1, 0], dtype=bool)) == ((0, 1), (2, 2), (5, 1))
+    assert gaps_of(np.ones(3, dtype=bool)) == ()

@@ -1,0 +1,59 @@
+"""The window of the newest labelled traces: what was handed out stays as it was, whatever comes in afterwards."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dengine.engine.trainer import Window
+from dengine.store.records import Labelled
+
+
+def add(window: Window, *seqs: int) -> None:
+    for seq in seqs:
+        window.add(np.full((1, 3), float(seq), np.float32), seq % 2, 100 + seq, seq)
+
+
+def seqs_of(labelled: Labelled) -> list[int]:
+    n = len(labelled.seq)
+    assert labelled.traces.shape == ((n, 1, 3) if n else (0, 1, 1))
+    assert labelled.traces[:, 0, 0].tolist() == labelled.seq.tolist()
+    assert labelled.labels.tolist() == [seq % 2 for seq in labelled.seq]
+    assert labelled.hashes.tolist() == [100 + seq for seq in labelled.seq]
+    return labelled.seq.tolist()
+
+
+@settings(deadline=None)
+@given(capacity=st.integers(1, 200), steps=st.lists(st.integers(0, 90), max_size=6))
+def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity: int, steps: list[int]) -> None:
+    window, handed_out, last = Window(capacity), [], 0
+    for n in steps:
+        add(window, *range(last + 1, last + n + 1))
+        last += n
+        handed_out.append((window.snapshot(), list(range(max(0, last - capacity) + 1, last + 1))))
+    for snapshot, expected in handed_out:
+        assert seqs_of(snapshot) == expected
+
+
+def test_a_snapshot_stays_as_it_was_when_the_window_is_filled_anew() -> None:
+    window = Window(10)
+    add(window, 1, 2, 3)
+    before = window.snapshot()
+    other = Window(10)
+    add(other, 7, 8)
+    window.refill(other.snapshot())
+    add(window, 9)
+    assert seqs_of(before) == [1, 2, 3]
+    assert seqs_of(window.snapshot()) == [7, 8, 9]
+
+
+@pytest.mark.parametrize("capacity", [4, 100])
+def test_what_is_newer_than_a_label_is_found_with_its_trace(capacity: int) -> None:
+    window = Window(capacity)
+    add(window, 2, 3, 5, 8, 9)
+    assert window.newer(5).tolist() == [8, 9]
+    assert window.newer(9).tolist() == []
+    trace, label, hash_ = window.row(8)
+    assert (trace[0, 0], label, hash_) == (8.0, 0, 108)
