@@ -51,6 +51,7 @@ lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/lint-imports --no-cache --no-logo
 
 # Into site/, warnings are errors. Read it with `python -m http.server --directory site`.
 docs: $(VENV)/.dev
