@@ -2,7 +2,7 @@
 
     python training/picture_page.py --out docs/page.png
 
-Needs Chromium, and Playwright, which is in the extra `dev`. `--view map`, `--lang de` and `--dark` show the others.
+Needs Chromium, and Playwright, which is in the extra `dev`. `--view map` and `--dark` show the others.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ PATIENT = 120_000  # ms until the model answers
 
 
 @contextmanager
-def demonstration(parts: int, seed: int) -> Iterator[str]:
-    """Run `dengine demo-cell`; gives its address."""
-    command = [sys.executable, "-m", "dengine", "demo-cell", "--port", "0", "--speed", "2", "--seed", str(seed)]
-    with subprocess.Popen([*command, "--before", str(parts)], stdout=subprocess.PIPE, text=True) as process:
+def demonstration(seed: int) -> Iterator[str]:
+    """Run `dengine serve --demo`; gives its address."""
+    command = [sys.executable, "-m", "dengine", "serve", "--demo", "--port", "0", "--speed", "2", "--seed", str(seed)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         found = re.search(r"http://[\d.:]+", process.stdout.readline())
         if found is None:
@@ -39,14 +39,14 @@ def demonstration(parts: int, seed: int) -> Iterator[str]:
         process.communicate()
 
 
-def photograph(url: str, out: Path, width: int, height: int, lang: str, dark: bool) -> None:
+def photograph(url: str, out: Path, width: int, height: int, dark: bool) -> None:
     """Wait until a model answers, then for the next decision that it is certain of, and take the picture."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(FLAGS))
         size = {"width": width, "height": height}
-        context = browser.new_context(viewport=size, locale=lang, color_scheme="dark" if dark else "light")
+        context = browser.new_context(viewport=size, locale="en", color_scheme="dark" if dark else "light")
         page = context.new_page()
         page.set_default_timeout(PATIENT)
         page.goto(url)
@@ -65,13 +65,11 @@ def main() -> None:
     parser.add_argument("--view", choices=("", "how", "map", "history", "acts"), default="", help="which view; the first")
     parser.add_argument("--width", type=int, default=1280, help="of the browser's window, in pixels")
     parser.add_argument("--height", type=int, default=720, help="of it")
-    parser.add_argument("--lang", choices=("en", "de"), default="en", help="the page's language")
     parser.add_argument("--dark", action="store_true", help="as on a device that is set to dark")
-    parser.add_argument("--parts", type=int, default=400, help="parts that were inserted before")
     parser.add_argument("--seed", type=int, default=0, help="of the parts' order")
     args = parser.parse_args()
-    with demonstration(args.parts, args.seed) as url:
-        photograph(f"{url}/{args.view}", args.out, args.width, args.height, args.lang, args.dark)
+    with demonstration(args.seed) as url:
+        photograph(f"{url}/{args.view}", args.out, args.width, args.height, args.dark)
     print(f"Wrote {args.out}.")
 
 

@@ -23,7 +23,7 @@ from .history import explain, history
 from .options import example
 from .output import end_interrupted
 from .replay import compare, replay
-from .run import demo_cell, run
+from .run import run
 from .serve import serve
 from .status import cells, status
 from .store import dump, verify
@@ -73,6 +73,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels, demo_cell),
+    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
 ):
     main.add_command(verb)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -17,13 +19,21 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..engine.engine import DataEngine
+    from ..recipe import Recipe
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "jinja2", "sse_starlette")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette")
+PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.command(epilog=example("dengine serve --store cell.db --port 8000"))
-@click.option("--store", required=True, metavar="FILE|URL", help="Remembers everything; made where there is none.")
+@click.option("--store", metavar="FILE|URL", help="Remembers everything; made where there is none.")
+@click.option(
+    "--demo", is_flag=True, help="Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."
+)
+@click.option(
+    "--speed", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, help="Parts a second of --demo."
+)
 @cell_options("--cell-id", product=True)
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
@@ -67,7 +77,9 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @recipe_options
 def serve(
     choice: RecipeChoice,
-    store: str,
+    store: str | None,
+    demo: bool,
+    speed: float,
     shadow: bool,
     xmlrpc: bool,
     page: bool,
@@ -85,23 +97,38 @@ def serve(
     """
     must_have_serve(*(["asyncua"] if how["opcua"] else []))
     from ..cells import RtdeRecorder
-    from ..engine.engine import DataEngine
-    from ..serve.server import Serving, tell_safe_mode
+    from ..recipe import Recipe
+    from ..serve.demo import POLICY, playing
+    from ..serve.server import Serving
     from ..serve.server import serve as serve_cell
 
-    def make(executor: Executor) -> DataEngine:
-        options: dict[str, Any] = {"executor": executor, "on_safe_mode": tell_safe_mode}
-        engine = DataEngine.open_or_create(store, seed, recipe=choice.load() if choice.asked else None, **options)
-        if shadow:
-            engine.set_shadow(True, "dengine serve --shadow")
-        return engine
-
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
-    recorder = None
-    if robot:
-        host, port = host_and_port(robot)
-        recorder = partial(RtdeRecorder, host, trigger, samples, port=port)
-    serve_cell(make, store, Serving(interfaces=interfaces, recorder=recorder, **how), click.echo)
+    recipe = choice.load() if choice.asked else None
+    with ExitStack() as stack:
+        if demo:
+            if store is not None and Path(store).exists():
+                raise SettingError(f"Expected a new file to keep the demonstration in, {store} is there; name another one.")
+            how["beside"] = [partial(playing, speed=speed, seed=seed or 0)]
+            how["deadline"] = max(how["deadline"], PATIENT)
+            recipe = recipe or Recipe.load("conv").with_policy(**POLICY)
+            store = store or str(Path(stack.enter_context(TemporaryDirectory(prefix="dengine-demo-"))) / "demo.db")
+        if store is None:
+            raise click.UsageError("Expected --store FILE|URL, where everything is remembered; or --demo, to look on.")
+        if robot:
+            host, port = host_and_port(robot)
+            how["recorder"] = partial(RtdeRecorder, host, trigger, samples, port=port)
+        make = partial(_opened, store, seed, recipe, shadow)
+        serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
+
+
+def _opened(store: str, seed: int | None, recipe: Recipe | None, shadow: bool, executor: Executor) -> DataEngine:
+    from ..engine.engine import DataEngine
+    from ..serve.server import tell_safe_mode
+
+    engine = DataEngine.open_or_create(store, seed, recipe=recipe, executor=executor, on_safe_mode=tell_safe_mode)
+    if shadow:
+        engine.set_shadow(True, "dengine serve --shadow")
+    return engine
 
 
 def must_have_serve(*beside: str) -> None:

@@ -1,64 +1,58 @@
-"""A cell without a robot: a `Cell` that is driven through the service, as a robot's program would, at a speed to watch.
-
-await drive(service, ReplayCell("insertion"), Pace(before=150, a_second=1.0))
-"""
+"""A cell without a robot: the bundled recordings, decided on through the service as a robot's program would."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import uuid
-from dataclasses import dataclass
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
-from ..cells.base import Cell
+import numpy as np
+
+from ..cells.replay import ReplayCell
 from ..errors import BusyError
 from ..records import Action, Outcome
 from .service import CellService
 
+log = logging.getLogger("dengine")
+BEFORE = 150  # parts that come at once, but for retrains: no model would be ready before all were verified
 CHECK = 0.4  # of a cycle, after which a verified part's result is there
 READY = 0.05  # seconds between two looks at whether a retrain is done
+POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """How fast parts come.
+@asynccontextmanager
+async def playing(service: CellService, speed: float = 1.0, seed: int = 0) -> AsyncIterator[None]:
+    """Play recordings in a drawn order, beside a server.  speed : parts a second after the first `BEFORE`."""
+    cell = ReplayCell("insertion")
+    cell.order = np.random.default_rng(seed).permutation(len(cell.data))
+    driving = asyncio.create_task(drive(service, cell, speed))
+    yield
+    driving.cancel()
+    await asyncio.wait([driving])
 
-    before : parts that come as fast as they can, but for retrains: no model would be ready before all were verified.
-    a_second : parts a second, after these.
-    """
 
-    before: int
-    a_second: float
-
-
-async def drive(service: CellService, cell: Cell, pace: Pace, cycles: int) -> int:
-    """Insert so many parts, ask what to do with each, and report what became of it; returns how many were decided on."""
-    loop, run, decided = asyncio.get_running_loop(), uuid.uuid4().hex[:8], 0
+async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
+    """Insert every part of a recording, ask what to do with it, and report what became of it."""
+    loop, run = asyncio.get_running_loop(), uuid.uuid4().hex[:8]
     due = loop.time()
-    for cycle in range(cycles):
-        trace = await asyncio.to_thread(cell.insert)
-        seconds = 0.0 if cycle < pace.before else 1.0 / pace.a_second
-        due = max(due + seconds, loop.time())
-        try:
-            answer = await service.decide(trace, f"{run}-{cycle + 1}", f"{cycle + 1:04d}")
-        except BusyError:  # as a robot does: the part is verified, and nothing is known of it
-            cell.verify()
-            continue
-        decided += 1
-        await asyncio.sleep(seconds * CHECK)
-        success = await asyncio.to_thread(_dealt_with, cell, answer.decision.action)
-        if success is not None:
-            await service.report(answer.decision.id, success)
-        await asyncio.sleep(due - loop.time())
-        while cycle < pace.before and service.engine.retraining:
-            await asyncio.sleep(READY)
-    return decided
-
-
-def _dealt_with(cell: Cell, action: Action) -> bool | None:
-    """Do what was decided; returns what is known of the part then, None for nothing."""
-    if action is Action.VERIFY:
-        return cell.verify()
-    if action is Action.REJECT:
-        cell.reject()
-        return None
-    return {Outcome.STOPPED: False, Outcome.CONFIRMED: True, Outcome.UNKNOWN: None}[cell.proceed()]
+    try:
+        for cycle in range(len(cell.order)):
+            seconds = 0.0 if cycle < BEFORE else 1.0 / speed
+            due = max(due + seconds, loop.time())
+            trace, name = cell.insert(), f"{run}-{cycle + 1}"
+            try:
+                action = (await service.decide(trace, name, f"{cycle + 1:04d}")).decision.action
+            except BusyError:  # as a robot does: the part is verified, and nothing is known of it
+                continue
+            await asyncio.sleep(seconds * CHECK)
+            stopped = action is Action.ACCEPT and cell.proceed() is Outcome.STOPPED
+            if action is Action.VERIFY or stopped:
+                await service.report(name, cell.verify())
+            await asyncio.sleep(due - loop.time())
+            while cycle < BEFORE and service.engine.retraining:
+                await asyncio.sleep(READY)
+        log.info("all parts of the recording are through; the page stays until Ctrl-C")
+    except Exception:
+        log.exception("the demonstration stopped")

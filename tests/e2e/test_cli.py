@@ -95,7 +95,7 @@ def test_version_is_the_packages() -> None:
 
 
 VERBS = sorted(main.commands)
-ENDLESS = ("demo-cell", "serve")  # they go on until they are told to end, and speak through what they serve
+ENDLESS = ("serve",)  # it goes on until it is told to end, and speaks through what it serves
 LESS = {  # so that an example takes seconds; its own options are all read
     "compare": ["--repeats", 1, "--cycles", 150],
     "costs": ["--alphas", 0.5, "--lower-bounds", 0.8, "--cycles", 100, "--n-jobs", 1],
