@@ -23,7 +23,7 @@ SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
 LONG = (
-    *("test_docs", "test_notebooks", "test_page", "test_fuzz_requests", "test_golden", "test_training", "test_cli"),
+    *("test_docs", "test_notebooks", "test_page", "test_fuzz", "test_golden", "test_training", "test_cli"),
     *("test_golden_default", "test_estimators", "test_reducers"),
 )
 # The C++ programs are built once, by one worker.

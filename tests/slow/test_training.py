@@ -1,16 +1,12 @@
 """The scripts in training/: what they say of themselves is so, and small data does not break them."""
 
-import argparse
-import ast
 import importlib
-import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import click
 import numpy as np
 import pytest
 
@@ -53,47 +49,6 @@ def load(name: str) -> ModuleType:
     return importlib.import_module(name)
 
 
-class ParsedError(Exception):
-    """A parser, as complete as it is when the script asks it to parse."""
-
-
-def options_of(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Option or argument -> help."""
-    main = load(name).main
-    if isinstance(main, click.Command):
-        return {word: p.help or "" for p in main.params if isinstance(p, click.Option) for word in p.opts}
-
-    def parse(parser: argparse.ArgumentParser, *_: Any) -> None:
-        raise ParsedError(parser)
-
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
-    with pytest.raises(ParsedError) as parsed:
-        main()
-    actions = parsed.value.args[0]._actions
-    return {word: action.help or "" for action in actions for word in action.option_strings or [action.dest]}
-
-
-def commands_in(script: Path) -> list[list[str]]:
-    """The commands that a script's docstring names."""
-    text = ast.get_docstring(ast.parse(script.read_text(encoding="utf-8"))) or ""
-    return [shlex.split(line) for line in text.splitlines() if line.strip().startswith("python training/")]
-
-
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_a_scripts_docstring_names_a_command_that_it_understands(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    commands = commands_in(script)
-    assert commands
-    known = set(options_of(script.stem, monkeypatch))
-    for _, file, *words in commands:
-        assert file == f"training/{script.name}"
-        assert {word for word in words if word.startswith("--")} <= known
-
-
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_every_option_of_a_script_is_described(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not [option for option, text in options_of(script.stem, monkeypatch).items() if not text]
-
-
 def test_a_comparison_of_60_cycles_has_a_table_and_a_csv(run: Run, tiny: Path, tmp_path: Path) -> None:
     words = ["report", "--data", tiny, "--reducers", "pca", "--seeds", "0:2", "--n-jobs", 1, "--out", tmp_path]
     out = run("compare_reducers", *words)
@@ -122,10 +77,6 @@ def test_a_rival_without_a_bound_says_so_in_its_row(run: Run, tiny: Path, tmp_pa
 def test_choosing_among_tries_that_are_never_certain_says_so(run: Run, tiny: Path, tmp_path: Path) -> None:
     words = ["choose", "--data", tiny, "--cycles", 10, "--reducers", "pca", "--seeds", "0:1", "--n-jobs", 1]
     assert "Chosen of pca: none" in run("compare_reducers", *words, "--out", tmp_path)
-
-
-def test_the_noise_check_takes_sets_of_fewer_than_1503_traces(run: Run, tiny: Path) -> None:
-    assert "of 60 cycles" in run("check_noise", "--data", tiny, "--reducer", "pca", "--seeds", "0:1")
 
 
 def test_an_exported_model_is_said_in_kilobytes(run: Run, tiny: Path, tmp_path: Path) -> None:

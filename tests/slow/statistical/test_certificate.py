@@ -7,11 +7,11 @@ import math
 
 import numpy as np
 import pytest
-from proof.certificate import CLAIM, PROPENSITIES, STREAMS, ever_wrong, most_bad
 from scipy import stats
 
 from dengine.decision.certificate import failure_bound
 from dengine.decision.rule import log_evidence
+from tests.slow.proof.certificate import CLAIM, PROPENSITIES, STREAMS, ever_wrong, most_bad
 
 
 @pytest.mark.parametrize("propensity", PROPENSITIES)

@@ -12,9 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from proof.blindness import moved, places, weak_signal
-from proof.counts import count_noise, mean_square, relabelled, white_noise
-from proof.replays import Case, broken, judge
 from torch import Tensor
 
 from dengine import load_dataset
@@ -28,6 +25,9 @@ from dengine.records import Reason
 from dengine.reducers import heads as logistic
 from dengine.reducers import scored
 from dengine.reducers.heads import CrossFittedScores
+from tests.slow.proof.blindness import moved, places, weak_signal
+from tests.slow.proof.counts import count_noise, mean_square, relabelled, white_noise
+from tests.slow.proof.replays import Case, broken, judge
 
 HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
 SEEDS = 16

@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from proof.collapse import collapse
-from proof.garbage import garbage
-from proof.pieces import Piece, finish
-from proof.replays import Case, broken, judge
-from proof.report import write_report
-from proof.truths import TRUTHS, planted
 from scipy import stats
+
+from tests.slow.proof.collapse import collapse
+from tests.slow.proof.garbage import garbage
+from tests.slow.proof.pieces import Piece, finish
+from tests.slow.proof.replays import Case, broken, judge
+from tests.slow.proof.report import write_report
+from tests.slow.proof.truths import TRUTHS, planted
 
 SOFT = Case("soft", "soft", alpha=0.2, lower_bound=0.8, cycles=400)
 

@@ -1,7 +1,7 @@
 """The proof: does what is called a guarantee hold, where the truth is known? Resumable: finished pieces are kept.
 
-    python training/prove.py --out out/proof --repeats 200
-    python training/prove.py --out out/proof --repeats 4 --only planted,noise --jobs 2 --docs out/proof
+    python -m tests.slow.proof --out out/proof --repeats 200
+    python -m tests.slow.proof --out out/proof --repeats 4 --only planted,noise --jobs 2 --docs out/proof
 
 Writes proof.csv (a row a configuration), proof.md (the tables) and proof.png into the folder that `--docs` names.
 """
@@ -12,10 +12,10 @@ import argparse
 import functools
 from pathlib import Path
 
-from proof.certificate import PROPENSITIES, STREAMS
-from proof.pieces import Piece, Row, finish
-from proof.replays import Case, noise_cases, planted_cases
-from proof.report import write_report
+from .certificate import PROPENSITIES, STREAMS
+from .pieces import Piece, Row, finish
+from .replays import Case, noise_cases, planted_cases
+from .report import write_report
 
 CHUNK = 10  # seeds a piece
 PARTS = ("counts", "certificate", "planted", "noise", "collapse", "garbage")

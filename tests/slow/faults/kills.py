@@ -26,10 +26,10 @@ from dengine.errors import DengineError
 from .harness import PROBE, RECIPE, Outcome, Place, missing, stream
 
 # The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
-HERE = str(Path(__file__).resolve().parents[1])
+HERE = str(Path(__file__).resolve().parents[3])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (HERE, os.environ.get("PYTHONPATH"))))
 LOADED = (
-    "faults.kills",
+    "tests.slow.faults.kills",
     "dengine.store.sql",
     "dengine.datasets.importing",
     "dengine.export.torchscript",

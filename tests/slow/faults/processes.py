@@ -8,9 +8,9 @@ import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from typing import Any
 
-import dengine.pending
 import numpy as np
 
+from dengine.engine import trainer
 from dengine.errors import StoreError
 
 from .harness import Cell, Outcome, Place, stream
@@ -40,7 +40,7 @@ def killed_executor(outcome: Outcome, place: Place) -> None:
 
 def hung_executor(outcome: Outcome, place: Place) -> None:
     """An executor that never finishes; its deadline, a minute, is a second here."""
-    before, dengine.engine.trainer.HUNG = dengine.engine.trainer.HUNG, 1.0
+    before, trainer.HUNG = trainer.HUNG, 1.0
     try:
         cell = Cell(place, outcome, executor=Hung())
         outcome.injected += 1
@@ -51,7 +51,7 @@ def hung_executor(outcome: Outcome, place: Place) -> None:
         cell.options.clear()
         cell.finish()
     finally:
-        dengine.engine.trainer.HUNG = before
+        trainer.HUNG = before
 
 
 def interrupted(outcome: Outcome, place: Place) -> None:

@@ -1,6 +1,6 @@
 """Malformed inputs of every kind: each must be refused by an error of dengine's own, or its part be verified.
 
-    python training/fuzz_inputs.py --n 1000 --seed 0
+    python -m tests.slow.fuzzing.inputs --n 1000 --seed 0
 
 Prints a table by kind: what was tried, refused (a `DengineError`; exit code 1 or 2 and one line that begins with "Error:"),
 verified, and taken, since what was damaged can still be a good input. Any other exception is raw and is shown; so is what
@@ -23,9 +23,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fuzzing.inputs import Fuzz
-
 from dengine import DengineError
+
+from .attempts import Fuzz
 
 SHOWN = 5  # raw exceptions of a kind whose traceback is printed
 OUTCOMES = ("refused", "verified", "taken", "raw")

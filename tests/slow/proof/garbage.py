@@ -16,7 +16,7 @@ from dengine.recipe import RECIPES
 from dengine.records import Action
 
 Traces = NDArray[np.float32]
-SCREW_DRIVING = Path(__file__).resolve().parents[3] / "shared" / "data" / "screw_driving.npz"
+SCREW_DRIVING = Path(__file__).resolve().parents[4] / "shared" / "data" / "screw_driving.npz"
 LEARNED, PER_KIND = 800, 100
 
 

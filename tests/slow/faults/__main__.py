@@ -1,7 +1,7 @@
 """Fault by fault: what is lost, what is decided wrongly, what reaches the cell, and how long it waits.
 
-    python training/benchmark_faults.py --trials 3 --kills 20
-    . .ci/postgres.sh && python training/benchmark_faults.py --kills 200 --others 100 --postgres "$DENGINE_TEST_POSTGRES"
+    python -m tests.slow.faults --trials 3 --kills 20
+    . .ci/postgres.sh && python -m tests.slow.faults --kills 200 --others 100 --postgres "$DENGINE_TEST_POSTGRES"
 
 --program names a built dengine-cell, whose journal is then tried too (`dengine export-cpp`). A trial of a fault plays a
 cell before, in and after it, opens the store again, and compares labels with what was acknowledged and decisions with those
@@ -20,10 +20,11 @@ import uuid
 from collections.abc import Callable
 from pathlib import Path
 
-from faults import inputs, kills, processes, stores
-from faults.harness import Outcome, Place
 from rich.console import Console
 from rich.table import Table
+
+from . import inputs, kills, processes, stores
+from .harness import Outcome, Place
 
 Fault = Callable[[Outcome, Place], None]
 

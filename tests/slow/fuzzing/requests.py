@@ -1,6 +1,6 @@
 """Malformed requests over every interface of a real server process: each is refused, and nothing else changes.
 
-    python training/fuzz_requests.py --n 20000 --seed 1
+    python -m tests.slow.fuzzing.requests --n 20000 --seed 1
 
 Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC, OPC UA and bare TCP. Prints a table by kind: tried;
 refused (a 4xx, a fault, a Bad status, an ERR message); late (half a request: refused once its time was over, by 408 or
@@ -31,13 +31,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzzing.opc import Conversation
-from fuzzing.web import MAKERS, SAMPLES, TOKEN
-from fuzzing.wire import QUIET, WAIT, Call, Halves, exchange, over_http
 
 from dengine import DataEngine, TraceSpec, open_store
 from dengine.store.views import HistoryFilter
 from dengine.testing import toy_traces
+
+from .opc import Conversation
+from .web import MAKERS, SAMPLES, TOKEN
+from .wire import QUIET, WAIT, Call, Halves, exchange, over_http
 
 SHARES = {  # of all attempts
     "json": 0.22,
@@ -56,6 +57,7 @@ WRONG = {
     "silent": "requests had no answer",
     "failed": "requests failed",
 }
+REPO = Path(__file__).parents[3]
 GROWTH = 24.0  # MB that the server may have grown by, over the last four fifths
 SHOWN = 5  # of a kind that are wrong, and are printed
 
@@ -102,8 +104,8 @@ def server(store: Path) -> Iterator[Server]:
     """A server over a store; ended by SIGTERM, with exit code 0."""
     log = store.with_suffix(".log")
     with log.open("wb") as errors:
-        command = [sys.executable, __file__, "--serve", str(store)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        command = [sys.executable, "-m", "tests.slow.fuzzing.requests", "--serve", str(store)]
+        process = subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, stderr=errors, text=True)
         assert process.stdout is not None
         try:
             ports = dict(_port(process.stdout.readline()) for _ in range(2))

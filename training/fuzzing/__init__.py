@@ -1,1 +1,0 @@
-"""Malformed inputs and requests by the kind, for `training/fuzz_inputs.py` and `training/fuzz_requests.py`."""
