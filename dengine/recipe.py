@@ -260,6 +260,4 @@ RECIPES: dict[str, Recipe] = {
     "rocket": Recipe("rocket", radius=0.05),
     # The paper: UMAP, a fixed radius, Wilson, verified and stopped samples stored; it asks nothing else of a trace.
     "paper": Recipe("umap", policy=Policy(alpha=0.1, lower_bound=0.9), novelty=0.0),
-    "plane": Recipe("plane", radius=0.5),
-    "umap-encoded": Recipe("umap", params={"encoded": True}),
 }

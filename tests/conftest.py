@@ -30,7 +30,7 @@ LONG = (
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden_default")
 GROUPS = dict.fromkeys(PROGRAMS, "cpp")
 # Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
-GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers", "test_plane"), "umap")
+GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers"), "umap")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups

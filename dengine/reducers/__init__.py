@@ -19,26 +19,12 @@ if TYPE_CHECKING:
     from .conv import ConvReducer
     from .cross_fitting import CrossFitted
     from .pca import PcaReducer
-    from .plane import PlaneReducer
     from .rocket import RocketReducer
     from .umap import UmapReducer
 
-_WHERE = {
-    "base": ["Reducer"],
-    "conv": ["ConvReducer"],
-    "cross_fitting": ["CrossFitted"],
-    "pca": ["PcaReducer"],
-    "plane": ["PlaneReducer"],
-    "rocket": ["RocketReducer"],
-    "umap": ["UmapReducer"],
-}
-_CLASSES = {
-    "conv": "dengine.reducers.conv:ConvReducer",
-    "umap": "dengine.reducers.umap:UmapReducer",
-    "pca": "dengine.reducers.pca:PcaReducer",
-    "rocket": "dengine.reducers.rocket:RocketReducer",
-    "plane": "dengine.reducers.plane:PlaneReducer",
-}
+# The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
+_NAMED = {"conv": "ConvReducer", "umap": "UmapReducer", "pca": "PcaReducer", "rocket": "RocketReducer"}
+_LAZY = {"base": ["Reducer"], "cross_fitting": ["CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer
 
@@ -47,7 +33,6 @@ __all__ = [
     "ConvReducer",
     "CrossFitted",
     "PcaReducer",
-    "PlaneReducer",
     "Reducer",
     "RocketReducer",
     "UmapReducer",
@@ -57,12 +42,12 @@ __all__ = [
 
 
 def reducer_class(name: str) -> type:
-    """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for: UMAP alone takes seconds."""
-    if name not in _CLASSES and ":" not in name:
+    """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
+    if name not in _NAMED and ":" not in name:
         raise SettingError(
-            f"Expected a reducer among {', '.join(_CLASSES)}, or module:Class of your own, got {shortened(name)}."
+            f"Expected a reducer among {', '.join(_NAMED)}, or module:Class of your own, got {shortened(name)}."
         )
-    found = find_class(_CLASSES.get(name, name))
+    found: type = __getattr__(_NAMED[name]) if name in _NAMED else find_class(name)
     if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
         raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")
     return found
@@ -75,7 +60,7 @@ def make_reducer(name: str, **params: Any) -> Any:
     unknown = sorted(set(params) - set(allowed))
     if unknown:
         raise SettingError(f"{found.__name__} has no parameter {', '.join(unknown)}; it has {', '.join(allowed)}.")
-    if name in _CLASSES:
+    if name in _NAMED:
         for key, value in params.items():
             _must_be_like(allowed[key].default, key, value)
     return found(**params)
@@ -104,6 +89,6 @@ def reducer_of(recipe: Recipe, seed: int) -> Any:
     return make_reducer(recipe.reducer, **own | dict(recipe.params))
 
 
-REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _CLASSES}
+REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _NAMED}
 
-__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs=_WHERE)
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs=_LAZY)

@@ -11,16 +11,13 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from ..errors import SettingError
-from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows, seed_of
-from .plane import untrained_encoder
-from .scored import in_chunks
+from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
 
 
 class UmapReducer(Reducer):
-    """umap-learn's UMAP: with a random_state fitted on one thread, so that a run repeats exactly.
+    """umap-learn's UMAP, fitted on one thread where a random_state is given, so that a run repeats exactly.
 
     n_components : of the embedding.  n_neighbors, min_dist, n_epochs, random_state : as in umap-learn.
-    encoded : whether it lays out features of the untrained encoder (encoder.py), which reads no label, instead of samples.
     It is refitted, not warm-started; a trace transformed alone moves by up to 0.1 against the same in a batch.
     Source: McInnes, Healy and Melville (2018), arXiv:1802.03426.
     """
@@ -35,14 +32,12 @@ class UmapReducer(Reducer):
         min_dist: float = 0.1,
         n_epochs: int | None = None,
         random_state: Any = 0,
-        encoded: bool = False,
     ) -> None:
         self.n_components = n_components
         self.n_neighbors = n_neighbors
         self.min_dist = min_dist
         self.n_epochs = n_epochs
         self.random_state = random_state
-        self.encoded = encoded
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for fewer than n_neighbors + 1 traces."""
@@ -53,16 +48,8 @@ class UmapReducer(Reducer):
             )
         from umap import UMAP
 
-        rows = self._learn_features(traces) if self.encoded else as_rows(traces)
         with _Contained():
-            self.umap_ = UMAP(
-                n_components=self.n_components,
-                n_neighbors=self.n_neighbors,
-                min_dist=self.min_dist,
-                n_epochs=self.n_epochs,
-                random_state=self.random_state,
-                n_jobs=1,
-            ).fit(rows)
+            self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
@@ -74,26 +61,11 @@ class UmapReducer(Reducer):
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
         with _Contained():
-            return np.asarray(self.umap_.transform(self._rows(traces)), dtype=np.float32)
-
-    def _learn_features(self, traces: Floats) -> Floats:
-        """(n, C, T) -> (n, 2*W), by an encoder that is learned on them."""
-        x = torch.from_numpy(traces)
-        self.encoder_ = untrained_encoder(x, np.random.default_rng(seed_of(self.random_state)))
-        with torch.no_grad():
-            features, _ = self.encoder_.standardise(in_chunks(self.encoder_.raw, x))
-        return as_points(features)
-
-    def _rows(self, traces: Floats) -> Floats:
-        """What is laid out of traces (n, C, T): the fit's features, or the samples."""
-        if not self.encoded:
-            return as_rows(traces)
-        with torch.inference_mode():
-            return as_points(in_chunks(self.encoder_, torch.from_numpy(traces)))
+            return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
 
 
 class _Contained(warnings.catch_warnings):
-    """What umap-learn does beyond its task stays here: its warnings, and the number of threads.
+    """Keep umap-learn's warnings and its number of threads out of the process.
 
     It warns that a seed means one thread, which is what is asked for; spectral fallbacks are its own. Its first kernel
     makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others on a busy machine.

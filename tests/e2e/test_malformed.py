@@ -35,7 +35,7 @@ SETTINGS = [
     *((f.name, f"{f.name} = {{}}\n") for f in fields(Recipe)),
     *((f.name, f"[policy]\n{f.name} = {{}}\n") for f in fields(Policy)),
 ]
-PARAMS = [(key, name) for name in ("conv", "pca", "rocket", "plane") for key in signature(reducer_class(name)).parameters]
+PARAMS = [(key, name) for name in ("conv", "pca", "rocket") for key in signature(reducer_class(name)).parameters]
 
 
 def refusal(text: str) -> str:

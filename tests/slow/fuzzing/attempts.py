@@ -39,7 +39,7 @@ class Fuzz:
             [header, *(",".join([*map(str, x[:6]), "OK" if good else "NOK"]) for x, good in zip(X[:4, 0], y, strict=False))]
         )
         self.recording = "timestamp,FZ_Base\n" + "\n".join(f"{i / 500},{value}" for i, value in enumerate(self.X[0]))
-        self.recipes = [Recipe.load(name).to_toml() for name in ("conv", "pca", "rocket", "umap", "plane")]
+        self.recipes = [Recipe.load(name).to_toml() for name in ("conv", "pca", "rocket", "umap")]
         self.commands = self._commands()
 
     def _teach(self, engine: DataEngine) -> None:
