@@ -1,4 +1,4 @@
-# Two commands do everything: `make demo` and `make test`. The others are for working on dengine.
+# Two commands to begin with: `make demo` and `make test`. The others are for working on dengine.
 PYTHON ?= python3
 VENV ?= .venv
 # On a machine whose package index serves the CUDA build, name PyTorch's CPU index here:
@@ -6,6 +6,7 @@ VENV ?= .venv
 PIP_FLAGS ?=
 PIP = $(VENV)/bin/python -m pip install --quiet --progress-bar off --disable-pip-version-check --constraint constraints.txt $(PIP_FLAGS)
 RUN = $(VENV)/bin/dengine
+PYTEST = $(VENV)/bin/python -m pytest --numprocesses 2 --dist loadgroup --no-loadscope-reorder
 OUT ?= out
 AUDIT = $(VENV)/audit
 # At least so many packages must have been audited; the run-time dependencies alone are more.
@@ -25,7 +26,7 @@ endef
 export COUNT_AUDITED
 REPEATS ?= 200
 
-.PHONY: setup demo test lint docs proof audit clean
+.PHONY: setup demo test test-merge test-all lint docs proof audit clean
 
 setup: $(VENV)/.dev
 
@@ -45,7 +46,15 @@ demo: $(VENV)/.demo
 	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cell replay --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
 
 test: $(VENV)/.dev
-	$(VENV)/bin/python -m pytest --numprocesses 2 --dist loadgroup --no-loadscope-reorder
+	$(PYTEST) -m "not slow" tests/unit tests/contract tests/e2e tests/golden
+
+# The slow tests that each merge must pass; a PostgreSQL server is named by DENGINE_TEST_POSTGRES (.ci/postgres.sh).
+test-merge: $(VENV)/.dev
+	$(PYTEST) -m merge
+
+# Everything: each page and notebook, UMAP, fuzzing, outages, statistics.
+test-all: $(VENV)/.dev
+	$(PYTEST)
 
 lint: $(VENV)/.dev
 	$(VENV)/bin/ruff check .

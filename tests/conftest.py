@@ -10,6 +10,9 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+REPO = Path(__file__).resolve().parents[1]
+os.environ.setdefault("NUMBA_CACHE_DIR", str(REPO / "build" / "numba"))  # before umap: what it compiled is kept
+
 import numpy as np
 import pytest
 import torch
@@ -17,28 +20,33 @@ import torch
 from dengine import Dataset
 from dengine.export import export_sources
 
-REPO = Path(__file__).resolve().parents[1]
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
 # Files that take longest come first: a long one that begins last keeps one core waiting for the other.
-LONG = (
-    *("test_docs", "test_notebooks", "test_page", "test_fuzz", "test_golden", "test_training", "test_cli"),
-    *("test_golden_default", "test_estimators", "test_reducers"),
-)
-# The C++ programs are built once, by one worker.
+LONG = ("test_docs", "test_notebooks", "test_page", "test_requests", "test_golden", "test_training", "test_cli")
+# The C++ programs are built once, by one worker; each process that fits a UMAP compiles it anew, for 25 s.
 PROGRAMS = ("test_cpp", "test_cell_program", "test_c_interface", "test_onnx_program", "test_golden_default")
 GROUPS = dict.fromkeys(PROGRAMS, "cpp")
-# Each process that fits a UMAP compiles it anew, for 25 s: the files that do go to one worker, one after the other.
 GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers"), "umap")
+# `make test` leaves out what is slow: these folders, and the cases of other tests that have these names.
+SLOW = REPO / "tests" / "slow"
+SLOW_CASES = ("umap", "postgres")
+# What is slow and yet run before each merge; single tests are marked where they stand.
+MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_store_kill")
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups, and -m the marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first; a file's own order stays as it is, and so does the worker that it is run by."""
+    """Mark tiers and groups; long files first, and a file's own order stays as it is."""
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
     for item in items:
-        item.add_marker(pytest.mark.xdist_group(GROUPS.get(item.path.stem, item.path.stem)))
+        stem, case = item.path.stem, item.callspec.id if hasattr(item, "callspec") else ""
+        item.add_marker(pytest.mark.xdist_group(GROUPS.get(stem, stem)))
+        if stem in MERGE or "postgres" in case:
+            item.add_marker("merge")
+        if item.get_closest_marker("merge") or SLOW in item.path.parents or any(name in case for name in SLOW_CASES):
+            item.add_marker("slow")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -2,7 +2,7 @@
 
     python training/check_estimators.py --out docs/estimator_checks.md
 
-`tests/contract/test_estimators.py` runs the same checks on the same estimators; there an exclusion that passes fails.
+`tests/slow/test_estimators.py` runs the same checks on the same estimators; there an exclusion that passes fails.
 """
 
 from __future__ import annotations

@@ -157,6 +157,7 @@ def test_a_decision_appears_and_the_next_one_takes_its_place(watched: Watched, d
     assert page.evaluate("performance.getEntriesByType('navigation').length") == 1  # it was told, and never loaded again
 
 
+@pytest.mark.slow
 def test_a_part_on_the_map_is_clicked_and_shows_its_trace(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     with_a_model(page, demo)
@@ -169,6 +170,7 @@ def test_a_part_on_the_map_is_clicked_and_shows_its_trace(watched: Watched, demo
     expect(page.locator("#part .story li").first).to_contain_text("Verify")
 
 
+@pytest.mark.slow
 def test_a_mark_that_nothing_covers_is_hit_by_the_mouse(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     with_a_model(page, demo)
@@ -176,6 +178,7 @@ def test_a_mark_that_nothing_covers_is_hit_by_the_mouse(watched: Watched, demo: 
     expect(page.locator("#part-title")).to_contain_text("Part")
 
 
+@pytest.mark.slow
 def test_the_map_is_gone_over_by_the_keyboard_alone(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     with_a_model(page, demo)
@@ -196,6 +199,7 @@ def test_the_map_is_gone_over_by_the_keyboard_alone(watched: Watched, demo: Demo
     expect(page.locator("#part svg.chart").first).to_be_visible()
 
 
+@pytest.mark.slow
 def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     with demo.store() as store:
@@ -221,6 +225,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watc
         assert store.corrections()[-1].author == AUTHOR
 
 
+@pytest.mark.slow
 def test_verify_everything_is_entered_and_left(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     with_a_model(page, demo)
@@ -241,6 +246,7 @@ def test_verify_everything_is_entered_and_left(watched: Watched, demo: DemoCell)
         assert Recipe.from_toml(store.settings()["recipe"]).policy.audit_rate == 0.05
 
 
+@pytest.mark.slow
 def test_a_retrain_a_rollback_and_an_export_are_done_and_recorded(watched: Watched, demo: DemoCell, tmp_path: Path) -> None:
     page = watched.page
     with_a_model(page, demo)
@@ -260,6 +266,7 @@ def test_a_retrain_a_rollback_and_an_export_are_done_and_recorded(watched: Watch
     assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
 
 
+@pytest.mark.slow
 def test_the_history_is_filtered(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     opened(page, demo, "history")
@@ -272,6 +279,7 @@ def test_the_history_is_filtered(watched: Watched, demo: DemoCell) -> None:
 
 
 # Colours are the scheme's and texts the language's: each once.
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "language"), [("light", "en"), ("dark", "de")])
 def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(
     browser: Browser, demo: DemoCell, scheme: str, language: str
@@ -294,6 +302,7 @@ def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(
     context.close()
 
 
+@pytest.mark.slow
 def test_language_and_appearance_are_chosen_and_remembered(watched: Watched, demo: DemoCell) -> None:
     page = watched.page
     opened(page, demo, "history?label=bad")
@@ -340,6 +349,7 @@ def stopped_until_safe(service: CellService, data: Dataset) -> str:
         return thread.submit(asyncio.run, cell()).result()
 
 
+@pytest.mark.slow
 def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wrong_is_put_right(
     browser: Browser, tmp_path: Path, make_data: Callable[..., Dataset]
 ) -> None:
@@ -376,6 +386,7 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
     assert told[2][2] == "ended: what was told anew keeps the tolerance"
 
 
+@pytest.mark.slow
 def test_a_cell_of_simulated_physics_is_shown_too(browser: Browser, tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="the simulated cell needs the extra `sim`")
     options = ["--cell", "simulated", "--port", "0", "--speed", "2", "--before", "4", "--keep", str(tmp_path / "cell.db")]
@@ -399,6 +410,7 @@ def test_a_cell_of_simulated_physics_is_shown_too(browser: Browser, tmp_path: Pa
         assert store.status()["labels"] >= 4  # what physics said of them
 
 
+@pytest.mark.slow
 def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser) -> None:
     service = CellService(lambda: DataEngine("pca"))
     context = browser.new_context(locale="en")

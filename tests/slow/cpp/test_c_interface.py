@@ -38,7 +38,7 @@ def installed(programs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def consumer(repo: Path, installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     build = tmp_path_factory.mktemp("consumer")
-    run("cmake", "-S", repo / "tests" / "cpp", "-B", build, f"-DCMAKE_PREFIX_PATH={installed}")
+    run("cmake", "-S", repo / "tests" / "slow" / "cpp" / "consumer", "-B", build, f"-DCMAKE_PREFIX_PATH={installed}")
     run("cmake", "--build", build)
     return build / "consumer"
 
