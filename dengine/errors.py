@@ -59,6 +59,18 @@ class ReportError(DengineError, ValueError):
     """A report that says nothing (no label, no id), on an unknown decision, a second one, or one against the first."""
 
 
+class UnknownDecisionError(ReportError):
+    """A report on a decision that this cell does not know."""
+
+
+class ReportConflictError(ReportError):
+    """A report against what is recorded: a second label, or one on a rejected part."""
+
+
+class TraceConflictError(TraceError):
+    """Another trace under the id of a recorded decision."""
+
+
 class StoreError(DengineError, RuntimeError):
     """A store that cannot be opened, belongs to something else, or lost its writer."""
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.rule import script
-from ..errors import ReportError, TraceError, shortened
+from ..errors import ReportConflictError, TraceConflictError, TraceError, shortened
 from ..folds import audited, own_hash
 from ..model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
 from ..records import LONGEST, REASONS, Action, Decision, Reason, Source, TraceSpec, is_name
@@ -116,7 +116,7 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
     """The decision that this id has already; TraceError where it was made on another trace."""
     x = as_agreed(trace, spec, False)
     if not np.array_equal(x, known.trace, equal_nan=True):
-        raise TraceError(
+        raise TraceConflictError(
             f"Expected the trace that decision {known.id!r} was made on, got another; give it an id of its own."
         )
     return as_decision(known)
@@ -150,7 +150,7 @@ def as_part(part: Any) -> str | None:
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
     """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
     if action is Action.REJECT:
-        raise ReportError(
+        raise ReportConflictError(
             f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label to report."
         )
     if action is Action.VERIFY:

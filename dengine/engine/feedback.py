@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from ..errors import ReportError, StoreError
+from ..errors import StoreError, UnknownDecisionError
 from ..records import Action, Source
 from ..store.outbox import Keeper
 from ..store.records import NewLabel, StoredDecision
@@ -193,9 +193,9 @@ class Feedback:
             log.exception("safe mode %s, and that could not be told", f"began: {now}" if now else "ended")
 
 
-def unknown_stop(decision_id: str) -> ReportError:
+def unknown_stop(decision_id: str) -> UnknownDecisionError:
     """What is said of a report on a decision that is not known."""
-    return ReportError(
+    return UnknownDecisionError(
         f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
         "a system stop whose decision was lost can be reported with its trace."
     )

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ReportError, StoreError, shortened
+from ..errors import ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
 from ..records import LONGEST, Action, Decision, Reason, RetrainReport, Source, as_id, as_success, is_name
 
 
 def unknown_decision(decision_id: str, hint: str = "") -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
-    return ReportError(
+    return UnknownDecisionError(
         f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's store does not hold; "
         f"report the `Decision.id` that `decide` returned, to the same store and cell_id.{hint}"
     )
@@ -39,7 +39,7 @@ def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple
     said, says = (f"{'success' if success else 'failure'} from {source.value}" for success, source in (first, second))
     same = first[0] == second[0]
     advice = "nothing more needs reporting" if same else "if the first was wrong, look at how the part was checked"
-    return ReportError(
+    return ReportConflictError(
         f"Expected one report a decision, got a second on {decision_id!r}: {said} was reported first and stands, "
         f"now came {says}; {advice}."
     )
