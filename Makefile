@@ -42,7 +42,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@ $(VENV)/.demo
 
 demo: $(VENV)/.demo
-	$(RUN) compare --data insertion --reducers conv,umap --alpha 0.1 --lower-bound 0.9 --repeats 1 --n-jobs 2 --out $(OUT)
+	$(RUN) compare --data insertion --reducers conv,umap --alpha 0.1 --lower-bound 0.9 --repeats 1 --n-jobs 2 --out $(OUT) --force
 	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cell replay --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
 
 test: $(VENV)/.dev

@@ -190,9 +190,9 @@ def compare(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     level, seeds = f"({args.alpha:g}, {100 * args.lower_bound:g} %)", f"seeds {args.seeds[0]} to {args.seeds[-1]}"
     title = f"{args.recipe} on {data.name}, {level}, {seeds}"
     Console(width=100).print(pooled_table(rows, title))
-    print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv')}")
+    print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv', force=True)}")
     if replays:
-        print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png')}")
+        print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png', force=True)}")
 
 
 if __name__ == "__main__":

@@ -59,8 +59,7 @@ def stream(scenario: str, cycles: int, seed: int, n_jobs: int, folder: Path) -> 
     if not path.is_file():
         from dengine.cells.simulation.generate import save_traces, simulate
 
-        unfinished = save_traces(path.with_suffix(".part.npz"), simulate(cycles, seed, scenario, n_jobs))
-        unfinished.replace(path)  # a file of this name is a whole one, whenever the script was broken off
+        save_traces(path, simulate(cycles, seed, scenario, n_jobs))
     return path
 
 
@@ -220,8 +219,8 @@ def main() -> None:
     rows = [row_of(run) for run in runs]
     Console(width=150).print(table_of(rows))
     figure = picture(runs)
-    write_csv(pd.DataFrame(rows), args.out / "drift.csv")
-    written = save(figure, args.out / "drift.png", dpi=80)
+    write_csv(pd.DataFrame(rows), args.out / "drift.csv", force=True)
+    written = save(figure, args.out / "drift.png", dpi=80, force=True)
     if args.docs:
         Path("docs").mkdir(exist_ok=True)
         shutil.copyfile(written, "docs/drift.png")

@@ -175,7 +175,7 @@ def main() -> None:
         replays += [replay for some in by_name.values() for replay in some]
         if choosing:
             show_chosen(asked, by_name, bound)
-    path = write_csv(frame_of(replays), args.out / f"{args.do}_{data.name}.csv")
+    path = write_csv(frame_of(replays), args.out / f"{args.do}_{data.name}.csv", force=True)
     path.with_suffix(".md").write_text("\n".join(pages), encoding="utf-8")
     print(f"Wrote {path} and {path.with_suffix('.md')}")
 

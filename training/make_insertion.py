@@ -264,7 +264,7 @@ def main(out: Path, seed: int, steps: int, jobs: int, card_only: bool) -> None:
         start = time.perf_counter()
         traces = simulate_balanced(SUCCESSES, FAILURES, seed, jobs, lambda done, of: click.echo(f"{done} of {of} kept"))
         click.echo(f"{time.perf_counter() - start:.0f} s for {int(traces.cycle[-1]) + 1} cycles")
-        save_traces(out / "insertion.npz", traces)
+        save_traces(out / "insertion.npz", traces, force=True)
     click.echo(write_card(out, steps, jobs))
 
 

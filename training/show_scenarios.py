@@ -112,7 +112,7 @@ def main() -> None:
     recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
     runs = Parallel(n_jobs=args.n_jobs)(delayed(run)(s, args.cycles, recipe, args.seed) for s in SCENARIOS)
     Console(width=120).print(table_of(runs))
-    save(picture(runs), args.out, dpi=80)
+    save(picture(runs), args.out, dpi=80, force=True)
 
 
 if __name__ == "__main__":

@@ -281,7 +281,7 @@ def main() -> None:
     model = ModelPrediction.from_recipe(recipe, args.seed)
     history, features = train(model, data, args.steps)
     Console(width=150).print(table_of(history, f"{args.recipe} on {data.name}"))
-    save(picture(history, features, data), args.out / "training.png", dpi=80)
+    save(picture(history, features, data), args.out / "training.png", dpi=80, force=True)
     export_torchscript(model, args.out / "model.ts", trace=data.spec)
     if args.weights is not None:
         learned: dict[str, Any] = weights_of(model.spaces.net_.features)

@@ -160,7 +160,7 @@ def _complete(finished: Finished, policies: int) -> bool:
 
 def _report(curve: CostCurve, unit: str, interrupted: bool, out: OutFolder | None, as_json: bool) -> None:
     with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: _save(curve, unit, out))
+        files = [] if out is None else attempt(lambda: out.listed(_save(curve, unit, out)))
         if as_json:
             about = {
                 "verb": "costs",

@@ -62,7 +62,7 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
         from ..experiments.figures import save
         from ..experiments.pictures import data_picture
 
-        files = [save(data_picture(dataset, found.name), out.path / "data.png", force=out.force)]
+        files = out.listed([save(data_picture(dataset, found.name), out.path / "data.png", force=out.force)])
     if as_json:
         write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
         return
@@ -162,10 +162,10 @@ def _faults(found: Survey) -> list[Any]:
 @json_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool, as_json: bool) -> None:
     """Simulate insertions and write their forces and labels."""
-    from ..files import TRACES, check_output
+    from ..files import check_output
 
     must_have_mujoco()
-    check_output(out, TRACES, force)  # before minutes of physics
+    check_output(out, force)  # before minutes of physics
     from ..cells.simulation.generate import save_traces
     from ..cells.simulation.generate import simulate as simulate_traces
 

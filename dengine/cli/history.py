@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..records import Action, Reason
-from .options import cell_options, example, json_option, out_file_option
+from .options import cell_options, example, force_option, json_option, out_file_option
 from .output import duration, show, when, write_json
 
 if TYPE_CHECKING:
@@ -171,8 +171,9 @@ MOST = 5  # excesses that are named
     "--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references that are shown."
 )
 @out_file_option
+@force_option
 @json_option
-def explain(store: str, decision: str, neighbours: int, out: Path | None, as_json: bool) -> None:
+def explain(store: str, decision: str, neighbours: int, out: Path | None, force: bool, as_json: bool) -> None:
     """Say why a decision came out as it did.
 
     DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
@@ -194,18 +195,18 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, as_jso
         found = explain_stored(opened, decision, neighbours)
     finally:
         opened.close()
-    files = [] if out is None else [_drawn(found, out)]
+    files = [] if out is None else [_drawn(found, out, force)]
     if as_json:
         write_json({"verb": "explain", "store": store} | found.record() | {"files": files})
         return
     show(*_tables(found), *(f"Wrote {path}" for path in files))
 
 
-def _drawn(found: Explanation, out: Path) -> Path:
+def _drawn(found: Explanation, out: Path, force: bool) -> Path:
     from ..experiments.figures import save
     from ..experiments.pictures import explained_picture
 
-    return save(explained_picture(found), out)
+    return save(explained_picture(found), out, force=force)
 
 
 def _tables(found: Explanation) -> Iterator[Any]:

@@ -298,17 +298,21 @@ def must_have_mujoco() -> None:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-force_option = click.option(
-    "--force", is_flag=True, help="Replace whatever files are there; by default only earlier ones of the same kind."
-)
+force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
 
 
 @dataclass(frozen=True)
 class OutFolder:
-    """Where a verb's CSV and pictures go. force : whether they replace whatever file is there."""
+    """Where a verb's CSV and pictures go. force : whether they replace the files that are there."""
 
     path: Path
     force: bool = False
+
+    def listed(self, files: list[Path]) -> list[Path]:
+        """What was written, and the manifest that names it, which comes last."""
+        from ..files import write_manifest
+
+        return [*files, write_manifest(self.path, files, self.force)]
 
 
 def out_option(command: Command) -> Command:

@@ -165,7 +165,7 @@ def report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out:
     rows = [row | {"promise_kept": promise_kept(row)} for row in pool(frame, replays)]
     title = _title(dataset.name, by_name, not stream.shuffle)
     with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: _save(frame, replays, title, out))
+        files = [] if out is None else attempt(lambda: out.listed(_save(frame, replays, title, out)))
         retrains = {name: [r for each in some for r in each.retrains] for name, some in by_name.items()}
         found = _findings(frame)
         if as_json:
@@ -242,10 +242,10 @@ def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: OutFo
 def _save_grid(frame: pd.DataFrame, replays: Sequence[Replay], out: OutFolder) -> list[Path]:
     from ..experiments.figures import grid_figure, save
     from ..experiments.paper import grid_lines
-    from ..files import TABLES, write_output
+    from ..files import write_output
 
     page = "\n".join(grid_lines(frame)) + "\n"
-    files = [write_output(out.path / "tables.md", page.encode("utf-8"), TABLES, out.force, make_folder=True)]
+    files = [write_output(out.path / "tables.md", page.encode("utf-8"), out.force, make_folder=True)]
     for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
         files.append(save(grid_figure(some, name), out.path / f"grid_{_slug(name)}.png", force=out.force))
     return files

@@ -231,7 +231,7 @@ def _report(
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
     with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: _save(log, title, out))
+        files = [] if out is None else attempt(lambda: out.listed(_save(log, title, out)))
         if as_json:
             about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
             counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording}

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import without_password
-from .options import cell_options, example, json_option, out_file_option
+from .options import cell_options, example, force_option, json_option, out_file_option
 from .output import Asked, certificate_record, console, duration, interruptible, show, when, write_json
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def drawn(store: Store, recipe: Recipe, last: int, out: Path) -> Path:
     from ..experiments.pictures import status_picture
     from ..history.status import course
 
-    return save(status_picture(course(store, recipe, last), f"{store.cell_id}: {recipe.name}"), out)
+    return save(status_picture(course(store, recipe, last), f"{store.cell_id}: {recipe.name}"), out, force=True)
 
 
 STEP = 0.05  # seconds between two looks for Ctrl-C
@@ -238,8 +238,9 @@ SHADOW = "all of what it is certain of: the shadow mode, in which it only says w
     help="Show it again every so many seconds, 5 if none are given, until Ctrl-C; after STORE.",
 )
 @out_file_option
+@force_option
 @json_option
-def status(store: str, last: int, watch: float | None, out: Path | None, as_json: bool) -> None:
+def status(store: str, last: int, watch: float | None, out: Path | None, force: bool, as_json: bool) -> None:
     """Say how an engine is doing, and what its store holds.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. The interval of bad
@@ -247,6 +248,10 @@ def status(store: str, last: int, watch: float | None, out: Path | None, as_json
     """
     if watch is not None and as_json:
         raise click.UsageError("--watch and --json exclude each other.")
+    if out is not None:
+        from ..files import check_output
+
+        check_output(out, force)
     if watch is not None:
         redraw(lambda: _screen(store, last, out), watch)
         return

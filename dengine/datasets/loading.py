@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DataError
-from ..files import DATABASES
+from ..files import is_database
 from .arrays import from_pair, read_hdf5, read_npz
 from .bags import is_stream, read_bag
 from .dataset import Asked, Dataset, names_of
@@ -99,7 +99,7 @@ def _read(path: Path, asked: Asked) -> Dataset:
             f"folder of CSV files; {path} is neither."
         )
     suffix = path.suffix.lower()
-    if _is_database(path):
+    if is_database(path):
         asked.refuse("a store", "label", "labels")
         from .stores import read_store  # a database is imported where one is read
 
@@ -109,11 +109,6 @@ def _read(path: Path, asked: Asked) -> Dataset:
         raise DataError(f"Expected a file .npz, .csv, .parquet, .h5 or .mcap, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
-
-
-def _is_database(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(16).startswith(DATABASES)
 
 
 def _refuse(source: Any) -> Dataset:

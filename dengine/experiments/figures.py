@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OutputError
-from ..files import PICTURE, write_output
+from ..files import write_output
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import reducer_class
@@ -127,13 +127,13 @@ def draw_verified(
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
-    """Write a figure as its suffix says; makes the folder. OutputError where the file there is no picture, or `force`."""
+    """Write a figure as its suffix says; makes the folder. OutputError where a file is there, without `force`."""
     buffer = BytesIO()
     try:
         figure.savefig(buffer, dpi=dpi, format=Path(path).suffix.removeprefix(".") or "png")
     except ValueError as error:
         raise OutputError(f"Cannot draw {path}: {error}; name it .png, .pdf or .svg.") from error
-    return write_output(path, buffer.getvalue(), PICTURE, force, make_folder=True)
+    return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
 NEWEST = 300  # parts drawn, as many as the paper's window

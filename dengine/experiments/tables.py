@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..files import table_of, write_output
+from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
 from .replay import Replay
@@ -208,6 +208,6 @@ def encoder_line(replays: Sequence[Replay]) -> str:
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:
-    """The frame as CSV; makes the folder. OutputError where the file there is no earlier table of its kind, or `force`."""
+    """The frame as CSV; makes the folder. OutputError where a file is there, without `force`."""
     text = frame.to_csv(index=False, lineterminator="\n")
-    return write_output(path, text.encode("utf-8"), table_of(map(str, frame.columns)), force, make_folder=True)
+    return write_output(path, text.encode("utf-8"), force, make_folder=True)

@@ -26,7 +26,7 @@ import secrets
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -38,7 +38,7 @@ from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS
 from ..errors import ExportError, OutputError
-from ..files import SUMS, Kind, check_output, write_output
+from ..files import check_output, write_output
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
@@ -101,8 +101,7 @@ def signature(content: bytes, key: bytes) -> str:
 def listed(text: str, name: str) -> list[str]:
     """The first words of the lines that are about a file, or about none in particular.
 
-    Two while a file is being replaced: the earlier one and the next. A file that was renamed together with its one line is
-    still known by it.
+    A file that was renamed together with its one line is still known by it.
     """
     found: list[str] = []
     others: list[str] = []
@@ -126,36 +125,6 @@ def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
         raise ExportError(f"The signature of {path} cannot be read: {error}.") from error
     if not any(hmac.compare_digest(each.encode(), found.encode()) for each in known):
         raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
-
-
-def write_signatures(path: Path, signatures: Sequence[str]) -> None:
-    """One line each, all at once."""
-    target = signature_file(path)
-    partial = target.with_name(f"{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        with partial.open("x", encoding="utf-8") as file:
-            file.writelines(f"{each}  {path.name}\n" for each in signatures)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
-    except OSError as error:
-        raise _unwritable(target, error) from error
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def earlier_signatures(path: Path) -> list[str]:
-    """The signatures that may hold for the file that is there. ExportError for a file of that name that is none of ours."""
-    known = signature_file(path)
-    try:
-        found = listed(known.read_text(encoding="utf-8"), path.name)
-    except FileNotFoundError:
-        return []
-    except (OSError, UnicodeDecodeError):
-        found = [""]
-    if not all(each.startswith(PREFIX) for each in found):
-        raise ExportError(f"{known} is no signature of dengine's and would be replaced; move it away.")
-    return found
 
 
 SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
@@ -237,66 +206,34 @@ def _guarantee_of(rule: Any) -> str:
 def write_export(
     path: str | os.PathLike[str],
     content: bytes,
-    kind: Kind,
     force: bool = False,
     key: KeyFile | None = None,
     source: Exportable | None = None,
 ) -> Path:
-    """`write_checked`, signed with a key, and noted in the store that the engine remembers in.
+    """Write a file, its checksum, and with a key its signature; note it in the store that the engine remembers in.
 
-    The new signature stands beside the earlier one until the file is replaced, so that one of them always fits.
+    ExportError where they must not or cannot be written. A file, its sum and its signature are renames of their own:
+    where a kill comes between, the file is refused as damaged until it is exported again.
     """
-    target, secret = Path(path), None if key is None else read_key(key)
-    check_target(target, kind, force)
-    earlier = earlier_signatures(target)
-    if secret is not None:
-        write_signatures(target, [*earlier[-1:], signature(content, secret)])
+    target, secret, digest = Path(path), None if key is None else read_key(key), hashlib.sha256(content).hexdigest()
+    check_target(target, force)
     if source is not None and source.note is not None:
-        source.note("export", f"{hashlib.sha256(content).hexdigest()} {target.name}, version {source.model_version}")
-    written = write_checked(target, content, kind, force)
-    if secret is not None:
-        write_signatures(target, [signature(content, secret)])
-    elif earlier:
-        signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
-    return written
-
-
-def check_target(path: str | os.PathLike[str], kind: Kind, force: bool) -> None:
-    """ExportError where a file and its sum must not be written: before the work of an export."""
+        source.note("export", f"{digest} {target.name}, version {source.model_version}")
     with _as_export_error():
-        check_output(path, kind, force)
-        check_output(sum_file(Path(path)), SUMS, force)
-
-
-def write_checked(path: str | os.PathLike[str], content: bytes, kind: Kind, force: bool = False) -> Path:
-    """Write a file and its checksum; ExportError where they must not or cannot be written.
-
-    A file and its sum are two renames, and a kill may come between: so until both are done the sum file lists the new sum
-    and that of the file that is there, a line each, and whichever file is there is accepted.
-    """
-    target, digest = Path(path), hashlib.sha256(content).hexdigest()
-    check_target(target, kind, force)
-    with _as_export_error():
-        sums = [digest, *_accepted(target, digest)]
-        write_output(sum_file(target), _sum_lines(sums, target), SUMS, force)
-        write_output(target, content, kind, force)
-        if len(sums) > 1:
-            write_output(sum_file(target), _sum_lines([digest], target), SUMS, force)
+        write_output(target, content, force)
+        write_output(sum_file(target), f"{digest}  {target.name}\n".encode(), force)
+        if secret is not None:
+            write_output(signature_file(target), f"{signature(content, secret)}  {target.name}\n".encode(), force)
+        elif force:
+            signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
     return target
 
 
-def _sum_lines(sums: Sequence[str], target: Path) -> bytes:
-    return "".join(f"{digest}  {target.name}\n" for digest in sums).encode()
-
-
-def _accepted(target: Path, new: str) -> list[str]:
-    """The sum of the file that is there, where its sum file lists it and it is another one."""
-    try:
-        checked_bytes(target)
-    except ExportError:
-        return []  # it was not accepted before
-    old = hashlib.sha256(target.read_bytes()).hexdigest()
-    return [old] if old != new else []
+def check_target(path: str | os.PathLike[str], force: bool) -> None:
+    """ExportError where a file, its sum or its signature must not be written: before the work of an export."""
+    with _as_export_error():
+        for each in (Path(path), sum_file(Path(path)), signature_file(Path(path))):
+            check_output(each, force)
 
 
 @contextmanager
@@ -338,7 +275,7 @@ def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
 
 
 def _sums_of(path: Path) -> list[str]:
-    """The sums that a sum file lists: one, or two where an export was killed between its two renames."""
+    """The sums that a sum file lists for a file."""
     sums = listed(_read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace"), path.name)
     if not sums or any(not SHA256.fullmatch(each) for each in sums):
         raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")

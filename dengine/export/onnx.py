@@ -30,7 +30,6 @@ from torch import Tensor, nn
 from ..decision.references import FARTHEST
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
-from ..files import ONNX
 from ..model.base import Exportable
 from ..model.compiled import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
@@ -72,7 +71,7 @@ def export_onnx(
     the interval has no module, a package is missing, onnxruntime does not decide as the model does, or `path` cannot be
     written. force : as of `export_torchscript`.
     """
-    check_target(path, ONNX, force)
+    check_target(path, force)
     onnx = _package("onnx")
     source = source_of(engine_or_model, trace)
     decision_module(source)  # the same refusals as for TorchScript
@@ -84,7 +83,7 @@ def export_onnx(
     onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
     content = program.SerializeToString()
     _check(OnnxModel(content, metadata), source.model, source.trace)
-    return write_export(path, content, ONNX, force, key, source)
+    return write_export(path, content, force, key, source)
 
 
 def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> OnnxModel:

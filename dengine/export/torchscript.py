@@ -33,7 +33,6 @@ from .. import __version__
 from ..decision.rule import SAFE_MODE, script
 from ..engine.decide import as_part
 from ..errors import ExportError
-from ..files import TORCHSCRIPT
 from ..folds import part_hash
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
 from ..traces import as_trace, as_traces
@@ -86,18 +85,18 @@ def export_torchscript(
     An accepted part of which nothing is known yet stays with the engine: export when none is under way.
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
     key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
-    force : replace whatever file is there; by default only an earlier export is, and never a database, a folder or a link.
+    force : replace the file that is there; never a database, a folder or a link.
     Raises ExportError where nothing was trained yet, the reducer, the interval or the rule cannot be scripted, or `path`
     cannot be written: what was there is then as it was.
     """
-    check_target(path, TORCHSCRIPT, force)
+    check_target(path, force)
     source = source_of(engine_or_model, trace)
     try:
         frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=list(METHODS))
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
-    return write_export(path, _content(frozen, metadata), TORCHSCRIPT, force, key, source)
+    return write_export(path, _content(frozen, metadata), force, key, source)
 
 
 def _content(module: Any, metadata: dict[str, Any]) -> bytes:
@@ -186,7 +185,7 @@ class ExportedModel:
         key, force : as of `export_torchscript`.
         """
         now = {"references": self._asked.n_references(), "references_sha256": None}  # the sum is that of the first export
-        return write_export(path, _content(self.module, self.metadata | now), TORCHSCRIPT, force, key)
+        return write_export(path, _content(self.module, self.metadata | now), force, key)
 
 
 class FirstSchema:

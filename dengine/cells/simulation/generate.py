@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import SettingError
-from ...files import TRACES, write_output
+from ...files import write_output
 from .cell import Insertion, insert_once
 from .conditions import CHANNELS, RATE_HZ, CellParameters, find_scenario
 from .world import TIME_STEP_S
@@ -141,7 +141,7 @@ def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) 
 
     Keys: X int16 with `scale` (X * scale is in `unit`), y int8, cause str, height_mm float32, cycle int32, the draws
     as `conditions` (n, m) float32 with their names `condition_names`, and rate_hz, unit, seed, scenario, simulated.
-    OutputError where the file there was not written by this, or `force`.
+    OutputError where a file is there, without `force`.
     """
     buffer = BytesIO()
     scale = _scale(traces.X)
@@ -162,7 +162,7 @@ def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) 
         scenario=np.array(traces.scenario),
         simulated=np.array(True),
     )
-    return write_output(path, buffer.getvalue(), TRACES, force, make_folder=True)
+    return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
 def _scale(X: NDArray[np.float32]) -> NDArray[np.float64]:

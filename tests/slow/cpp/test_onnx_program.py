@@ -91,9 +91,8 @@ def test_what_must_not_be_used_is_refused(programs: Path, signed: tuple[Path, Pa
         file.write_bytes(content)
     elif kind == "foreign":
         from dengine.export.bundle import write_export
-        from dengine.files import ONNX
 
-        write_export(file, b"garbage", ONNX, key=key)
+        write_export(file, b"garbage", force=True, key=key)
     elif kind == "no sum":
         file.with_name("model.onnx.sha256").unlink()
     elif kind == "unsigned":

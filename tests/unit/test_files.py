@@ -1,0 +1,176 @@
+"""Outputs: whole or not at all, and never over what is there."""
+
+import hashlib
+import json
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from dengine import DataEngine, export_torchscript, load_exported
+from dengine.cli import main
+from dengine.errors import ExportError, OutputError
+from dengine.export import sum_file
+from dengine.files import DATABASES, check_output, write_manifest, write_output
+
+TEXT = b"my notes\n"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
+    path, data = tmp_path_factory.mktemp("outputs") / "engine.db", make_data(70)
+    with DataEngine("pca", retrain_every=60, store=path) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, y)
+    return path
+
+
+def dengine(*words: object):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+def test_a_file_that_is_there_is_refused_and_left_and_replaced_by_force(tmp_path: Path) -> None:
+    target = tmp_path / "file"
+    target.write_bytes(TEXT)
+    with pytest.raises(OutputError, match=r"exists, and was left as it was; name another file, or replace it with --force"):
+        write_output(target, b"new")
+    assert target.read_bytes() == TEXT
+    assert write_output(target, b"new", force=True).read_bytes() == b"new"
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(tmp_path: Path, force: bool) -> None:
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "mine").write_bytes(TEXT)
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
+    places = {name: tmp_path / name for name in ("folder", "pipe", "link", "dangling")} | {"device": Path("/dev/null")}
+    for name, target in places.items():
+        with pytest.raises(OutputError, match=f"is a {'link' if name == 'dangling' else name}; name another one"):
+            write_output(target, b"new", force)
+    assert (tmp_path / "mine").read_bytes() == TEXT
+    assert not (tmp_path / "nothing").exists()
+    assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
+
+
+def test_no_part_of_a_database_is_replaced_even_by_force(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "a.db") as connection:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("CREATE TABLE t (x)")
+        connection.commit()
+        for name in ("a.db", "a.db-wal"):
+            assert (tmp_path / name).read_bytes().startswith(DATABASES)
+            with pytest.raises(OutputError, match="is a database"):
+                check_output(tmp_path / name, force=True)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300, "missing/model.ts"])
+def test_a_name_that_no_file_can_have_is_an_error_of_ours(name: str, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="choose a folder that exists, is writable and has room"):
+        write_output(tmp_path / name, b"new")
+
+
+def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_path: Path) -> None:
+    first, second = (write_output(tmp_path / name, name.encode()) for name in ("a.csv", "b.png"))
+    write_manifest(tmp_path, [first])
+    listed = json.loads(write_manifest(tmp_path, [second]).read_text())["sha256"]
+    assert listed == {each.name: hashlib.sha256(each.read_bytes()).hexdigest() for each in (first, second)}
+    (tmp_path / "manifest.json").write_text('{"name": "my web page"}')
+    with pytest.raises(OutputError, match="was left as it was"):
+        write_manifest(tmp_path, [first])
+
+
+def test_recorded_traces_are_not_replaced_by_simulated_ones(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    recorded = tmp_path / "recorded.npz"
+    np.savez(recorded, X=np.zeros((3, 5)), y=np.zeros(3))
+    before = recorded.read_bytes()
+    done = dengine("simulate", "--n", 2, "--out", recorded, "--n-jobs", 1)
+    assert (done.exit_code, recorded.read_bytes()) == (1, before)
+    assert "--force" in done.output
+    assert dengine("simulate", "--n", 2, "--out", recorded, "--n-jobs", 1, "--force").exit_code == 0
+
+
+def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path: Path) -> None:
+    target = tmp_path / "model.ts"
+    for present in (target, sum_file(target)):
+        present.write_bytes(TEXT)
+        done = dengine("export", store, "--out", target)
+        assert (done.exit_code, present.read_bytes()) == (1, TEXT)
+        assert [each.name for each in tmp_path.iterdir()] == [present.name]
+        present.unlink()
+    target.write_bytes(TEXT)
+    (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
+    assert dengine("export", store, "--out", target, "--force").exit_code == 0
+    assert sum_file(target).read_text() == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
+    assert load_exported(target).trace.samples == 100
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+@pytest.mark.parametrize("form", ["torchscript", "onnx"])
+def test_an_export_onto_its_own_store_is_refused_and_the_store_untouched(store: Path, force: list, form: str) -> None:
+    before = hashlib.sha256(store.read_bytes()).hexdigest()
+    done = dengine("export", store, "--out", store, "--format", form, *force)
+    assert (done.exit_code, len(done.output.splitlines())) == (1, 1)
+    assert "is a database, as a store is, and was left as it was" in done.output
+    assert hashlib.sha256(store.read_bytes()).hexdigest() == before
+    assert not sum_file(store).exists()
+
+
+def test_an_export_that_was_killed_between_file_and_sum_is_refused_until_it_is_done_again(
+    store: Path, tmp_path: Path
+) -> None:
+    with DataEngine.open(store) as engine:
+        file = export_torchscript(engine, tmp_path / "model.ts")
+        sum_file(file).write_text("0" * 64 + "  model.ts\n")
+        with pytest.raises(ExportError, match="is damaged or truncated"):
+            load_exported(file)
+        load_exported(export_torchscript(engine, file, force=True))
+
+
+FULL = """
+import resource, signal, sys
+from dengine import DataEngine, export_torchscript
+from dengine.errors import DengineError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+with DataEngine.open(sys.argv[1]) as engine:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # as a disk that fills up
+    try:
+        export_torchscript(engine, sys.argv[2], force=True)
+    except DengineError as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store: Path, tmp_path: Path) -> None:
+    with DataEngine.open(store) as engine:
+        model = export_torchscript(engine, tmp_path / "model.ts")
+    before = model.read_bytes()
+    done = subprocess.run([sys.executable, "-c", FULL, store, model], capture_output=True, text=True, check=False)
+    assert done.stdout.startswith(f"ExportError Cannot write {model}: File too large; choose a folder"), done.stderr
+    assert model.read_bytes() == before
+    load_exported(model)
+    assert {each.name for each in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
+
+
+def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(tmp_path: Path) -> None:
+    for name in ("data.png", "replays.csv"):
+        (tmp_path / name).write_bytes(TEXT)
+    words = ["replay", "--repeats", "1", "--cycles", "60", "--reducer", "pca", "--out", tmp_path]
+    done = dengine(*words)
+    assert done.exit_code == 1
+    assert "was left as it was" in " ".join(done.output.split())
+    assert (tmp_path / "replays.csv").read_bytes() == TEXT
+    assert not (tmp_path / "manifest.json").exists()
+    assert "certain" in done.output  # what took long is shown all the same
+    assert dengine(*words, "--force").exit_code == 0
+    listed = set(json.loads((tmp_path / "manifest.json").read_text())["sha256"])
+    assert listed == {each.name for each in tmp_path.iterdir()} - {"data.png", "manifest.json"}
