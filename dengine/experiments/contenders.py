@@ -46,7 +46,8 @@ class Contender:
         if isinstance(asked, Contender):
             return asked
         if isinstance(asked, str) and asked in RIVALS:
-            return cls(asked, Recipe(), asked, RIVALS[asked].chosen)
+            rival = RIVALS[asked]
+            return cls(asked, Recipe(), asked, rival.tries[rival.chosen])
         recipe = Recipe.load(asked)
         by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
         return cls(Path(asked).stem if by_name else recipe.name, recipe)

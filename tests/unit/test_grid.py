@@ -155,7 +155,7 @@ def test_a_killed_grid_redoes_only_what_was_running(data: Dataset, tmp_path: Pat
 def test_a_rival_without_its_library_is_refused_before_anything_is_played(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(RIVALS, "always", replace(RIVALS["always"], needs="no_such_library"))
+    monkeypatch.setattr(RIVALS["always"], "needs", "no_such_library")
     with pytest.raises(SettingError, match="always needs no_such_library"):
         run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -1,10 +1,11 @@
-"""What every rival shares: the policy's numbers, one look a trace, and caution where nothing could be learned."""
+"""What rivals share: the policy's numbers, one look a trace, caution where nothing was learned, and features."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,8 +33,7 @@ class Judgement:
     @classmethod
     def without_counts(cls, action: NDArray[Any], lower: Floats, upper: Floats) -> Judgement:
         """Of a method that counts nothing."""
-        nothing = np.zeros(len(lower), dtype=np.int64)
-        return cls(action, lower, upper, nothing, nothing)
+        return cls(action, lower, upper, *np.zeros((2, len(lower)), dtype=np.int64))
 
     @classmethod
     def same(cls, n: int, action: Action) -> Judgement:
@@ -44,14 +44,25 @@ class Judgement:
 class Rival(ABC):
     """A method of somebody else's behind the five methods of `Model`.
 
-    alpha, lower_bound : as in `Policy`; they are numbers of the rival here, and it says what it makes of them.
+    alpha, lower_bound : as in `Policy`; numbers of the rival here, and it says what it makes of them.
     seed : of all that it draws; the same seed and the same labels give the same decisions.
 
     A subclass gives `_learn` and `_judge`, and `_take` where it learns between two trainings. Where a training cannot be
-    done, on labels of one class or on too few, every part is verified until the next one.
-    The engine asks `predict_interval`, `count` and `decide` in turn about the same trace: the first of them does the work,
-    and what it found is kept for the other two, until something is learned or another trace comes.
+    done, on labels of one class or on too few, every part is verified until the next one. The engine asks
+    `predict_interval`, `count` and `decide` in turn about one trace: the first does the work, the others remember it.
+
+    title : for a table.  source : the paper, or the library.  needs : the library beyond what dengine needs.
+    bound : what bound its decisions keep; "" where it has none, and its threshold is swept.
+    tries : four sets of parameters, as many as ours, to choose among on other seeds than those reported.
+    chosen : which of them.
     """
+
+    title: ClassVar[str]
+    source: ClassVar[str]
+    bound: ClassVar[str] = ""
+    needs: ClassVar[str] = ""
+    tries: ClassVar[tuple[Mapping[str, Any], ...]] = ({},) * 4
+    chosen: ClassVar[int] = 0
 
     def __init__(self, alpha: float, lower_bound: float, seed: int = 0) -> None:
         self.policy = Policy(alpha, lower_bound)
@@ -75,13 +86,13 @@ class Rival(ABC):
 
     def count(self, X: ArrayLike) -> tuple[Counts, Counts]:
         """(n_success, n_failure), each (n,), behind each prediction; zeros of a method that counts nothing."""
-        told = self.judge(X)
-        return told.n_success, told.n_failure
+        found = self.judge(X)
+        return found.n_success, found.n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """(lower, upper), each (n,), of the success probability; the same number twice where there is only a point."""
-        told = self.judge(X)
-        return told.lower, told.upper
+        found = self.judge(X)
+        return found.lower, found.upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """(n,) an `Action` for each trace of X (n, C, T)."""
@@ -106,10 +117,6 @@ class Rival(ABC):
     def _take(self, X: Traces, good: bool) -> None:  # noqa: B027  # a default: the next training learns it
         """Learn one trace (1, C, T)."""
 
-    def _by_bound(self, lower: Floats, upper: Floats, n_success: Counts, n_failure: Counts) -> Judgement:
-        """A judgement by the paper's rule: accept where lower >= LB, reject where upper <= 1 - LB."""
-        return Judgement(self.policy.actions(lower, upper), lower, upper, n_success, n_failure)
-
 
 class ThresholdRival(Rival):
     """A rival with one number for each trace, its success probability as it believes: accept from one threshold on, reject
@@ -126,10 +133,10 @@ class ThresholdRival(Rival):
 
     def _judge(self, X: Traces) -> Judgement:
         p = self._probability(X)
-        return Judgement.without_counts(chosen(p >= self.accept_at, p <= self.reject_at), p, p)
+        return Judgement.without_counts(actions_of(p >= self.accept_at, p <= self.reject_at), p, p)
 
 
-def chosen(accept: Labels, reject: Labels) -> NDArray[Any]:
+def actions_of(accept: Labels, reject: Labels) -> NDArray[Any]:
     """(n,) of `Action`: from what to accept and what to reject, each (n,); VERIFY for the rest."""
     position = np.where(accept, ACTIONS.index(Action.ACCEPT), np.where(reject, ACTIONS.index(Action.REJECT), 0))
     return np.array([ACTIONS[i] for i in position], dtype=object)
@@ -156,3 +163,70 @@ def whole(name: str, value: Any, least: int = 1) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
     return value
+
+
+class Components:
+    """The first principal components of traces, scaled.
+
+    n_components : how many.
+    whiten : each to unit variance; otherwise all by the first one's deviation, so that they keep their proportions.
+    """
+
+    def __init__(self, n_components: int, *, whiten: bool, seed: int) -> None:
+        from ...reducers.pca import PcaReducer
+
+        self.n_components, self.whiten = n_components, whiten
+        self._pca = PcaReducer(n_components=n_components, random_state=seed)
+
+    def can_fit(self, X: Traces) -> bool:
+        """Whether traces (n, C, T) are enough."""
+        return len(X) > self.n_components and X[0].size >= self.n_components
+
+    def fit(self, X: Traces) -> Floats:
+        """Find the components of traces (n, C, T); returns these traces as (n, d)."""
+        placed = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
+        deviation = placed.std(axis=0)
+        scale = deviation if self.whiten else np.full_like(deviation, deviation[0])
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        return np.asarray(placed / self._scale)
+
+    def transform(self, X: Traces) -> Floats:
+        """(n, C, T) -> (n, d)."""
+        return np.asarray(self._pca.transform(X) / self._scale, dtype=np.float64)
+
+
+def segment_means(X: Traces, segments: int) -> Floats:
+    """(n, C, T) -> (n, C * segments): means of stretches of about equal length, at most T of them."""
+    n, channels, samples = X.shape
+    starts = np.unique(np.linspace(0, samples, min(segments, samples), endpoint=False).astype(int))
+    lengths = np.diff(np.append(starts, samples))
+    sums = np.add.reduceat(X.astype(np.float64), starts, axis=2)
+    return np.asarray((sums / lengths).reshape(n, channels * len(starts)))
+
+
+class References:
+    """Labelled points (n, d) to which one more can be added at little cost."""
+
+    def __init__(self, points: Floats, good: Labels) -> None:
+        self._points, self._good, self._size = points.copy(), good.copy(), len(good)
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def points(self) -> Floats:
+        """(n, d)."""
+        return self._points[: self._size]
+
+    @property
+    def good(self) -> Labels:
+        """(n,)."""
+        return self._good[: self._size]
+
+    def add(self, point: Floats, good: bool) -> None:
+        """One more point (1, d); the room doubles when it is used up."""
+        if self._size == len(self._good):
+            self._points = np.concatenate([self._points, np.empty_like(self._points)])
+            self._good = np.concatenate([self._good, np.empty_like(self._good)])
+        self._points[self._size], self._good[self._size] = point[0], good
+        self._size += 1

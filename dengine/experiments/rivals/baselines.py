@@ -1,9 +1,4 @@
-"""An off-the-shelf stream learner: river's adaptive random forest, one trace after the other.
-
-The two ends of the scale: verify every part, and verify none.
-
-k nearest neighbours that all agree: the authors' own predecessor.
-"""
+"""Rivals without a bound: verify always or never, k neighbours that agree, a stream learner."""
 
 from __future__ import annotations
 
@@ -15,12 +10,15 @@ from numpy.typing import ArrayLike
 
 from ...errors import SettingError
 from ...records import Action
-from .base import Floats, Judgement, Labels, Rival, ThresholdRival, Traces, chosen, whole
-from .features import References, segment_means
+from .base import Floats, Judgement, Labels, References, Rival, ThresholdRival, Traces, actions_of, segment_means, whole
 
 
 class AlwaysVerify(Rival):
     """Every part is verified: no error, and nothing saved."""
+
+    title = "always verify"
+    source = "the cell as it is"
+    bound = "no error: every part is verified"
 
     def _learn(self, X: Traces, good: Labels) -> bool:
         return True
@@ -34,6 +32,9 @@ class NeverVerify(Rival):
 
     An engine has no model before its first retrain, so the first `retrain_every` parts are verified all the same.
     """
+
+    title = "never verify"
+    source = "the cell without its check"
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Nothing to learn: labels of one class are as good as any."""
@@ -57,6 +58,10 @@ class AgreeingNeighbours(Rival):
     Source: Duan et al. (2025), as the paper's section "Related Work" describes it.
     """
 
+    title = "k-NN, all k agree"
+    source = "Duan et al. (2025), the authors' predecessor"
+    tries = ({"k": 5}, {"k": 10}, {"k": 20}, {"k": 40})
+
     def __init__(self, alpha: float, lower_bound: float, seed: int = 0, *, k: int = 10) -> None:
         super().__init__(alpha, lower_bound, seed)
         self.k = whole("k", k)
@@ -75,7 +80,7 @@ class AgreeingNeighbours(Rival):
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
         share = n_success / self.k
-        action = chosen(n_success == self.k, n_success == 0)
+        action = actions_of(n_success == self.k, n_success == 0)
         return Judgement(action, share, share, n_success, self.k - n_success)
 
 
@@ -95,6 +100,11 @@ class StreamForest(ThresholdRival):
     in addition. `predict_interval` gives the votes' share twice; it is no bound.
     Source: Gomes et al. (2017), "Adaptive random forests for evolving data stream classification", Machine Learning 106.
     """
+
+    title = "adaptive random forest"
+    source = "Gomes et al. (2017), river"
+    tries = ({"threshold": 0.8}, {"threshold": 0.9}, {"threshold": 0.95}, {"threshold": 0.99})
+    needs = "river"
 
     def __init__(
         self,

@@ -1,0 +1,375 @@
+"""Rivals that keep a bound of their own: kernel densities, a Gaussian process, and thresholds with a guaranteed risk."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...decision.intervals import normal_quantile, wilson_interval
+from ...errors import SettingError
+from .base import (
+    Components,
+    Floats,
+    Judgement,
+    Labels,
+    References,
+    Rival,
+    ThresholdRival,
+    Traces,
+    positive,
+    segment_means,
+    whole,
+)
+
+BANDWIDTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8)  # to choose among, in deviations of a component
+MOST_CHOOSING = 1000  # traces that the bandwidth is chosen on: the work grows with their square
+DIMENSIONS = 2
+
+
+class WilsonKernelDensity(Rival):
+    """Kernel-weighted counts of successes and failures, Wilson's interval, and the paper's rule.
+
+    bandwidth : h, in deviations of each principal component; None: chosen at each training, among `BANDWIDTHS`, by the
+        leave-one-out likelihood of the labels.
+
+    With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is the kernel regression m = sum w_i y_i / sum w_i, and
+    the number of trials is n = sum K_H(z - z_i) |H| / R(K), K the normal density and R(K) = (4 pi)^(-d/2) its squared
+    integral: n = 2^(d/2) sum w_i, here 2 sum w_i. That is the sample size which the asymptotic variance of kernel
+    regression, m (1 - m) R(K) / (N h^d f), stands for, and where traces lie densely it equals Kish's (sum w)^2 / sum w^2.
+    It is no count: a lone label at the very place of the query counts as two, and a kernel wider than the data counts
+    every label twice. So the method has a bound in form, but only where the kernel is narrow and many labels lie within.
+
+    Source: Iversen, Duan and Hagelskjær (2026), "Estimation of Confidence Bounds in Binary Classification using Wilson
+    Score Kernel Density Estimation", arXiv:2602.20947; n, and H in proportion to the root of the covariance, as in the
+    authors' public implementation, github.com/SDU-Robotics/wilson-score-kde. Our reading: two principal components as
+    features, and the likelihood of Wilson's centre, (n m + z^2 / 2) / (n + z^2), which no lone wrong neighbour sends to 0.
+    """
+
+    title = "Wilson-score kernel density"
+    source = "Iversen, Duan and Hagelskjær (2026), arXiv:2602.20947"
+    bound = "Wilson interval of kernel-weighted counts, at one look"
+    tries = ({"bandwidth": None}, {"bandwidth": 0.1}, {"bandwidth": 0.2}, {"bandwidth": 0.4})
+
+    def __init__(self, alpha: float, lower_bound: float, seed: int = 0, *, bandwidth: float | None = None) -> None:
+        super().__init__(alpha, lower_bound, seed)
+        self.bandwidth = None if bandwidth is None else float(positive("bandwidth", bandwidth))
+        self._components = Components(DIMENSIONS, whiten=True, seed=seed)
+
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        if not self._components.can_fit(X):
+            return False
+        Z = self._components.fit(X)
+        self._references = References(Z, good)
+        self.bandwidth_ = self.bandwidth or chosen_bandwidth(Z[-MOST_CHOOSING:], good[-MOST_CHOOSING:], self.policy.alpha)
+        return True
+
+    def _take(self, X: Traces, good: bool) -> None:
+        self._references.add(self._components.transform(X), good)
+
+    def _judge(self, X: Traces) -> Judgement:
+        Z, held = self._components.transform(X), self._references
+        n_success, n_failure = kernel_counts(squared_distances(Z, held.points), held.good, self.bandwidth_)
+        lower, upper = wilson_interval(n_success, n_failure, self.policy.alpha)
+        whole_numbers = (np.rint(n).astype(np.int64) for n in (n_success, n_failure))
+        return Judgement(self.policy.actions(lower, upper), lower, upper, *whole_numbers)
+
+
+def squared_distances(Z: Floats, points: Floats) -> Floats:
+    """(n, d) and (m, d) -> (n, m)."""
+    from scipy.spatial.distance import cdist
+
+    return np.asarray(cdist(Z, points, "sqeuclidean"))
+
+
+def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Floats, Floats]:
+    """(n_success, n_failure), each (n,), no whole numbers: from squared distances (n, m) in two dimensions, labels (m,)."""
+    weights = np.exp(-0.5 * distances / bandwidth**2) * 2.0 ** (DIMENSIONS / 2)
+    return weights @ good, weights @ ~good
+
+
+def chosen_bandwidth(Z: Floats, good: Labels, alpha: float) -> float:
+    """The bandwidth among `BANDWIDTHS` under which labels (n,) at Z (n, 2) are most likely, each left out in turn."""
+    distances = squared_distances(Z, Z)
+    np.fill_diagonal(distances, np.inf)
+    z = normal_quantile(alpha)
+    return max(BANDWIDTHS, key=lambda h: _log_likelihood(*kernel_counts(distances, good, h), good, z))
+
+
+def _log_likelihood(n_success: Floats, n_failure: Floats, good: Labels, z: float) -> float:
+    rate = (n_success + z * z / 2.0) / (n_success + n_failure + z * z)
+    return float(np.log(np.where(good, rate, 1.0 - rate)).sum())
+
+
+MOST_TRAINED = 500  # traces to train on: the work of a training grows with their cube
+
+
+class GaussianProcess(Rival):
+    """scikit-learn's Gaussian-process classifier on principal components; the paper's rule on its credible interval.
+
+    n_components : principal components, which keep their proportions.
+    amplitude : the largest deviation that the prior of the latent function may have, above 1, in logits. The marginal
+        likelihood drives it up where classes part well; then the interval stays wide even amid hundreds of successes.
+
+    The latent function f at a trace has mean m and variance v under Laplace's approximation; the interval of the success
+    probability is sigmoid(m -+ z sqrt(v)), z the 1 - alpha/2 normal quantile as with Wilson. It is a credible interval: it
+    holds under the prior, a scaled squared exponential of one length scale, both chosen by the marginal likelihood.
+    Trained on the newest 500 labels only, because of its cost; nothing is learned between two trainings.
+    Source: Rasmussen and Williams (2006), "Gaussian Processes for Machine Learning", Algorithms 3.1 and 3.2.
+    Raises SettingError for a scikit-learn before 1.7, which does not tell the latent mean and variance.
+    """
+
+    title = "Gaussian process"
+    source = "Rasmussen and Williams (2006), scikit-learn"
+    bound = "credible interval under the prior, at one look"
+    tries = (
+        {"n_components": 2, "amplitude": 2.0},
+        {"n_components": 2, "amplitude": 3.0},
+        {"n_components": 5, "amplitude": 3.0},
+        {"n_components": 2, "amplitude": 10.0},
+    )
+    chosen = 2
+
+    def __init__(
+        self, alpha: float, lower_bound: float, seed: int = 0, *, n_components: int = 2, amplitude: float = 3.0
+    ) -> None:
+        from sklearn.gaussian_process import GaussianProcessClassifier
+
+        super().__init__(alpha, lower_bound, seed)
+        if not hasattr(GaussianProcessClassifier, "latent_mean_and_variance"):
+            raise SettingError("The rival gp needs scikit-learn 1.7 or newer; pip install -U scikit-learn.")
+        self.n_components = whole("n_components", n_components)
+        if positive("amplitude", amplitude) <= 1.0:
+            raise SettingError(f"Expected amplitude above 1, got {amplitude!r}; 3 is a success rate of 5 to 95 %.")
+        self.amplitude = float(amplitude)
+        self._components = Components(n_components, whiten=False, seed=seed)
+
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        from sklearn.gaussian_process import GaussianProcessClassifier
+        from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+        newest, labels = X[-MOST_TRAINED:], good[-MOST_TRAINED:]
+        if not self._components.can_fit(newest) or len(np.unique(labels)) < 2:
+            return False
+        kernel = ConstantKernel(1.0, (0.1, self.amplitude**2)) * RBF(0.5, (0.01, 10.0))
+        classifier = GaussianProcessClassifier(kernel, random_state=self.seed)
+        with warnings.catch_warnings():  # it warns of an optimum at a limit, and the limit is meant
+            warnings.filterwarnings("ignore", message="The optimal value found")
+            self._classifier = classifier.fit(self._components.fit(newest), labels)
+        return True
+
+    def _judge(self, X: Traces) -> Judgement:
+        mean, variance = self._classifier.latent_mean_and_variance(self._components.transform(X))
+        lower, upper = credible_interval(mean, variance, self.policy.alpha)
+        return Judgement.without_counts(self.policy.actions(lower, upper), lower, upper)
+
+
+def credible_interval(mean: Floats, variance: Floats, alpha: float) -> tuple[Floats, Floats]:
+    """(lower, upper), each (n,), of a probability whose logit is normal with this mean and variance."""
+    from scipy.special import expit
+
+    half = normal_quantile(alpha) * np.sqrt(np.maximum(variance, 0.0))
+    return np.asarray(expit(mean - half)), np.asarray(expit(mean + half))
+
+
+def risk_bound(n_wrong: int, n: int, delta: float) -> float:
+    """The largest risk under which n_wrong or fewer errors in n have a probability of at least delta.
+
+    The paper's B*, the inversion of the binomial tail. 1 where nothing was seen.
+    Source: Geifman and El-Yaniv (2017), "Selective classification for deep neural networks", NIPS 30, Algorithm 1.
+    """
+    from scipy.special import betaincinv
+
+    return 1.0 if n_wrong >= n else float(betaincinv(n_wrong + 1.0, n - n_wrong, 1.0 - delta))
+
+
+def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: float) -> float:
+    """The confidence from which on a classifier errs with at most `risk`; infinity where no threshold can be vouched for.
+
+    confidence, wrong : (m,) of traces that the classifier was not trained on, and whether it errs on each.
+    With probability 1 - delta over these traces the risk beyond the threshold is at most `risk`, if they are independent
+    draws from what will be decided: ceil(log2 m) thresholds are looked at, each with its share of delta.
+    """
+    ordered = np.sort(confidence)
+    m, found = len(ordered), math.inf
+    looks = max(1, math.ceil(math.log2(max(m, 1))))
+    low, high = 1, m  # ranks, as in the paper
+    for _ in range(looks if m else 0):
+        rank = math.ceil((low + high) / 2)
+        beyond = confidence >= ordered[rank - 1]
+        if risk_bound(int(wrong[beyond].sum()), int(beyond.sum()), delta / looks) < risk:
+            high, found = rank, float(ordered[rank - 1])
+        else:
+            low = rank
+    return found
+
+
+def held_out(n: int, share: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Positions of n traces to train on, and to hold out: a share of them, at random and blind to labels."""
+    order = np.random.default_rng(seed).permutation(n)
+    size = round(share * n)
+    return np.sort(order[size:]), np.sort(order[:size])
+
+
+SHORTEST = 9  # samples: the length of MiniRocket's kernels
+
+
+class RocketSelective(ThresholdRival):
+    """MiniRocket (aeon), logistic regression (scikit-learn), and SGR's threshold on each side.
+
+    n_kernels : of MiniRocket, 84 at least; aeon's default.
+    C : inverse strength of the regression's penalty, as in scikit-learn; features are standardised.
+    holdout : share of the labels that choose the thresholds, and train nothing; drawn anew at each training.
+
+    Traces that are held out and called successes give the threshold to accept from, with risk 1 - LB and delta = alpha;
+    those called failures give the one to reject from. So for each training and each side: with probability 1 - alpha over
+    the held-out labels, at most 1 - LB of what is decided on that side is wrong; with 1 - 2 alpha on both sides. That
+    is so for one training, and for parts like those that were held out. In the loop there are many trainings, and held-out
+    parts are those that were verified or stopped: where good parts beyond the threshold are not confirmed, only the bad
+    ones among them return as labels. For accepting that errs on the safe side; of rejected parts nothing returns at all.
+
+    Nothing is learned between two trainings. `predict_interval` gives the regression's probability twice; it is no bound.
+    Sources: Dempster, Schmidt and Webb (2021), "MiniRocket", KDD; Geifman and El-Yaniv (2017), NIPS 30, Algorithm 1.
+    """
+
+    title = "MiniRocket, logistic, SGR"
+    source = "Dempster et al. (2021), aeon; Geifman and El-Yaniv (2017)"
+    bound = "SGR risk bound, each side and each training by itself"
+    tries = tuple({"C": C, "holdout": holdout} for holdout in (0.5, 0.3) for C in (0.001, 0.01))
+    chosen = 1
+    needs = "aeon"
+
+    def __init__(
+        self,
+        alpha: float,
+        lower_bound: float,
+        seed: int = 0,
+        *,
+        n_kernels: int = 10_000,
+        C: float = 0.001,
+        holdout: float = 0.5,
+    ) -> None:
+        super().__init__(alpha, lower_bound, seed)
+        self._classifier = _pipeline(whole("n_kernels", n_kernels, 84), positive("C", C), seed)
+        self.holdout = positive("holdout", holdout, below=1.0)
+
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        train, rest = held_out(len(X), self.holdout, self.seed)
+        if X.shape[-1] < SHORTEST or len(np.unique(good[train])) < 2:
+            return False
+        self._classifier.fit(X[train], good[train])
+        p = self._probability(X[rest]) if len(rest) else np.empty(0)
+        self._set_thresholds(p, good[rest])
+        return True
+
+    def _set_thresholds(self, p: Floats, good: Labels) -> None:
+        risk, delta = 1.0 - self.policy.lower_bound, self.policy.alpha
+        called = p > 0.5
+        self.accept_at = guaranteed_threshold(p[called], ~good[called], risk, delta)
+        self.reject_at = 1.0 - guaranteed_threshold(1.0 - p[~called], good[~called], risk, delta)
+
+    def _probability(self, X: Traces) -> Floats:
+        return np.asarray(self._classifier.predict_proba(X)[:, 1], dtype=np.float64)
+
+
+def _pipeline(n_kernels: int, C: float, seed: int) -> Any:
+    """The classifier, untrained, its features compiled."""
+    from aeon.transformations.collection.convolution_based import MiniRocket
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    features = MiniRocket(n_kernels=n_kernels, random_state=seed)
+    features.fit_transform(np.eye(2 * SHORTEST, dtype=np.float32)[:, None, :])
+    return make_pipeline(features, StandardScaler(), LogisticRegression(C=C, max_iter=1000))
+
+
+SEGMENTS = 50
+PROCEDURES = ("bonferroni_holm", "fixed_sequence")
+
+
+class ControlledRisk(ThresholdRival):
+    """Logistic regression on segment means, and the thresholds whose precision MAPIE certifies.
+
+    thresholds : how many probabilities are tested on each side, from 0.95 down to 0.5.
+    fwer : how MAPIE pays for testing many: "bonferroni_holm", its default, shares alpha among them; "fixed_sequence" tests
+        them in turn at the whole alpha, from the highest on, until one fails.
+    holdout : share of the labels that the tests are made on, and that train nothing; drawn anew at each training.
+
+    Of the thresholds at which `BinaryClassificationController` certifies a precision of LB with confidence 1 - alpha, the
+    one with the highest recall accepts; the same with failures as the positive class rejects (its precision is the NPV).
+    As with SGR (`RocketSelective`) that holds for one training, for each side by itself, and for parts like those
+    that were held out, which in the loop are the verified and the stopped ones.
+
+    Nothing is learned between two trainings. `predict_interval` gives the regression's probability twice; it is no bound.
+    Source: Angelopoulos, Bates, Candès, Jordan and Lei (2021), "Learn then test", arXiv:2110.01052, in MAPIE
+    (Hoeffding-Bentkus p-values).
+    """
+
+    title = "logistic, MAPIE risk control"
+    source = "Angelopoulos et al. (2021), MAPIE"
+    bound = "learn-then-test, each side and each training by itself"
+    tries = tuple({"thresholds": n, "fwer": fwer} for fwer in PROCEDURES for n in (5, 20))
+    chosen = 3
+    needs = "mapie"
+
+    def __init__(
+        self,
+        alpha: float,
+        lower_bound: float,
+        seed: int = 0,
+        *,
+        thresholds: int = 10,
+        fwer: str = "bonferroni_holm",
+        holdout: float = 0.5,
+    ) -> None:
+        from mapie.risk_control import BinaryClassificationController
+        from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+
+        super().__init__(alpha, lower_bound, seed)
+        self._controller: Any = BinaryClassificationController
+        self._classifier: Any = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
+        self.thresholds = whole("thresholds", thresholds)
+        if fwer not in PROCEDURES:
+            raise SettingError(f"Expected fwer {' or '.join(PROCEDURES)}, got {fwer!r}.")
+        self.fwer = fwer
+        self.holdout = positive("holdout", holdout, below=1.0)
+
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        train, rest = held_out(len(X), self.holdout, self.seed)
+        if len(np.unique(good[train])) < 2 or len(rest) == 0:
+            return False
+        self._classifier.fit(segment_means(X[train], SEGMENTS), good[train])
+        p = self._probability(X[rest])
+        self.accept_at = self._certified(p, good[rest])
+        self.reject_at = 1.0 - self._certified(1.0 - p, ~good[rest])
+        return True
+
+    def _certified(self, p: Floats, positive_class: Labels) -> float:
+        """The certified threshold of the highest recall; infinity where there is none. p, positive_class : (m,)."""
+        controller = self._controller(
+            predict_function=_both_classes,
+            risk="precision",
+            target_level=float(self.policy.lower_bound),
+            confidence_level=1.0 - self.policy.alpha,
+            list_predict_params=np.linspace(0.95, 0.5, self.thresholds),
+            fwer_method=self.fwer,
+        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that there is no threshold, which the result says
+            controller.calibrate(p, positive_class.astype(int))
+        best: Any = controller.best_predict_param
+        return np.inf if best is None else float(best)
+
+    def _probability(self, X: Traces) -> Floats:
+        return np.asarray(self._classifier.predict_proba(segment_means(X, SEGMENTS))[:, 1], dtype=np.float64)
+
+
+def _both_classes(p: Floats) -> Floats:
+    """(m,) -> (m, 2): probabilities that were computed before, in the form of a classifier's."""
+    return np.stack([1.0 - p, p], axis=1)
