@@ -1,7 +1,4 @@
-"""What errors and screens may say of a value: so much of it as a line holds, and never a password.
-
-The exception tree: everything dengine raises on purpose derives from `DengineError`.
-"""
+"""The exception tree, and what errors and screens may say of a value: a line of it, and never a password."""
 
 import re
 import reprlib

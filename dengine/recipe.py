@@ -26,6 +26,7 @@ from .records import is_number, is_whole
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
+ESCAPED = re.compile(r'[\\"\x00-\x1f\x7f]')
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
 NOVELTY = 1.5
 LARGEST = 2**20  # bytes of a recipe's file
@@ -36,8 +37,6 @@ WHOLE = {  # the least and the most; beyond the latter no machine goes, and an e
     "window": (10, 10**8),
 }
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
-RENAMED = {"dim": "n_components"}  # parameters of reducers as dengine 0.1 wrote them
-GONE = (("objective", "supervised"),)  # what went without saying then
 
 
 @dataclass(frozen=True)
@@ -51,13 +50,11 @@ class Recipe:
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
-    encoder_budget : seconds a cycle, on average, in which a reducer that trains without labels may do so, in slices between
-        two cycles or in the executor; 0: never. A replay counts them in steps (`retraining.STEP_SECONDS` each).
-    max_steps : optimiser steps that a retrain may take at most; None: as many as the reducer's own settings say. A replay
-        stops on steps alone and reads no clock, so that a seed repeats exactly.
+    encoder_budget : seconds a cycle, on average, in which a reducer that trains without labels may do so; 0: never.
+    max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
-    novelty : a trace is novel, and verified, where its squared distance to the nearest learned one, in level or in texture,
-        is more than so many times that which 99.5 % of these have from one another; 0: nothing is novel.
+    novelty : a trace is novel where its squared distance to the nearest learned one, in level or in texture, is more than
+        so many times that which 99.5 % of these have from one another; 0: nothing is novel.
     """
 
     reducer: Any = "conv"
@@ -150,8 +147,7 @@ class Recipe:
         _must_be_known(policy, Policy, f"{where}, policy,")
         base = RECIPES.get(reducer, cls())
         if isinstance(table.get("params"), Mapping):
-            kept = {name: value for name, value in table["params"].items() if (name, value) not in GONE}
-            table["params"] = _without_none({RENAMED.get(name, name): value for name, value in kept.items()})
+            table["params"] = _without_none(table["params"])
         try:
             return replace(base, **_without_none(table), policy=replace(base.policy, **policy))
         except (TypeError, SettingError) as error:
@@ -160,8 +156,8 @@ class Recipe:
     def to_toml(self) -> str:
         """The recipe as TOML; None is written as "none".
 
-        A reducer that is an object is written as `module:Class` and its parameters. Where those are no plain values, as in
-        a pipeline, it cannot come back from TOML: it must be handed in again, and is written as "object Class".
+        A reducer object is written as `module:Class` and its parameters; where those are no plain values, as in a pipeline,
+        as "object Class": it must be handed in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("params", "policy")}
         plain["reducer"], params = _named(self.reducer, self.params)
@@ -232,8 +228,7 @@ def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _table(name: str, values: Mapping[str, Any]) -> str:
-    head = [f"[{name}]"] if name else []
-    return "\n".join(head + [f"{key} = {_value(value)}" for key, value in values.items()]) + "\n"
+    return "".join([f"[{name}]\n" * bool(name), *(f"{key} = {_value(value)}\n" for key, value in values.items())])
 
 
 def _value(value: Any) -> str:
@@ -242,15 +237,9 @@ def _value(value: Any) -> str:
     if isinstance(value, bool | np.bool_):
         return str(bool(value)).lower()
     if isinstance(value, str):
-        return '"' + "".join(_escaped(c) for c in value) + '"'
+        return '"' + ESCAPED.sub(lambda found: f"\\u{ord(found[0]):04X}", value) + '"'
     # A NumPy number's repr names its type, which is not TOML.
     return repr(int(value)) if isinstance(value, int | np.integer) else repr(float(value))
-
-
-def _escaped(character: str) -> str:
-    if character in '\\"' or character < " " or character == "\x7f":
-        return f"\\u{ord(character):04X}"
-    return character
 
 
 RECIPES: dict[str, Recipe] = {

@@ -1,13 +1,4 @@
-"""Records as JSON has them.
-
-What a setting's value is, whatever type it came as: True is no number, and 10**400 is no float.
-
-Frozen records that travel between the layers. They carry values and no behaviour.
-
-What a report may say: the id of a decision, and success or failure. Anything else is refused before it is stored.
-
-A label that is guessed is worse than none: `bool("NG")` is True, and -1 is what some controllers call true.
-"""
+"""Frozen records that travel between the layers, the values that they may hold, and their plain JSON."""
 
 from __future__ import annotations
 
@@ -31,7 +22,7 @@ def is_whole(value: Any, least: int, most: int) -> bool:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a real number that a float can hold, an infinity or a NaN among them: no range holds the latter."""
+    """Whether it is a real number that a float can hold, infinities and NaN included; True and 10**400 are none."""
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     try:
@@ -94,14 +85,11 @@ FITS = ("strict", "cut", "pad", "resample")  # in exported files the position he
 class TraceSpec:
     """The contract of a trace. SettingError for values that no trace can keep to.
 
-    samples : samples per channel.
-    rate_hz : sampling rate in hertz.
-    channels : number of channels; a one-channel trace may come as `(samples,)`.
-    unit : of the samples, for people only.
+    samples : per channel.  rate_hz : sampling rate in hertz.  unit : of the samples, for people only.
+    channels : their number; a one-channel trace may come as `(samples,)`.
     limit : the sensor's range in `unit`; a sample at or beyond ±limit is saturated. None: not checked.
-    fit : what becomes of a trace of another length (`traces.fitted`). strict: TraceError. cut: a longer one loses its end.
-        pad: that, and a shorter one repeats its last sample. resample: linear interpolation over the whole. What cannot
-        honestly be fitted becomes a trace that is not finite: the part is verified, and the cell goes on.
+    fit : of a trace of another length (`traces.fitted`). strict: TraceError. cut: a longer one loses its end. pad: that,
+        and a shorter one repeats its last sample. resample: linear interpolation. Else it becomes NaN, and is verified.
     columns : the channels' names, by which the columns of a DataFrame are picked; empty: they have none.
     """
 
@@ -143,14 +131,12 @@ class TraceSpec:
 class Decision:
     """What the engine decided on one trace, and on what evidence.
 
-    id : the decision's key in the store.
-    action : what to do.
+    id : the decision's key in the store.  action : what to do.  reason : why.
     predicted : what the model alone would have done; differs from `action` in an audit only.
     lower, upper : bound on the success probability in the ball around the trace.
     n_success, n_failure : labels counted in that ball.
     embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
     model_version : of the model that answered; 0 before the first retrain.
-    reason : why.
     audit : verified although the model was certain.
     propensity : probability with which this decision is verified: 1 for an uncertain one, else the audit rate.
     part : the number of the part, where it was given.
@@ -175,12 +161,10 @@ class Decision:
 class RetrainReport:
     """One retrain, from taking the data to the new version answering.
 
-    version : of the model that answers afterwards.
+    version : of the model that answers afterwards.  n_traces : labelled traces the candidate was given.
     seconds : wall time from taking the data until the version answers; committing it to the store comes on top.
-    n_traces : labelled traces the candidate was given.
     n_steps : optimiser steps taken (0 for closed-form reducers and rivals).
-    accepted : whether the candidate replaced the old version.
-    reason : why, in words.
+    accepted : whether the candidate replaced the old version.  reason : why, in words.
     """
 
     version: int
@@ -195,12 +179,9 @@ class RetrainReport:
 class Cycle:
     """One turn of the loop.
 
-    index : cycle number of this run, from 0.
-    decision : what the engine decided.
+    index : cycle number of this run, from 0.  decision : what the engine decided, in `decide_seconds` of wall time.
     outcome : after an accept, what the cell found out; None otherwise.
-    success : the label that was reported; None where nothing was learned.
-    source : of that label.
-    decide_seconds : wall time of the decision.
+    success, source : of the label that was reported; None where nothing was learned.
     retrain : the retrain this cycle set off or saw finish, if any.
     safe_mode : why everything is being verified after this cycle; "" where it is not.
     """
@@ -219,9 +200,9 @@ LONGEST = 200  # characters of an id, or of a part's number
 
 
 def as_success(value: Any, of: str = "") -> bool:
-    """A label as True or False. ReportError for anything but a bool, or a number that is exactly 1 or 0.
+    """A bool, or a number or 0-d array of exactly 1 or 0, as a bool; else ReportError. of : whose label, for the error.
 
-    value : bool, int, float, a NumPy scalar, or an array of no dimensions.  of : what it is the label of, for the error.
+    A label that is guessed is worse than none: `bool("NG")` is True, and -1 is what some controllers call true.
     """
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):

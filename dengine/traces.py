@@ -1,12 +1,6 @@
-"""How a first trace sets the contract of all that follow, and what is said where it set a wrong one.
+"""Where a trace enters: its shape is checked, its type cast, its faults and its hash found.
 
-A contract holds for an engine's whole life, so not every trace may set it: one that is quarantined is verified, and the
-next one is asked; one of a few samples is a caller's bug, unless `TraceSpec` says that it is meant.
-
-Where a trace enters: its shape is checked, its type cast, its faults and its hash found.
-
-A wrong shape is a caller's bug and raises. A NaN, a dead sensor or a saturated one is the world's fault: it gets a
-reason, the part is verified, and the cell goes on. So is a wrong length, where `TraceSpec.fit` says what to do with it.
+A wrong shape is a caller's bug and raises. A NaN, a dead or saturated sensor is the world's fault: the part is verified.
 """
 
 import re

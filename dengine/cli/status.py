@@ -178,7 +178,7 @@ def cells(store: str, as_json: bool) -> None:
     a cell without a product shares nothing. Other verbs name one of them by --cell.
     """
     from ..store.base import must_be_there
-    from ..store.peers import list_cells, without_password
+    from ..store.peers import list_cells
 
     must_be_there(store)
     found, name = list_cells(store), without_password(store)

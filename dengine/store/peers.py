@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import SettingError, StoreError
+from ..errors import SettingError, StoreError, without_password
 from ..recipe import Recipe
 from .connections import advice, make_engine
 from .queries import cells_of, lock_product
@@ -160,11 +160,6 @@ def _reading(url: str) -> Iterator[sa.Connection]:
         ) from error
     finally:
         engine.dispose()
-
-
-def without_password(url: str) -> str:
-    """A file or URL as it may be shown."""
-    return sa.make_url(url).render_as_string(hide_password=True) if "://" in url else url
 
 
 def cell_names(url: str) -> list[str]:

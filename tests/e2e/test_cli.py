@@ -301,7 +301,7 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path
     assert first["stretches"][-1]["verified_share"] < 1.0
     assert (tmp_path / "run.png").is_file()
     assert len((tmp_path / "run.csv").read_text().splitlines()) == 111
-    second = document(*words, "--cycles", 30)
+    second = document(*words, "--cycles", 30, "--force")
     assert "resumed" in second["title"]
     assert document("status", tmp_path / "e.db")["decisions"] == 140
     with sqlite3.connect(tmp_path / "e.db") as connection:
