@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import DataError, ReportError, SettingError, shortened, without_password
+from .errors import DataError, ReportError, SettingError, StoreError, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -125,6 +126,19 @@ class TraceSpec:
             raise SettingError(
                 f"Expected {self.channels} different columns, a name a channel, got {', '.join(self.columns)}."
             )
+
+
+def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
+    """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
+    if "trace" not in known:
+        return None
+    try:
+        return TraceSpec(**json.loads(known["trace"]))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(
+            f"Expected the contract of traces in the store's settings, got {shortened(known['trace'])}: {error}; restore "
+            "the store from a copy."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from .output import Asked, certificate_record, console, duration, interruptible,
 
 if TYPE_CHECKING:
     from ..decision.certificate import Certificate
-    from ..history.status import BadAccepts, Span, Standing, Watch, WouldHave
+    from ..history.status import Judged, Span, Status
     from ..recipe import Recipe
     from ..records import RetrainReport
     from ..store.base import Event, Evidence, Store
@@ -34,42 +34,31 @@ if TYPE_CHECKING:
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 
 
-@dataclass(frozen=True)
-class Doing:
-    """What is shown.  watch : the safe mode's detectors, None without them.  alpha : of the interval.  last : asked for."""
-
-    standing: Standing
-    watch: Watch | None
-    alpha: float
-    last: int
-
-
-def doing_record(doing: Doing) -> dict[str, Any]:
+def doing_record(doing: Status) -> dict[str, Any]:
     """As JSON has it."""
-    spans = {name: _span_record(getattr(doing.standing, name)) for name in ("newest", "ever")}
+    spans = {"newest": asdict(doing.newest), "ever": asdict(doing.ever)}
     detectors = None if doing.watch is None else asdict(doing.watch)
-    return {"doing": spans | {"last": doing.last, "alpha": doing.alpha, "watch": detectors}} | {
-        "waiting": asdict(doing.standing.waiting)
+    return {
+        "doing": spans | {"last": doing.last, "alpha": doing.recipe.policy.alpha, "watch": detectors},
+        "waiting": {
+            "new_labels": doing.new_labels,
+            "retrain_every": doing.recipe.retrain_every,
+            "verified": doing.ever.unlabelled,
+            "accepted": doing.unreported,
+        },
     }
 
 
-def _span_record(span: Span) -> dict[str, Any]:
-    shares = {f"{name}_share": span.share(getattr(span, name)) for name in ("verified", "novel")}
-    judged = ("bad_accepts", "would_accept", "would_reject")
-    verdicts = {name: asdict(said := getattr(span, name)) | {"verdict": said.verdict} for name in judged}
-    return asdict(span) | shares | verdicts
-
-
-def doing_table(doing: Doing, store: str) -> Any:
+def doing_table(doing: Status, store: str) -> Any:
     """A column each for the newest decisions and for all, and what is on its way."""
     from rich.table import Table
 
-    newest, ever = doing.standing.newest, doing.standing.ever
+    newest, ever, alpha = doing.newest, doing.ever, doing.recipe.policy.alpha
     table = Table(title=f"{without_password(store)}: how it is doing", title_justify="left")
     table.add_column(style="bold", no_wrap=True)
     table.add_column(f"last {newest.decisions:,}", overflow="fold")
     table.add_column("since birth", overflow="fold")
-    for row in zip(_rows(newest, doing.alpha), _rows(ever, doing.alpha), strict=True):
+    for row in zip(_rows(newest, alpha), _rows(ever, alpha), strict=True):
         (name, new), (_, old) = row
         table.add_row(name, new, old)
     table.add_section()
@@ -82,7 +71,7 @@ def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
     yield "from", when(span.first)
     yield "verified", _of(span.verified, span)
     yield "accepted", _of(span.accepted, span)
-    yield "of them bad", _bad(span.bad_accepts, alpha) if span.accepted else "none was accepted"
+    yield "of them bad", _bad(span, alpha) if span.accepted else "none was accepted"
     yield "rejected", _of(span.rejected, span)
     yield "audits", _of(span.audits, span)
     yield "would accept", _would(span.would_accept, "bad")
@@ -96,21 +85,21 @@ def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
 
 
 def _of(some: int, span: Span) -> str:
-    share = span.share(some)
-    return f"{some:,}" + ("" if share is None else f" ({100 * share:.1f} %)")
+    return f"{some:,}" + (f" ({100 * some / span.decisions:.1f} %)" if span.decisions else "")
 
 
-def _bad(bad: BadAccepts, alpha: float) -> str:
+def _bad(span: Span, alpha: float) -> str:
     """Known bad accepts, with what they say of all."""
+    bad = span.bad_accepts
     if not bad.by:
-        return f"{bad.stops:,} known; of the others nothing is"
-    lead = f"{bad.bad:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
-    stops = f", beside {bad.stops:,} stops" if bad.by == "audits" and bad.stops else ""
+        return f"{span.stops:,} known; of the others nothing is"
+    lead = f"{bad.wrong:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
+    stops = f", beside {span.stops:,} stops" if bad.by == "audits" and span.stops else ""
     between = f"{100 * bad.lower:.1f} to {100 * bad.upper:.1f} % at alpha {alpha:g}"
     return f"{lead}{stops}: {between}, {WORDS[bad.verdict]} {100 * bad.tolerance:g} %"
 
 
-def _would(said: WouldHave, wrong: str) -> str:
+def _would(said: Judged, wrong: str) -> str:
     """What checks said of parts that the model was certain of."""
     if not said.n:
         return "none was checked"
@@ -119,11 +108,10 @@ def _would(said: WouldHave, wrong: str) -> str:
     return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {between}, {held}"
 
 
-def _whole(doing: Doing) -> Iterator[tuple[str, str]]:
+def _whole(doing: Status) -> Iterator[tuple[str, str]]:
     """What is of now, and of no span."""
-    waiting = doing.standing.waiting
-    yield "labels waiting", f"{waiting.new_labels:,} new, a retrain is due at {waiting.retrain_every:,}"
-    yield "never reported", f"{waiting.verified:,} verified, {waiting.accepted:,} accepted"
+    yield "labels waiting", f"{doing.new_labels:,} new, a retrain is due at {doing.recipe.retrain_every:,}"
+    yield "never reported", f"{doing.ever.unlabelled:,} verified, {doing.unreported:,} accepted"
     if doing.watch is not None:
         of = (("accepts", doing.watch.accepts), ("rejects", doing.watch.rejects), ("novelty", doing.watch.novelty))
         yield "way to an alarm", ", ".join(f"{name} {100 * share:.0f} %" for name, share in of)
@@ -289,7 +277,7 @@ class Held:
     novel: int
     recent: int
     mode: Event | None
-    doing: Doing
+    doing: Status
 
     @property
     def shadow(self) -> bool:
@@ -299,7 +287,7 @@ class Held:
     @property
     def safe_mode(self) -> str:
         """Why everything is verified; "" where it is not."""
-        return "" if self.mode is None or self.mode.text.startswith("ended") else self.mode.text
+        return self.doing.safe_mode
 
 
 def _read(store: str, last: int, out: Path | None) -> Held:
@@ -321,12 +309,12 @@ def _read(store: str, last: int, out: Path | None) -> Held:
 
 def _held(store: Store, settings: dict[str, str], last: int) -> Held:
     from ..decision.certificate import certificate_of
-    from ..history.status import standing, watch
+    from ..history.status import safe_mode_event
+    from ..history.status import status as status_of
     from ..recipe import Recipe
 
     recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
     newest = _newest(store, counts["labels"])
-    modes = [event for event in store.events() if event.kind == "safe mode"]
     return Held(
         settings=settings,
         recipe=recipe,
@@ -335,8 +323,8 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
         certificate=certificate_of(store.outcomes(int(settings.get("policy_since", 0))), recipe.policy),
         novel=int(newest.novel.sum()),
         recent=len(newest.seq) + int(newest.silent.sum()),
-        mode=modes[-1] if modes else None,
-        doing=Doing(standing(store, recipe, last), watch(store, recipe), recipe.policy.alpha, last),
+        mode=safe_mode_event(store),
+        doing=status_of(store, last, watching=True),
     )
 
 
@@ -415,7 +403,7 @@ def _neighbours(recipe: Recipe) -> str:
 
 
 def _contract(settings: dict[str, str]) -> str:
-    from ..engine.settings import trace_in
+    from ..records import trace_in
 
     spec = trace_in(settings)
     if spec is None:

@@ -27,12 +27,11 @@ from numpy.typing import NDArray
 from ..decision.policy import Policy
 from ..engine.decide import source_of
 from ..engine.engine import DataEngine
-from ..engine.settings import trace_in
 from ..errors import DataError, StoreError, TraceError
 from ..export.cell_journal import Journal, JournalLine, read_journal
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec
+from ..records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec, trace_in
 from ..store.base import UNHURRIED, NewLabel, Store, opening
 from ..store.outbox import OwnedStore
 from ..traces import TraceGate, as_traces

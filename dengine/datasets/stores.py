@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..engine.settings import trace_in
 from ..errors import DataError
+from ..records import trace_in
 from ..store.base import open_store
 from .dataset import Asked, Dataset, make_dataset
 from .lengths import refit

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from ..errors import StoreError, UnknownDecisionError
 from ..records import Action, Source
 from ..store.outbox import Keeper
-from ..store.records import NewLabel, StoredDecision
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
 from .decide import source_of
 from .versions import ModelVersions, Point
 
@@ -186,7 +186,7 @@ class Feedback:
             return
         self._mode = now
         try:
-            self.keeper.event("safe mode", now or f"ended: {safe_again}")
+            self.keeper.event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
         except Exception:

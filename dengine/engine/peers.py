@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..model.base import EngineModel
 from ..recipe import Recipe
-from ..records import TraceSpec
+from ..records import TraceSpec, trace_in
 from ..store.base import SharedStore, Store, is_shared
 from ..store.peers import without_rule
 from ..store.records import ModelVersion
 from .resume import Origin, References, join_since, known_to, restored
-from .settings import EngineSettings, trace_in
+from .settings import EngineSettings
 
 if TYPE_CHECKING:
     from ..store.outbox import Keeper

@@ -14,7 +14,7 @@ from ..model.base import EngineModel, Model
 from ..model.neighbours import ModelPrediction
 from ..model.rival import as_engine_model
 from ..recipe import OBJECT, Recipe, described
-from ..records import TraceSpec, is_whole
+from ..records import TraceSpec, is_whole, trace_in
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 LOOP = (
@@ -169,19 +169,6 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
             "set it on the model, or leave it out (of a policy audit_rate and stops alone count)."
         )
-
-
-def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
-    """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
-    if "trace" not in known:
-        return None
-    try:
-        return TraceSpec(**json.loads(known["trace"]))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise StoreError(
-            f"Expected the contract of traces in the store's settings, got {shortened(known['trace'])}: {error}; restore "
-            "the store from a copy."
-        ) from error
 
 
 def seed_in(known: Mapping[str, str]) -> int:

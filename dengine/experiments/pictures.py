@@ -17,6 +17,7 @@ from ..datasets import Dataset
 from ..history.explain import Explanation
 from ..history.sentences import Bound
 from ..history.status import Course
+from ..store.records import SAFE_MODE_ENDED
 from ..traces import as_traces
 from .figures import (
     BAD,
@@ -246,7 +247,7 @@ def _modes(course: Course, ends: Floats) -> Iterator[tuple[float, float]]:
     """From which cycle to which everything was verified; a safe mode that lasts ends with the newest cycle."""
     began: float | None = None
     for event, cycle in zip(course.modes, _cycle(course, ends, [each.time for each in course.modes]), strict=True):
-        if event.text.startswith("ended"):
+        if event.kind == SAFE_MODE_ENDED:
             if began is not None:
                 yield began, float(cycle)
             began = None

@@ -26,17 +26,17 @@ from ..decision.novelty import NoveltyGate
 from ..decision.policy import Policy
 from ..decision.references import RadiusIndex, math_ceil
 from ..decision.rule import DecisionRule
-from ..engine.settings import trace_in
 from ..errors import ReportError, StoreError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..model.base import EngineModel
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceSpec
+from ..records import Action, Reason, Source, TraceSpec, trace_in
 from ..store.base import Store
-from ..store.records import ModelVersion, StoredDecision
+from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision
 from ..store.views import PastDecision, PastLabel
 from .envelope import Envelope, envelope_of
 from .sentences import Bound, Circumstances, Novelty, bound_of, verdict
+from .status import safe_mode_event
 
 Embedding = tuple[tuple[float, ...], ...]
 STRIDE = 100_000  # labels after a version at most that are read: a cell that never retrains again
@@ -318,8 +318,8 @@ def _coin(stored: StoredDecision, seed: int) -> float:
 
 def _safe_mode(store: Store, past: PastDecision) -> str:
     """Why everything was verified when a decision was made; "" where it was not."""
-    modes = [each.text for each in store.events() if each.kind == "safe mode" and each.time <= past.time]
-    return "" if not modes or modes[-1].startswith("ended") else modes[-1]
+    mode = safe_mode_event(store, past.time)
+    return mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else ""
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,8 @@
-"""How an engine is doing, by its store: over its newest decisions, and since its birth.
+"""How an engine is doing, and the decisions of its past, read from its store; no trace is read.
 
-    doing = standing(store, recipe, last=500)
-    doing.newest.verified / doing.newest.decisions, doing.ever.bad_accepts.upper
-
-Counted by the store: no trace is read.
-
-The decisions of a store, as they were recorded, and what happened between them.
-
-    for past in history(store, last=50, action="accept", label="bad"):
-        print(past.id, past.lower, past.reason)
-
-Read page by page along the time of the decisions, without their traces.
+found = status(store)
+found.newest.verified_share, found.ever.bad_accepts.upper, found.alarm
+for past in history(store, last=50, action="accept", label="bad"): ...
 """
 
 from __future__ import annotations
@@ -18,24 +10,305 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from itertools import chain
 from typing import TypeVar
 
+from ..decision.certificate import Certificate, certificate_of
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import SettingError
+from ..errors import SettingError, StoreError
 from ..recipe import Recipe
-from ..records import Action, Reason
-from ..store.base import Store
-from ..store.records import Event, Outcomes
+from ..records import Action, Reason, TraceSpec, trace_in
+from ..store.base import Store, is_shared
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Evidence, Outcomes
 from ..store.views import LABELS, HistoryFilter, Key, PastDecision, PastRetrain, Stretch, Tally
 
 PAGE = 500  # decisions read at a time
+NEWEST = 500  # decisions that are looked at apart
+RECENT = 200  # labels that the share of novel traces is told of
+EVENTS = 5  # newest ones that a status shows
 
 Happened = PastDecision | PastRetrain | Event
 Name = TypeVar("Name", bound=StrEnum)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Parts that the model was certain of, and how many of them it was wrong about, as far as that is known.
+
+    n : parts.  known : those of them that the claim rests on.  wrong : of these.
+    by : what tells: "every outcome", "audits", or "" where nothing does.
+    lower, upper : Wilson interval of the share of wrong ones, at one look; 0 and 1 where nothing is known.
+    tolerance : 1 - LB.  verdict : kept, broken or open, as far as the interval goes.
+    """
+
+    n: int
+    known: int
+    wrong: int
+    by: str
+    lower: float
+    upper: float
+    tolerance: float
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Consecutive decisions, and what happened meanwhile.
+
+    first, last : times of the oldest and the newest; None where there is none.
+    verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
+    accepted, rejected : went on without a check.  stops : of the accepted, those known to be bad.
+    rejected_good : audited parts that the model would have rejected, and were good.
+    bad_accepts : parts that it let pass or would have, by the policy's alpha.
+    would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
+    unlabelled : verified, of which no result was reported.
+    retrains : all.  dropped : reasons of those that were dropped, with how often.
+    """
+
+    decisions: int
+    first: float | None
+    last: float | None
+    verified: int
+    audits: int
+    novel: int
+    safe_mode: int
+    errors: int
+    quarantined: int
+    accepted: int
+    rejected: int
+    stops: int
+    audited_rejects: int
+    rejected_good: int
+    would_accept: Judged
+    would_reject: Judged
+    bad_accepts: Judged
+    unlabelled: int
+    retrains: int
+    dropped: dict[str, int]
+    verified_share: float | None
+    novel_share: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Watch:
+    """How far each detector of the safe mode is on its way to an alarm, from 0 to 1."""
+
+    accepts: float
+    rejects: float
+    novelty: float
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How an engine is doing; times in seconds since 1970.
+
+    model : what a model that was handed in is called; None: the recipe describes it.
+    version : of the model that answers; 0 before the first retrain.
+    safe_mode : why everything is verified, "" where it is not.  safe_mode_time : when it began or ended, None: never.
+    new_labels : since the newest retrain, of `recipe.retrain_every` that set one off.
+    newest, ever : the newest `last` decisions, and all.
+    unreported : accepted parts whose fate was never reported; of verified ones `ever.unlabelled` tells.
+    sources : labels by their source.  corrected, forgotten : labels that were put right.
+    recent, recent_novel : parts that the newest labels tell of, and those of them that were novel.
+    events : the newest, oldest first.  watch : None where nothing is watched, or it was not asked for.
+    store_fault, retraining : of a running engine, which alone knows.
+    """
+
+    cell: str
+    product: str | None
+    settings: dict[str, str]
+    recipe: Recipe
+    trace: TraceSpec | None
+    model: str | None
+    version: int
+    shadow: bool
+    safe_mode: str
+    safe_mode_time: float | None
+    new_labels: int
+    last: int
+    newest: Span
+    ever: Span
+    unreported: int
+    actions: dict[str, int]
+    reasons: dict[str, int]
+    labels: int
+    sources: dict[str, int]
+    corrected: int
+    forgotten: int
+    last_label_time: float | None
+    recent: int
+    recent_novel: int
+    certificate: Certificate
+    retrains: tuple[PastRetrain, ...]
+    events: tuple[Event, ...]
+    write_failures: int
+    watch: Watch | None
+    store_fault: str = ""
+    retraining: bool = False
+
+    @property
+    def alarm(self) -> str:
+        """What somebody should look at, the worst first; "" where there is nothing."""
+        accepts, errors = self.newest.bad_accepts, self.newest.errors
+        alarms = (
+            (self.store_fault, f"The store cannot be written: {self.store_fault}"),
+            (self.safe_mode, f"Safe mode: {self.safe_mode}"),
+            (
+                accepts.verdict == "broken",
+                f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows.",
+            ),
+            (errors, f"The model failed on {errors} of the newest decisions."),
+        )
+        return next((text for wrong, text in alarms if wrong), "")
+
+
+def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
+    """How the engine of a store is doing; last : the newest so many decisions are looked at apart.
+
+    watching : read how far the safe mode's detectors are, too, which takes the newest version's arrays.
+    StoreError for a store that no engine has used.
+    """
+    settings = store.settings()
+    if "recipe" not in settings:
+        raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
+    recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.past_retrains()
+    every, policy, mode = store.tally(), recipe.policy, safe_mode_event(store)
+    recent = _newest_evidence(store, counts["labels"])
+    outcomes = every.outcomes
+    return Status(
+        cell=store.cell_id,
+        product=counts.get("product"),
+        settings=settings,
+        recipe=recipe,
+        trace=trace_in(settings),
+        model=settings.get("model"),
+        version=counts["last_version"] or 0,
+        shadow=policy.audit_rate == 1.0,
+        safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
+        safe_mode_time=None if mode is None else mode.time,
+        new_labels=sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0)),
+        last=last,
+        newest=_span(store.tally(last), retrains, policy),
+        ever=_span(every, retrains, policy),
+        unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
+        recent=len(recent.seq) + int(recent.silent.sum()),
+        recent_novel=int(recent.novel.sum()),
+        certificate=certificate_of(store.outcomes(int(settings.get("policy_since", 0))), policy),
+        retrains=tuple(retrains),
+        events=tuple(store.events(EVENTS)),
+        watch=watch(store, recipe) if watching else None,
+        **{name: counts[name] for name in COUNTED},
+    )
+
+
+COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten", "last_label_time", "write_failures")
+
+
+def safe_mode_event(store: Store, until: float = float("inf")) -> Event | None:
+    """The newest event that began or ended the safe mode, up to a time; None where there is none."""
+    modes = [each for each in store.events() if each.kind in (SAFE_MODE_BEGAN, SAFE_MODE_ENDED) and each.time <= until]
+    return modes[-1] if modes else None
+
+
+def _newest_evidence(store: Store, labels: int) -> Evidence:
+    """What became of the decisions with the newest labels, RECENT at most."""
+    known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
+    return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
+
+
+def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
+    outcomes, first, n = tally.outcomes, tally.first, tally.count()
+    here = [each.report for each in retrains if first is not None and each.time >= first]
+    reasons: Counter[Reason] = Counter()
+    for kind in tally.kinds:
+        reasons[kind.reason] += kind.n
+    verified = tally.count(lambda kind: kind.action is Action.VERIFY)
+    return Span(
+        decisions=n,
+        first=first,
+        last=tally.last,
+        verified=verified,
+        audits=reasons[Reason.AUDIT],
+        novel=reasons[Reason.NOVEL],
+        safe_mode=reasons[Reason.SAFE_MODE],
+        errors=reasons[Reason.MODEL_ERROR],
+        quarantined=tally.count(lambda kind: kind.quarantined),
+        accepted=outcomes.accepted,
+        rejected=outcomes.rejected,
+        stops=outcomes.stops,
+        audited_rejects=outcomes.audited_rejects,
+        rejected_good=outcomes.audited_rejects_good,
+        would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
+        would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
+        bad_accepts=bad_accepts(outcomes, policy),
+        unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
+        retrains=len(here),
+        dropped=dict(Counter(report.reason for report in here if not report.accepted)),
+        verified_share=verified / n if n else None,
+        novel_share=reasons[Reason.NOVEL] / n if n else None,
+    )
+
+
+def _judged(
+    known: int, wrong: int, policy: Policy, alpha: float = 0.05, n: int | None = None, by: str = "audits"
+) -> Judged:
+    low, high = wilson_interval(known - wrong, wrong, alpha)
+    lower, upper, tolerance = 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound
+    verdict = "kept" if upper <= tolerance else "broken" if lower > tolerance else "open"
+    return Judged(known if n is None else n, known, wrong, by if known else "", lower, upper, tolerance, verdict)
+
+
+def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
+    """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
+
+    Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
+    """
+    n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
+    if heard and (policy.stops == "all" or outcomes.accepted == heard):
+        return _judged(heard, outcomes.stops, policy, policy.alpha, n, "every outcome")
+    return _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
+
+
+def watch(store: Store, recipe: Recipe) -> Watch | None:
+    """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
+    from ..decision.rule import WatchedRule
+    from .explain import rule_now  # torch
+
+    if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
+        return None
+    rule = rule_now(store, recipe.policy)
+    if not isinstance(rule, WatchedRule):
+        return None
+    accepts, rejects, novelty = (max(0.0, capital / rule.alarm_at) for capital in rule.watch.tolist())
+    return Watch(accepts, rejects, novelty)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What a picture of a store is drawn from: consecutive decisions, retrains and events; last : looked at apart.
+
+    modes : the events that began or ended the safe mode, oldest first.
+    """
+
+    stretches: list[Stretch]
+    retrains: list[PastRetrain]
+    modes: list[Event]
+    tolerance: float
+    last: int
+
+
+STRETCHES = 120  # of a picture
+FEWEST = 20  # decisions of a stretch: a share of fewer jumps
+
+
+def course(store: Store, recipe: Recipe, last: int) -> Course:
+    """Read what a picture is drawn from."""
+    modes = [event for event in store.events() if event.kind in (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)]
+    n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
+    return Course(store.stretches(n), store.past_retrains(), modes, 1.0 - recipe.policy.lower_bound, last)
 
 
 def history(
@@ -110,223 +383,3 @@ def beside(store: Store, since: float | None = None, until: float | None = None)
 def interleaved(decisions: list[PastDecision], others: Beside) -> Iterator[Happened]:
     """All of it in the order in which it happened; what has the same time keeps that order too."""
     return heapq.merge(others.retrains, others.events, decisions, key=lambda each: each.time)
-
-
-STRETCHES = 120  # of a picture
-FEWEST = 20  # decisions of a stretch: a share of fewer jumps
-
-
-@dataclass(frozen=True, slots=True)
-class BadAccepts:
-    """How many parts that the model let pass were bad, as far as that is known.
-
-    n : parts it would have let pass, audited ones included.  known : those of them that the claim rests on.
-    bad : of these.  stops : bad accepted parts, whatever the claim rests on.
-    by : what tells: "every outcome", "audits", or "" where only stops do, and nothing can be bounded from above.
-    lower, upper : Wilson interval of their share at the policy's alpha, at one look; 0 and 1 where nothing is known.
-    tolerance : 1 - LB.
-    """
-
-    n: int
-    known: int
-    bad: int
-    stops: int
-    by: str
-    lower: float
-    upper: float
-    tolerance: float
-
-    @property
-    def verdict(self) -> str:
-        """kept, broken, or open, as far as the interval goes; it speaks of this one look."""
-        return _verdict(self.lower, self.upper, self.tolerance)
-
-
-def _verdict(lower: float, upper: float, tolerance: float) -> str:
-    if upper <= tolerance:
-        return "kept"
-    return "broken" if lower > tolerance else "open"
-
-
-@dataclass(frozen=True, slots=True)
-class WouldHave:
-    """What the model would have done with parts that were checked all the same: audits, in the shadow mode every one.
-
-    n : checked parts that it would have accepted, or rejected.  wrong : of these, those that it was wrong about.
-    lower, upper : 95 % Wilson interval of the share of wrong ones, at one look; 0 and 1 where n is 0. Not at the policy's
-        alpha: at 0.5 that would be an even bet, and somebody decides by this whether the model may.
-    tolerance : 1 - LB.
-    """
-
-    n: int
-    wrong: int
-    lower: float
-    upper: float
-    tolerance: float
-
-    @property
-    def verdict(self) -> str:
-        """kept, broken, or open, as in `BadAccepts`."""
-        return _verdict(self.lower, self.upper, self.tolerance)
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """Consecutive decisions, and what happened meanwhile.
-
-    first, last : times of the oldest and the newest; None where there is none.
-    verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
-    accepted, rejected : went on without a check.  rejected_good : audited parts that it would have rejected, and were good.
-    would_accept, would_reject : what audits say: those that were bad, or good, are the wrong ones.
-    unlabelled : verified, of which no result was reported.
-    retrains : all.  dropped : reasons of those that were dropped, with how often.
-    """
-
-    decisions: int
-    first: float | None
-    last: float | None
-    verified: int
-    audits: int
-    novel: int
-    safe_mode: int
-    errors: int
-    quarantined: int
-    accepted: int
-    rejected: int
-    audited_rejects: int
-    rejected_good: int
-    would_accept: WouldHave
-    would_reject: WouldHave
-    bad_accepts: BadAccepts
-    unlabelled: int
-    retrains: int
-    dropped: dict[str, int]
-
-    def share(self, some: int) -> float | None:
-        """Of all decisions; None where there is none."""
-        return some / self.decisions if self.decisions else None
-
-
-@dataclass(frozen=True, slots=True)
-class Waiting:
-    """Labels on their way: new ones since the newest retrain, of `retrain_every` that set one off; verified parts whose
-    result, and accepted ones whose fate, was never reported.
-    """
-
-    new_labels: int
-    retrain_every: int
-    verified: int
-    accepted: int
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """How an engine is doing: over its newest decisions, and since its birth."""
-
-    newest: Span
-    ever: Span
-    waiting: Waiting
-
-
-def standing(store: Store, recipe: Recipe, last: int = 500) -> Standing:
-    """How the engine of a store is doing; last : the newest so many decisions that are looked at apart."""
-    retrains, policy = store.past_retrains(), recipe.policy
-    every = store.tally()
-    newest, ever = _span(store.tally(last), retrains, policy), _span(every, retrains, policy)
-    new_labels = sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0))
-    unheard = every.outcomes.accepted - every.outcomes.stops - every.outcomes.confirmed
-    return Standing(newest, ever, Waiting(new_labels, recipe.retrain_every, ever.unlabelled, unheard))
-
-
-def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
-    outcomes, first = tally.outcomes, tally.first
-    here = [each.report for each in retrains if first is not None and each.time >= first]
-
-    def reason(*reasons: Reason) -> int:
-        return tally.count(lambda kind: kind.reason in reasons)
-
-    return Span(
-        decisions=tally.count(),
-        first=first,
-        last=tally.last,
-        verified=tally.count(lambda kind: kind.action is Action.VERIFY),
-        audits=reason(Reason.AUDIT),
-        novel=reason(Reason.NOVEL),
-        safe_mode=reason(Reason.SAFE_MODE),
-        errors=reason(Reason.MODEL_ERROR),
-        quarantined=tally.count(lambda kind: kind.quarantined),
-        accepted=outcomes.accepted,
-        rejected=outcomes.rejected,
-        audited_rejects=outcomes.audited_rejects,
-        rejected_good=outcomes.audited_rejects_good,
-        would_accept=_would_have(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
-        would_reject=_would_have(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
-        bad_accepts=bad_accepts(outcomes, policy),
-        unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
-        retrains=len(here),
-        dropped=dict(Counter(report.reason for report in here if not report.accepted)),
-    )
-
-
-def _would_have(n: int, wrong: int, policy: Policy) -> WouldHave:
-    low, high = wilson_interval(n - wrong, wrong, 0.05)
-    return WouldHave(n, wrong, 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound)
-
-
-def bad_accepts(outcomes: Outcomes, policy: Policy) -> BadAccepts:
-    """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
-
-    Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
-    """
-    heard = outcomes.stops + outcomes.confirmed
-    every = policy.stops == "all" or 0 < outcomes.accepted == heard
-    by = "every outcome" if every and heard else "audits" if outcomes.audited_accepts else ""
-    known, bad = {
-        "every outcome": (heard, outcomes.stops),
-        "audits": (outcomes.audited_accepts, outcomes.audited_accepts_bad),
-        "": (0, 0),
-    }[by]
-    low, high = wilson_interval(known - bad, bad, policy.alpha)
-    n = outcomes.accepted + outcomes.audited_accepts
-    return BadAccepts(n, known, bad, outcomes.stops, by, 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound)
-
-
-@dataclass(frozen=True, slots=True)
-class Course:
-    """What a picture of a store is drawn from: consecutive decisions, retrains and events; last : looked at apart."""
-
-    stretches: list[Stretch]
-    retrains: list[PastRetrain]
-    modes: list[Event]
-    tolerance: float
-    last: int
-
-
-def course(store: Store, recipe: Recipe, last: int) -> Course:
-    """Read what a picture is drawn from."""
-    modes = [event for event in store.events() if event.kind == "safe mode"]
-    n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
-    return Course(store.stretches(n), store.past_retrains(), modes, 1.0 - recipe.policy.lower_bound, last)
-
-
-@dataclass(frozen=True, slots=True)
-class Watch:
-    """How far each detector of the safe mode is on its way to an alarm, from 0 to 1: accepts, rejects, novelty."""
-
-    accepts: float
-    rejects: float
-    novelty: float
-
-
-def watch(store: Store, recipe: Recipe) -> Watch | None:
-    """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
-    from ..decision.rule import WatchedRule
-    from .explain import rule_now  # torch
-
-    if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
-        return None
-    rule = rule_now(store, recipe.policy)
-    if not isinstance(rule, WatchedRule):
-        return None
-    accepts, rejects, novelty = (max(0.0, capital / rule.alarm_at) for capital in rule.watch.tolist())
-    return Watch(accepts, rejects, novelty)

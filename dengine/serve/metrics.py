@@ -6,14 +6,13 @@ What Prometheus reads: how many decisions of which kind, how long they took, and
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from ..engine.engine import DataEngine
-from ..history.status import Standing, standing
+from ..history.status import status
 from ..records import RetrainReport
 from .service import Answer, CellService, Told
 
@@ -119,31 +118,20 @@ class Overview:
 async def overview(service: CellService) -> Overview:
     """How the cell is doing, by its store; no decision waits for it, but where the engine remembers in memory alone."""
     engine = service.engine
-    doing = await service.read(lambda store: standing(store, engine.recipe))
-    share = doing.newest.share(doing.newest.verified)
+    stored = await service.read(status)
+    doing = replace(stored, store_fault=engine.store_fault, safe_mode=engine.safe_mode)
+    share = doing.newest.verified_share
     return Overview(
         decisions=doing.ever.decisions,
         verified_share=1.0 if share is None else share,
         accepted=doing.ever.accepted,
         rejected=doing.ever.rejected,
-        bad=doing.ever.bad_accepts.stops,
+        bad=doing.ever.stops,
         version=engine.version,
         safe_mode=engine.safe_mode,
         shadow=engine.shadow,
         waiting=service.waiting,
         late=service.late,
         busy=service.busy,
-        alarm=alarm(engine, doing),
+        alarm=doing.alarm,
     )
-
-
-def alarm(engine: DataEngine, doing: Standing) -> str:
-    """What somebody should look at, the worst first; "" where there is nothing."""
-    newest, accepts = doing.newest, doing.newest.bad_accepts
-    alarms = (
-        (engine.store_fault, f"The store cannot be written: {engine.store_fault}"),
-        (engine.safe_mode, f"Safe mode: {engine.safe_mode}"),
-        (accepts.verdict == "broken", f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."),
-        (newest.errors, f"The model failed on {newest.errors} of the newest decisions."),
-    )
-    return next((text for wrong, text in alarms if wrong), "")

@@ -173,6 +173,7 @@ def mixed_shapes(shapes: set[tuple[int, ...]]) -> StoreError:
     )
 
 
+SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
 STATUS_EVENTS = 5  # newest ones that a status shows
 FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
 

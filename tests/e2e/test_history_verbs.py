@@ -17,7 +17,7 @@ from dengine.cli import main
 from dengine.cli.history import WIDEST
 from dengine.cli.output import WIDE
 from dengine.decision.intervals import wilson_interval
-from dengine.history.status import bad_accepts, course, standing
+from dengine.history.status import bad_accepts, course, status
 from dengine.store.records import Outcomes
 
 NOTHING = Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
@@ -65,7 +65,7 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(s
     newest = document("history", store, "--last", 1)["decisions"][0]
     assert newest["id"] in shown[-1]
     assert sum("  * retrain to version" in line for line in shown) >= 5
-    assert any("  * safe mode: ended" in line for line in shown)
+    assert any("  * safe mode ended:" in line for line in shown)
     assert len([line for line in shown if newest["id"][:12] in line]) == 400
 
 
@@ -156,7 +156,7 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
         accepted = [each["label"] for each in some if each["action"] == "accept"]
         bad, good = accepted.count("bad"), accepted.count("good")
         lower, upper = wilson_interval(good, bad, 0.2)
-        assert (span["bad_accepts"]["known"], span["bad_accepts"]["bad"]) == (good + bad, bad)
+        assert (span["bad_accepts"]["known"], span["bad_accepts"]["wrong"]) == (good + bad, bad)
         assert (span["bad_accepts"]["lower"], span["bad_accepts"]["upper"]) == pytest.approx((1 - upper, 1 - lower))
     assert newest["quarantined"] == ever["quarantined"] == 1
     assert newest["retrains"] < ever["retrains"] == found["retrains"]
@@ -189,10 +189,10 @@ def test_a_store_with_no_decision_yet_is_shown_and_drawn_too(tmp_path: Path) -> 
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     some, every = Policy(alpha=0.1, lower_bound=0.9), Policy(alpha=0.1, lower_bound=0.9, stops="all")
     silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
-    assert (bad_accepts(silent, some).by, bad_accepts(silent, some).upper, bad_accepts(silent, some).stops) == ("", 1.0, 3)
+    assert (bad_accepts(silent, some).by, bad_accepts(silent, some).upper) == ("", 1.0)
     confirmed = Outcomes(50, 3, 47, 0, 0, 0, 0, 0)
     assert bad_accepts(confirmed, some) == bad_accepts(confirmed, every)
-    assert (bad_accepts(confirmed, every).known, bad_accepts(confirmed, every).bad) == (50, 3)
+    assert (bad_accepts(confirmed, every).known, bad_accepts(confirmed, every).wrong) == (50, 3)
     audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
     assert (bad_accepts(audited, some).by, bad_accepts(audited, some).known) == ("audits", 40)
     assert bad_accepts(audited, some).verdict == "kept"
@@ -207,9 +207,9 @@ def test_dropped_retrains_are_counted_with_their_reasons(tmp_path: Path) -> None
         engine.flush()
         engine.retrain()
         engine.retrain()
-        found = standing(engine.store, engine.recipe)
+        found = status(engine.store)
         assert found.ever.dropped == {engine.store.retrains()[0].reason: 2}
-        assert found.waiting.verified == 1
+        assert found.ever.unlabelled == 1
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is another signal there")

@@ -380,10 +380,10 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
         context.close()
     with demo.store() as store:
         told = [(event.kind, event.author, event.text) for event in store.events(3)]
-    assert [each[:2] for each in told] == [("safe mode", ""), ("correct", "Kim"), ("safe mode", "")]
+    assert [each[:2] for each in told] == [("safe mode", ""), ("correct", "Kim"), ("safe mode ended", "")]
     assert told[0][2] == "accepted parts failed more often than the tolerance"
     assert last in told[1][2]
-    assert told[2][2] == "ended: what was told anew keeps the tolerance"
+    assert told[2][2] == "what was told anew keeps the tolerance"
 
 
 @pytest.mark.slow

@@ -196,7 +196,7 @@ def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now
     assert engine.safe_mode
     engine.forget(*wrong, reason="the stop sensor was broken")
     assert engine.safe_mode == ""
-    assert [e.kind for e in engine.store.events(3)] == ["safe mode", "forget", "safe mode"]
+    assert [e.kind for e in engine.store.events(3)] == ["safe mode", "forget", "safe mode ended"]
 
 
 def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
@@ -505,7 +505,7 @@ def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(tmp_path: Pa
     engine.correct(decision.id, True)  # told anew: it still began in safe mode
     assert engine.safe_mode == why
     engine.set_policy(replace(engine.policy, stops="some"))  # the paper's rule has no safe mode
-    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "ended: the rule of the policy in force has none")
+    assert (engine.safe_mode, engine.store.events(1)[0].text) == ("", "the rule of the policy in force has none")
 
 
 def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:

@@ -227,7 +227,7 @@ def test_safe_mode_ends_when_fresh_evidence_keeps_the_tolerance(stream: Dataset,
     play(engine, make_data(400, samples=60, seed=9))
     assert heard[-1] == ""
     assert engine.safe_mode == ""
-    assert engine.store.events()[-1].text.startswith("ended")
+    assert engine.store.events()[-1].kind == "safe mode ended"
 
 
 # ---------------------------------------------------------------------------------------------- parts

@@ -71,7 +71,7 @@ def store(make: Callable[[Callable[[], float]], Store]) -> Store:
         if i % 10 == 9:
             made.put_version(RetrainReport(i // 10 + 1, 0.1, i, 3, True, "accepted"), i // 2, {"w": np.full(3, i)})
     made.put_event("safe mode", "too many traces were novel")
-    made.put_event("safe mode", "ended: fresh evidence keeps the tolerance")
+    made.put_event("safe mode ended", "fresh evidence keeps the tolerance")
     return made
 
 
@@ -223,7 +223,7 @@ def test_retrains_and_events_stand_where_they_happened(store: Store) -> None:
     assert [each.time for each in merged] == sorted(each.time for each in merged)
     assert [each for each in merged if isinstance(each, PastDecision)] == whole
     assert sum(isinstance(each, PastRetrain) for each in merged) == 6
-    assert [each.text[:5] for each in merged if isinstance(each, Event)] == ["too m", "ended"]
+    assert [each.text[:5] for each in merged if isinstance(each, Event)] == ["too m", "fresh"]
     late = beside(store, since=whole[-1].time)
     assert len(late.retrains) == 1
     assert len(late.events) == 2

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from dengine import Action, DataEngine, Dataset, Policy, Recipe, wilson_interval
 from dengine.cli import main
-from dengine.history.status import standing
+from dengine.history.status import status
 from tests.support.driving import drive
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
@@ -48,6 +48,6 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
 def test_without_audits_status_says_that_none_was_checked(stream: Dataset, tmp_path: Path) -> None:
     with DataEngine(recipe=RECIPE, store=tmp_path / "engine.db") as engine:
         drive(engine, stream, 0, 60)
-        found = standing(engine.store, engine.recipe).ever
+        found = status(engine.store).ever
     assert (found.would_accept.n, found.would_accept.upper, found.would_accept.verdict) == (0, 1.0, "open")
     assert "none was checked" in CliRunner().invoke(main, ["status", str(tmp_path / "engine.db")]).stdout

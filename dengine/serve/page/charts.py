@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...history.envelope import Envelope
 from ...history.sentences import Bound
-from ...history.status import BadAccepts, Course
+from ...history.status import Course, Judged
 from ...records import TraceSpec
 from .words import Words
 
@@ -113,7 +113,7 @@ def bound_chart(bound: Bound, w: Words) -> Markup:
     )
 
 
-def bad_chart(bad: BadAccepts, w: Words) -> Markup:
+def bad_chart(bad: Judged, w: Words) -> Markup:
     """The interval of the share of bad accepted parts, and the tolerance."""
     most = min(1.0, max(0.02, 2.0 * bad.tolerance, 1.1 * bad.upper))
     x = Scale(0.0, most, 16, WIDTH - 16)

@@ -23,7 +23,7 @@ from ...decision.policy import Policy
 from ...decision.rule import SAFE_MODE
 from ...experiments.figures import is_probability
 from ...history.explain import Explanation, Records, as_it_stood, explain
-from ...history.status import Course, Standing, Watch, course, standing, watch
+from ...history.status import Course, Status, Watch, course, status, watch
 from ...records import Action, Reason
 from ...store.records import Correction, Event
 from ...store.views import LABELS, HistoryFilter, Key, PastDecision, PastRetrain
@@ -208,7 +208,7 @@ class HowView:
     retrained : the newest accepted retrain.
     """
 
-    doing: Standing
+    doing: Status
     policy: Policy
     watch: Watch | None
     course: Course | None
@@ -225,7 +225,7 @@ class HowView:
 def how_view(looking: Looking) -> HowView:
     """Read how it is doing."""
     store, recipe, engine = looking.store, looking.recipe, looking.service.engine
-    doing = standing(store, recipe, NEWEST_OF_HOW_VIEW)
+    doing = status(store, NEWEST_OF_HOW_VIEW)
     went = course(store, recipe, NEWEST_OF_HOW_VIEW) if doing.ever.decisions else None
     accepted = [each for each in (went.retrains if went else ()) if each.report.accepted]
     return HowView(
