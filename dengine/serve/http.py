@@ -1,21 +1,12 @@
-"""HTTP and JSON: decide, report, and what can be asked of the engine.
+"""HTTP: decide, report, and what can be asked of the engine; and the application, every interface behind one guard.
 
-    curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' -H 'Content-Type: application/json' localhost:8000/decide
-
-What each answers is in `openapi`, which the tests hold to these routes.
-
-The web application in front of one engine: the interfaces' routes behind one guard.
-
-    app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db"))
-
-Each interface is a module of this package that gives its routes; `INTERFACES` names them.
+curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' -H 'Content-Type: application/json' localhost:8000/decide
+app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db"))
 """
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from typing import Any
 
@@ -26,73 +17,79 @@ from starlette.responses import HTMLResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from .. import __version__
-from ..errors import ReportError, SettingError, TraceError, shortened
-from ..records import Action, Decision, as_success, plain
+from ..errors import SettingError, UnknownDecisionError, shortened
+from ..records import Action, plain
 from ..store.base import Store
-from ..store.records import StoredDecision
 from ..store.views import HistoryFilter, PastDecision
 from . import http, page, xmlrpc
-from .api import HANDLERS, MOST_OPEN, OPEN, Refusal, as_page, document, report_request, trace_request
+from .api import (
+    DECISION,
+    HANDLERS,
+    JSON,
+    PAST,
+    STORED,
+    DetailQuery,
+    ListQuery,
+    Operation,
+    RawQuery,
+    Report,
+    TraceRequest,
+    answered,
+    as_page,
+    document,
+    read_query,
+    read_struct,
+    read_trace,
+    record,
+)
 from .auth import Access, Guard
 from .metrics import Metrics
 from .robot_calls import Recorder
-from .service import Answer, CellService
+from .service import CellService
 
 HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
-Endpoint = Callable[[Request], Awaitable[Response]]
 
 
 def routes(service: CellService) -> Sequence[BaseRoute]:
     """What is asked over HTTP."""
-    api = HttpApi(service, Metrics(service))
-    return [
-        Route("/decide", api.decide, methods=["POST"]),
-        Route("/report", api.report, methods=["POST"]),
-        Route("/status", api.status, methods=["GET"]),
-        Route("/decisions", api.decisions, methods=["GET"]),
-        Route("/decisions/{id:path}", api.decision, methods=["GET"]),
-        Route("/metrics", api.metrics, methods=["GET"]),
-        Route("/healthz", api.healthz, methods=["GET"]),
-        Route("/openapi.json", api.openapi, methods=["GET"]),
-        Route("/docs", api.docs, methods=["GET"]),
-    ]
+    return [Route(each.path, each.run, methods=[each.method]) for each in HttpApi(service).operations()]
 
 
 class HttpApi:
-    """What is answered over HTTP."""
+    """What is answered over HTTP; a method's docstring is its summary in the OpenAPI document."""
 
-    def __init__(self, service: CellService, metrics: Metrics) -> None:
+    def __init__(self, service: CellService) -> None:
         self.service = service
-        self._metrics = metrics
+        self._metrics = Metrics(service)
+
+    def operations(self) -> list[Operation]:
+        """Every path and method."""
+        one: dict[str, Any] = {"trace": [0.1, 1.5, 2.25, None, 0.4], "request": "order-7", "part": "P-1007"}
+        two: dict[str, Any] = {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
+        reported = ({"id": "order-7", "success": True},)
+        return [
+            Operation("POST", "/decide", self.decide, "Answer", (409, 503), TraceRequest, RawQuery, (one, two), raw=True),
+            Operation("POST", "/report", self.report, "Told", (404, 409, 503), Report, examples=reported),
+            Operation("GET", "/status", self.status, "Status", (503,)),
+            Operation("GET", "/decisions", self.decisions, "Decisions", (422, 503), query=ListQuery),
+            Operation("GET", "/decisions/{id:path}", self.decision, "Decision", (404, 422, 503), query=DetailQuery),
+            Operation("GET", "/metrics", self.metrics, "text/plain"),
+            Operation("GET", "/healthz", self.healthz, "Health"),
+            Operation("GET", "/openapi.json", self.openapi, JSON),
+            Operation("GET", "/docs", self.docs, "text/html"),
+        ]
 
     async def decide(self, request: Request) -> Response:
-        """Decide on a trace; 409 where its id is another trace's."""
-        asked = await trace_request(request)
-        try:
-            return answered(answer_record(await self.service.decide(asked.trace, asked.request, asked.part)))
-        except TraceError as error:
-            known = None if asked.request is None else await self.service.find(asked.request)
-            raise Refusal(422 if known is None else 409, str(error)) from error
+        """Decide on a trace. With a request id, whoever died before the answer asks again and has the same. The query is of
+        a raw body; JSON and MessagePack hold it all.
+        """
+        answer = await self.service.decide(*await read_trace(request))
+        return answered(record(answer.decision, DECISION, late=answer.late, seconds=answer.seconds))
 
     async def report(self, request: Request) -> Response:
-        """Report what became of a decision; 404 for an unknown one, 409 for a label against the first."""
-        said = await report_request(request)
-        success = as_success(said.success)
-        try:
-            told = await self.service.report(said.id, success)
-        except ReportError as error:
-            raise Refusal(await self._status_of(said.id), str(error)) from error
-        return answered(plain(told))
-
-    async def _status_of(self, decision_id: str) -> int:
-        """Why a report was refused: its id is none, its decision is unknown, or contradicts it."""
-        try:
-            known = await self.service.find(decision_id)
-        except ReportError:  # it is no id
-            return 422
-        if known is None:
-            return 404
-        return 409 if known.source is not None or known.action is Action.REJECT else 422
+        """Report what became of a part; the label is on the disk when this answers. The same twice is no error."""
+        said = await read_struct(request, Report)
+        return answered(await self.service.report(said.id, said.success))
 
     async def status(self, request: Request) -> Response:
         """How the engine stands, and what its store counts."""
@@ -100,83 +97,43 @@ class HttpApi:
         return answered(plain(facts(self.service) | {"store": counts}))
 
     async def decision(self, request: Request) -> Response:
-        """One decision with its label; its trace too, where `trace=true`."""
-        try:
-            known = await self.service.find(request.path_params["id"])
-        except ReportError as error:
-            raise Refusal(404, str(error)) from error
+        """One decision with its label; with trace=true its trace too."""
+        shown = read_query(request, DetailQuery)
+        known = await self.service.find(request.path_params["id"])
         if known is None:
-            raise Refusal(404, "Expected the id of a decision of this cell, got one that is unknown.")
-        return answered(stored_record(known, _flag(request, "trace")))
+            raise UnknownDecisionError("Expected the id of a decision of this cell, got one that is unknown.")
+        return answered(record(known, STORED, **{"trace": known.trace} if shown.trace else {}))
 
     async def decisions(self, request: Request) -> Response:
-        """The newest decisions, newest first; with `open=true` the verified ones that wait for a label."""
-        limit, waiting = _limit(request), _flag(request, "open")
-        found = await self.service.look(lambda store: _newest(store, limit, waiting))
-        return answered({"decisions": [past_record(each) for each in found]})
+        """The newest decisions, newest first; with open=true those that wait for a label: what a controller that died goes
+        on with.
+        """
+        asked = read_query(request, ListQuery)
+        found = await self.service.look(lambda store: _newest(store, asked.limit, asked.open))
+        return answered({"decisions": [record(each, PAST) for each in found]})
 
     async def metrics(self, request: Request) -> Response:
-        """Counters and histograms as Prometheus reads them."""
+        """What Prometheus reads."""
         body, kind = self._metrics.text()
         return Response(body, media_type=kind)
 
     async def healthz(self, request: Request) -> Response:
-        """Whether the engine answers: ok, degraded (its store cannot be written, and labels wait in a journal) or down."""
+        """Whether the engine answers: ok; degraded (200): its store cannot be written, labels wait in a journal; down (503).
+
+        It asks for no token.
+        """
         engine, alive = self.service.engine, self.service.silent < HUNG
         state = "down" if not alive else "degraded" if engine.store_fault else "ok"
         said = {"status": state, "store_fault": engine.store_fault, "waiting": self.service.waiting}
-        return answered(plain(said), 200 if alive else 503)
+        return answered(said, 200 if alive else 503)
 
     async def openapi(self, request: Request) -> Response:
-        """What this server answers, as OpenAPI has it."""
-        return answered(document(__version__))
+        """The OpenAPI document."""
+        return answered(document(self.operations(), __version__))
 
     async def docs(self, request: Request) -> Response:
         """The same, to read."""
-        return HTMLResponse(as_page(document(__version__)))
-
-
-def answered(body: Mapping[str, Any], status: int = 200) -> Response:
-    """A JSON answer."""
-    return Response(json.dumps(body, allow_nan=False, separators=(",", ":")), status, media_type="application/json")
-
-
-def answer_record(answer: Answer) -> dict[str, Any]:
-    """An answer as JSON has it."""
-    return decision_record(answer.decision) | {"late": answer.late, "seconds": answer.seconds}
-
-
-def decision_record(decision: Decision | StoredDecision) -> dict[str, Any]:
-    """A decision as JSON has it. By hand, for a robot waits for it: `plain` looks for passwords in every word."""
-    return {
-        "id": decision.id,
-        "action": decision.action.value,
-        "predicted": decision.predicted.value,
-        "reason": decision.reason.value,
-        "lower": _finite(decision.lower),
-        "upper": _finite(decision.upper),
-        "n_success": decision.n_success,
-        "n_failure": decision.n_failure,
-        "audit": decision.audit,
-        "propensity": _finite(decision.propensity),
-        "model_version": decision.model_version,
-        "embedding": None if decision.embedding is None else [[_finite(v) for v in z] for z in decision.embedding],
-        "part": decision.part,
-    }
-
-
-def stored_record(known: StoredDecision, with_trace: bool) -> dict[str, Any]:
-    """A decision and its label as JSON has it."""
-    source = None if known.source is None else known.source.value
-    record = decision_record(known) | {"quarantined": known.quarantined, "success": known.success, "source": source}
-    return record | ({"trace": [[_finite(float(v)) for v in row] for row in known.trace]} if with_trace else {})
-
-
-def past_record(past: PastDecision) -> dict[str, Any]:
-    """A decision in a list as JSON has it; without its hash, for JavaScript has no integers of 64 bits."""
-    record: dict[str, Any] = plain(past)
-    del record["content_hash"]
-    return record
+        return HTMLResponse("\n".join(as_page(document(self.operations(), __version__))))
 
 
 def facts(service: CellService) -> dict[str, Any]:
@@ -210,24 +167,6 @@ def _newest(store: Store, limit: int, waiting: bool) -> list[PastDecision]:
         found += [past for past in reversed(page) if not waiting or past.source is None]
         page = store.decisions(where, limit, page[0].key)
     return found[:limit]
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _flag(request: Request, name: str) -> bool:
-    value = request.query_params.get(name, "false")
-    if value not in ("true", "false"):
-        raise Refusal(422, f"Expected {name}=true or false.")
-    return value == "true"
-
-
-def _limit(request: Request) -> int:
-    text = request.query_params.get("limit", str(OPEN))
-    if not (text.isascii() and text.isdecimal() and len(text) < 5 and 1 <= int(text) <= MOST_OPEN):
-        raise Refusal(422, f"Expected limit to be a whole number from 1 to {MOST_OPEN}.")
-    return int(text)
 
 
 INTERFACES: Mapping[str, Callable[[CellService, Recorder | None], Sequence[BaseRoute]]] = {

@@ -1,14 +1,12 @@
-"""One engine behind every interface: who asks waits in line for the one thread that owns it, and not for ever.
+"""One engine behind every interface: who asks waits in a queue, not for ever, for the one thread that owns it.
 
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     answer = await service.decide(trace, "order-7")
     told = await service.report(answer.decision.id, True)
     service.close()
 
-Each interface (HTTP, XML-RPC, OPC UA, the page) turns its own words into these calls, and answers into its own words. What
-only reads does so by a second connection to the store (`read`, `look`), so that no decision waits for it.
-
-Work for the engine's thread, and whether anybody waits for it.
+HTTP, XML-RPC, OPC UA and the page turn their words into these calls. What only reads does so by a second connection to the
+store (`read`, `look`), so that no decision waits for it.
 """
 
 from __future__ import annotations
@@ -23,8 +21,8 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -34,50 +32,31 @@ from ..records import Decision, Reason, RetrainReport, as_id, as_success
 from ..store.base import Store, open_store
 from ..store.records import StoredDecision
 
+log = logging.getLogger("dengine")
 T = TypeVar("T")
 CLOSING = "The server is closing: verify the part, and ask again when it is back."
-
-
-class Job(Generic[T]):
-    """Work for the engine's thread. late : nobody waits for its answer any more, and it has not begun."""
-
-    def __init__(self, work: Callable[[DataEngine, bool], T]) -> None:
-        self.future: Future[T] = Future()
-        self._work = work
-        self._lock = threading.Lock()
-        self._begun = self._late = False
-
-    def give_up(self) -> bool:
-        """Wait no more; False where it has begun, and will be there at once."""
-        with self._lock:
-            self._late = self._late or not self._begun
-            return self._late
-
-    def run(self, engine: DataEngine) -> None:
-        """Do it, in the engine's thread; also where whoever asked has gone meanwhile."""
-        with self._lock:
-            self._begun = True
-            wanted = self.future.set_running_or_notify_cancel()
-        try:
-            result = self._work(engine, self._late or not wanted)
-        except BaseException as error:  # whoever asked is told
-            if wanted:
-                self.future.set_exception(error)
-            return
-        if wanted:
-            self.future.set_result(result)
-
-    def refuse(self) -> None:
-        """Do it no more: the engine is closed."""
-        if self.future.set_running_or_notify_cancel():
-            self.future.set_exception(BusyError(CLOSING))
-
-
-log = logging.getLogger("dengine")
 DEADLINE = 0.5  # seconds in line, after which who asked verifies
 MOST = 32  # requests in line
 SOON = 0.002  # seconds after an answer, in which a report or another part often comes
 IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
+
+
+class Job(NamedTuple):
+    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more."""
+
+    future: Future[Any]
+    work: Callable[[DataEngine, bool], Any]
+
+    def run(self, engine: DataEngine) -> None:
+        """Do it, also where whoever asked has cancelled the future meanwhile."""
+        wanted = self.future.set_running_or_notify_cancel()
+        try:
+            result = self.work(engine, not wanted)
+        except BaseException as error:  # whoever asked is told
+            self.future.set_exception(error) if wanted else log.error("a decision that came too late failed: %s", error)
+            return
+        if wanted:
+            self.future.set_result(result)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +86,8 @@ class Told:
     decision_id: str
     success: bool
     repeated: bool
-    retrain: RetrainReport | None = None
-    seconds: float = 0.0
+    retrain: RetrainReport | None
+    seconds: float
 
 
 class CellService:
@@ -130,7 +109,7 @@ class CellService:
         self.deadline = deadline
         self.late = self.busy = 0  # answers since it began
         self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
-        self._jobs: queue.Queue[Job[Any] | None] = queue.Queue(most)
+        self._jobs: queue.Queue[Job | None] = queue.Queue(most)
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self._closing = self._listening_ended = False
         self._beat = time.monotonic()
@@ -155,26 +134,32 @@ class CellService:
             given = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=given, late=late)
 
-        job = self._put(work)
-        answer = asyncio.wrap_future(job.future)
+        future = self._put(work)
+        answer = asyncio.wrap_future(future)
         await asyncio.wait([answer], timeout=self.deadline)
-        if answer.done() or not job.give_up():
+        if answer.done() or not future.cancel():
             return self._heard(Answer(await answer, time.monotonic() - begin))
-        answer.add_done_callback(_note_failure)
         decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
         self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
-    async def report(self, decision_id: str, success: bool) -> Told:
+    async def report(self, decision_id: str, success: float) -> Told:
         """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
 
         ReportError as `DataEngine.report`; BusyError where too many wait.
         """
         begin, said = time.monotonic(), as_success(success)
-        told = await self.ask(lambda engine: _report(engine, decision_id, said))
-        if told.retrain is not None:
-            self._heard(told.retrain)
-        return self._heard(replace(told, seconds=time.monotonic() - begin))
+
+        def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
+            known = engine.find(decision_id)
+            if known is not None and known.success is said:
+                return True, None
+            return False, engine.report(decision_id, said)
+
+        repeated, retrain = await self.ask(work)
+        if retrain is not None:
+            self._heard(retrain)
+        return self._heard(Told(decision_id, said, repeated, retrain, time.monotonic() - begin))
 
     async def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace and label; None for an unknown id."""
@@ -182,7 +167,11 @@ class CellService:
 
     async def ask(self, work: Callable[[DataEngine], T]) -> T:
         """Do something in the engine's thread, between two decisions; what it raises is raised here."""
-        return await asyncio.wrap_future(self._put(lambda engine, late: work(engine)).future)
+        return await asyncio.wrap_future(self.submit(work))
+
+    def submit(self, work: Callable[[DataEngine], T]) -> Future[T]:
+        """As `ask`, from any thread and without waiting."""
+        return self._put(lambda engine, late: work(engine))
 
     async def read(self, work: Callable[[Store], T]) -> T:
         """Read the store as the disk has it, in a thread of its own; in the engine's where it remembers in memory."""
@@ -231,24 +220,24 @@ class CellService:
         self._thread.join()
         with suppress(queue.Empty):
             while True:
-                if (job := self._jobs.get_nowait()) is not None:  # it came while this began
-                    job.refuse()
+                if (job := self._jobs.get_nowait()) is not None and job.future.set_running_or_notify_cancel():
+                    job.future.set_exception(BusyError(CLOSING))  # it came while this began
         self.end_listening()
         if self.reading is not self.engine.store:
             self.reading.close()
 
-    def _put(self, work: Callable[[DataEngine, bool], T]) -> Job[T]:
-        job = Job(work)
+    def _put(self, work: Callable[[DataEngine, bool], T]) -> Future[T]:
+        job = Job(Future(), work)
+        if self._closing or not self._thread.is_alive():
+            raise BusyError(CLOSING)
         try:
-            if self._closing or not self._thread.is_alive():
-                raise BusyError(CLOSING)
             self._jobs.put_nowait(job)
         except queue.Full:
             self.busy += 1
             raise BusyError(
                 f"Expected at most {self._jobs.maxsize} requests in line: verify the part, nothing of it was recorded."
             ) from None
-        return job
+        return job.future
 
     def _heard(self, news: T) -> T:
         for observe in self.observers:
@@ -259,7 +248,12 @@ class CellService:
 
     def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
         try:
-            engine = _opened(make)
+            engine = make()
+            try:
+                engine.know_ids()
+            except BaseException:
+                engine.close()
+                raise
         except BaseException as error:  # raised where the service is made
             opened.set_exception(error)
             return
@@ -269,7 +263,7 @@ class CellService:
                 job.run(engine)
                 self._tell()
 
-    def _next(self, engine: DataEngine) -> Job[Any] | None:
+    def _next(self, engine: DataEngine) -> Job | None:
         """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""
         patience = SOON  # right behind an answer, for the next part is farthest away then
         while True:
@@ -292,25 +286,3 @@ class CellService:
         for loop, changed in tuple(self._listeners):
             with suppress(RuntimeError):  # its loop has ended
                 loop.call_soon_threadsafe(changed.set)
-
-
-def _opened(make: Callable[[], DataEngine]) -> DataEngine:
-    engine = make()
-    try:
-        engine.know_ids()
-    except BaseException:
-        engine.close()
-        raise
-    return engine
-
-
-def _report(engine: DataEngine, decision_id: str, success: bool) -> Told:
-    known = engine.find(decision_id)
-    if known is not None and known.success is success:
-        return Told(decision_id, success, repeated=True)
-    return Told(decision_id, success, False, engine.report(decision_id, success))
-
-
-def _note_failure(answer: asyncio.Future[Any]) -> None:
-    if not answer.cancelled() and (error := answer.exception()) is not None:
-        log.error("a decision that came too late failed: %s", error)

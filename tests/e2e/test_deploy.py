@@ -137,7 +137,7 @@ def test_the_health_check_asks_healthz_and_knows_well_from_ill(status: int, heal
 @pytest.mark.skipif(os.name == "nt", reason="SIGTERM is no signal there")
 def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(tmp_path: Path) -> None:
     pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengine[serve]'")
-    for package in ("starlette", "msgpack", "prometheus_client"):
+    for package in ("starlette", "msgspec", "prometheus_client"):
         pytest.importorskip(package)
     token = tmp_path / "token"
     token.write_text("a-token-of-24-characters", encoding="ascii")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-for needed in ("uvicorn", "starlette", "prometheus_client", "msgpack", "defusedxml"):
+for needed in ("uvicorn", "starlette", "prometheus_client", "msgspec", "defusedxml"):
     pytest.importorskip(needed, reason='the server is not installed: pip install "dengine[serve]"')
 
 from dengine import DataEngine, Dataset, Recipe  # not before it is known to be there

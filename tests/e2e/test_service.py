@@ -120,7 +120,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(service: CellService, strea
 def held(service: CellService) -> Iterator[None]:
     """The engine's thread, busy with something else."""
     begun, free = threading.Event(), threading.Event()
-    service._put(lambda engine, late: (begun.set(), free.wait(60)))
+    service.submit(lambda engine: (begun.set(), free.wait(60)))
     assert begun.wait(60)
     try:
         yield

@@ -205,8 +205,8 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data
     data = make_data(90, samples=SAMPLES, seed=3)
     robot = Robot(data, len(data), cell)
     robot.play()
-    asked = cell.service._put(lambda engine, late: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
-    found = asked.future.result(60)
+    asked = cell.service.submit(lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
+    found = asked.result(60)
     assert len(found) == len(data)
     actions = [each.action for each in found]
     assert {Action.VERIFY, Action.ACCEPT} <= set(actions)
@@ -221,11 +221,11 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data
 
 def test_what_is_not_answered_in_time_is_checked(cell: Cell, make_data) -> None:
     data, free = make_data(2, samples=SAMPLES, seed=3), threading.Event()
-    held = cell.service._put(lambda engine, late: free.wait(60))
+    held = cell.service.submit(lambda engine: free.wait(60))
     robot = Robot(data, 2, cell, patience=0.3)
     robot.play()
     free.set()
-    held.future.result(60)
+    held.result(60)
     assert robot.checked == [0, 1]
     assert sum("no answer" in said for said in robot.said) == 2
     assert sum("a label was not kept" in said for said in robot.said) == 2
@@ -238,7 +238,7 @@ def test_without_a_server_everything_is_checked_and_the_program_goes_on(cell: Ce
     robot.socket_open = lambda *where: first_look(*where) if robot.taken < 4 else False
     robot.play()
     assert robot.checked == list(range(8))
-    assert cell.service._put(lambda engine, late: engine.store.status()).future.result(60)["decisions"] == 4
+    assert cell.service.submit(lambda engine: engine.store.status()).result(60)["decisions"] == 4
 
 
 def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: Cell, make_data) -> None:

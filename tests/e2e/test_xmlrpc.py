@@ -1,5 +1,6 @@
 """XML-RPC over a real server: what a robot's program calls, and what it is told when something is wrong."""
 
+import asyncio
 import http.client
 import threading
 import xmlrpc.client
@@ -67,7 +68,7 @@ class Cell:
         return said
 
     def find(self, id_: str) -> Any:
-        return self.service._put(lambda engine, late: engine.find(id_)).future.result(60)
+        return asyncio.run(self.service.find(id_))
 
     def close(self) -> None:
         self._server.should_exit = True
@@ -172,14 +173,14 @@ def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Da
     robot, free, begun = cell.robot(), threading.Event(), threading.Event()
     with monkeypatch.context() as patch:
         patch.setattr(cell.service._jobs, "maxsize", 1)
-        held = cell.service._put(lambda engine, late: (begun.set(), free.wait(60)))
+        held = cell.service.submit(lambda engine: (begun.set(), free.wait(60)))
         begun.wait(60)
-        waiting = cell.service._put(lambda engine, late: None)
+        waiting = cell.service.submit(lambda engine: None)
         answer = robot.decide(stream.X[0].tolist(), "too much")
         assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
         assert robot.report("order-1", True) is False
         free.set()
-        held.future.result(60), waiting.future.result(60)
+        held.result(60), waiting.result(60)
     assert cell.find("too much") is None
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.slow.fuzzing import inputs
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgpack", "defusedxml", "jinja2", "sse_starlette", "asyncua")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette", "asyncua")
 
 
 @pytest.fixture
