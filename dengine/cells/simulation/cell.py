@@ -1,8 +1,5 @@
-"""One simulated insertion: draw the conditions, push, read the sensor, measure the height.
+"""A simulated robot cell that a `DataEngine` can drive: bin, gripper, fixture and height check in MuJoCo.
 
-A simulated robot cell that a `DataEngine` can drive: bin, gripper, fixture and height check in MuJoCo.
-
-    from dengine import DataEngine, SimulatedCell
     cell = SimulatedCell(seed=0)
     for cycle in DataEngine().run(cell, cycles=600): ...
     print(cell.report())

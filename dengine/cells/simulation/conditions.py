@@ -1,9 +1,4 @@
-"""What changes while the simulated cell runs: a scenario turns a cycle's number into that cycle's parameters.
-
-What varies from one simulated insertion to the next, each quantity with its unit.
-
-One cycle's draw: the physical conditions under which one part is inserted.
-"""
+"""What varies from one simulated insertion to the next: settings with their units, one cycle's draw, and scenarios."""
 
 from __future__ import annotations
 
@@ -165,56 +160,50 @@ class Conditions:
     angular_nm_rad: float
 
 
+# Each quantity with its setting, in the order in which they are drawn.
+_DRAWS: dict[str, str | Range] = {
+    "offset_x_mm": "offset_sd_mm",
+    "offset_y_mm": "offset_sd_mm",
+    "tilt_x_deg": "tilt_sd_deg",
+    "tilt_y_deg": "tilt_sd_deg",
+    "yaw_deg": "yaw_sd_deg",
+    "protrusion_mm": "protrusion_sd_mm",
+    "grip_n": "grip_n",
+    "part_mass_kg": "part_mass_kg",
+    "extra_length_mm": "length_sd_mm",
+    "clearance_mm": "clearance_mm",
+    "chamfer_mm": "chamfer_mm",
+    "friction": "friction",
+    "debris_x_mm": (-5.0, 5.0),
+    "debris_y_mm": (-5.0, 5.0),
+    "debris_softness_s": (0.003, 0.02),
+    **{name: name for name in ("gap_mm", "delay_s", "speed_mm_s", "force_limit_n", "overtravel_mm")},
+    **{name: name for name in ("lateral_n_mm", "axial_n_mm", "angular_nm_rad")},
+}
+
+
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
     """Draw one insertion. Every quantity is drawn in every cycle, so a change of one leaves the others as they were."""
     p = parameters
 
-    def uniform(span: Range) -> float:
-        return float(rng.uniform(*span))
+    def drawn(setting: str | Range) -> float:
+        value = getattr(p, setting) if isinstance(setting, str) else setting
+        return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
-    def normal(sd: float) -> float:
-        return float(rng.normal(0.0, sd))
-
-    right = Conditions(
-        fault="none",
-        offset_x_mm=normal(p.offset_sd_mm),
-        offset_y_mm=normal(p.offset_sd_mm),
-        tilt_x_deg=normal(p.tilt_sd_deg),
-        tilt_y_deg=normal(p.tilt_sd_deg),
-        yaw_deg=normal(p.yaw_sd_deg),
-        protrusion_mm=normal(p.protrusion_sd_mm),
-        grip_n=uniform(p.grip_n),
-        part_mass_kg=uniform(p.part_mass_kg),
-        extra_length_mm=normal(p.length_sd_mm),
-        extra_width_mm=0.0,
-        clearance_mm=uniform(p.clearance_mm),
-        chamfer_mm=uniform(p.chamfer_mm),
-        friction=uniform(p.friction),
-        debris_mm=0.0,
-        debris_x_mm=uniform((-5.0, 5.0)),
-        debris_y_mm=uniform((-5.0, 5.0)),
-        debris_softness_s=uniform((0.003, 0.02)),
-        gap_mm=uniform(p.gap_mm),
-        delay_s=uniform(p.delay_s),
-        speed_mm_s=uniform(p.speed_mm_s),
-        force_limit_n=uniform(p.force_limit_n),
-        overtravel_mm=uniform(p.overtravel_mm),
-        lateral_n_mm=uniform(p.lateral_n_mm),
-        axial_n_mm=uniform(p.axial_n_mm),
-        angular_nm_rad=uniform(p.angular_nm_rad),
-    )
-    weak_grip_n, debris_mm = uniform(p.weak_grip_n), uniform(p.debris_mm)
-    extra_length_mm = uniform(p.extra_length_mm) * float(rng.choice((-1, 1)))
-    extra_width_mm = uniform(p.extra_width_mm) * float(rng.choice((-1, 1)))
-    faults = {
-        "none": right,
-        "missed_grasp": replace(right, fault="missed_grasp"),
-        "weak_grip": replace(right, fault="weak_grip", grip_n=weak_grip_n),
-        "debris": replace(right, fault="debris", debris_mm=debris_mm),
-        "wrong_part": replace(right, fault="wrong_part", extra_length_mm=extra_length_mm, extra_width_mm=extra_width_mm),
+    right = Conditions("none", extra_width_mm=0.0, debris_mm=0.0, **{name: drawn(by) for name, by in _DRAWS.items()})
+    weak_grip_n, debris_mm = drawn("weak_grip_n"), drawn("debris_mm")
+    extra_length_mm = drawn("extra_length_mm") * float(rng.choice((-1, 1)))
+    extra_width_mm = drawn("extra_width_mm") * float(rng.choice((-1, 1)))
+    changes: dict[str, dict[str, float]] = {
+        "none": {},
+        "missed_grasp": {},
+        "weak_grip": {"grip_n": weak_grip_n},
+        "debris": {"debris_mm": debris_mm},
+        "wrong_part": {"extra_length_mm": extra_length_mm, "extra_width_mm": extra_width_mm},
     }
     shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
-    return faults[str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))]
+    fault = str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))
+    return replace(right, fault=fault, **changes[fault])
 
 
 # (parameters, cycle, cycles) -> the parameters of that cycle

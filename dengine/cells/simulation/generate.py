@@ -5,10 +5,11 @@ As in `save_traces("traces.npz", simulate(100, seed=0))`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +70,7 @@ def simulate(
         raise SettingError(f"Expected channels of {', '.join(CHANNELS)}; got {channels!r}; choose one of these.")
     base, change = parameters or CellParameters(), find_scenario(scenario)
     tasks = [(change(base, cycle, n), seed, cycle, channels, time_step_s) for cycle in range(n)]
-    insertions = []
+    insertions: list[Insertion] = []
     for insertion in _run(tasks, n_jobs):
         insertions.append(insertion)
         if progress is not None:
@@ -77,16 +78,11 @@ def simulate(
     return _gather(insertions, range(n), base, scenario, seed)
 
 
-Task = tuple[CellParameters, int, int, str, float]
-
-
-def _run(tasks: Sequence[Task], n_jobs: int) -> Iterator[Insertion]:
+def _run(tasks: Iterable[tuple[Any, ...]], n_jobs: int) -> Iterator[Insertion]:
     """Insertions in the order of their tasks, as they come in."""
     from joblib import Parallel, delayed
 
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator")
-    results: Iterator[Insertion] = parallel(delayed(insert_once)(*task) for task in tasks)
-    return results
+    yield from Parallel(n_jobs=n_jobs, return_as="generator")(delayed(insert_once)(*task) for task in tasks)
 
 
 def _gather(
@@ -121,8 +117,7 @@ def simulate_balanced(
     kept: list[tuple[int, Insertion]] = []
     for start in range(0, _MOST_CYCLES_PER_TRACE * (successes + failures), _BLOCK):
         cycles = range(start, start + _BLOCK)
-        tasks: list[Task] = [(base, seed, cycle, "z", TIME_STEP_S) for cycle in cycles]
-        for cycle, insertion in zip(cycles, _run(tasks, n_jobs), strict=True):
+        for cycle, insertion in zip(cycles, _run(((base, seed, cycle) for cycle in cycles), n_jobs), strict=True):
             if wanted[insertion.success] > 0:
                 wanted[insertion.success] -= 1
                 kept.append((cycle, insertion))

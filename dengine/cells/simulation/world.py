@@ -11,16 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DengineError, SettingError
-from .conditions import RATE_HZ, SAMPLES
-
-if TYPE_CHECKING:
-    from .conditions import Conditions
+from .conditions import RATE_HZ, SAMPLES, Conditions
 
 TIME_STEP_S = 0.0005
 DEPTH_MM = 12.0

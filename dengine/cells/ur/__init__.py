@@ -8,10 +8,11 @@ there twice, unnoticed. When the controller hangs up, its thread ends, and the g
 controller's own timestamps, and connects again. It writes its inputs over the same connection, so that an order and its
 answer are in one stream, in one order. ur_rtde's client is what the tests hold the controller without a robot to.
 
-    protocol  client  stream      the wire, a connection, a thread that keeps it
-    channels  recorder            which number is which channel; one insertion cut out
-    orders  cell                  the handshake with the robot's program; a `Cell`
-    controller  server  program   a controller that speaks RTDE without a robot, for tests and for trying out
+    protocol    the wire, and which number of it is which channel
+    stream      a connection, and the thread that keeps it
+    recorder    one insertion cut out of the stream
+    cell        the handshake with the robot's program; a `Cell`
+    controller  a controller that speaks RTDE without a robot, for tests and for trying out
 """
 
 from __future__ import annotations

@@ -3,14 +3,11 @@
 with UrCell("192.168.1.10") as cell, DataEngine.open_or_create("cell.db") as engine:
     for cycle in engine.run(cell, cycles=300): ...
 
-The handshake with a robot's program: one order and one answer, each a number in one register.
-
-dengine writes an order, `10 * number + verb`, into `input_int_register_24`. The program carries it out and writes its
-answer, `10 * number + answer`, into `output_int_register_24`; the number is the order's. One register each, so that neither
-side can see half of a message; a number each, so that an order sent twice (a connection was lost) is carried out once, and
-an old answer is known as old. While the robot inserts, `output_int_register_25` holds the order's number: the trigger.
-
-A program that starts takes up no old order: it answers it with VOID, whatever it was. `training/ur_cell.script` is one.
+The handshake is one order and one answer, each a number in one register. dengine writes `10 * number + verb` into
+`input_int_register_24`; the program carries it out and writes `10 * number + answer` into `output_int_register_24`. One
+register each, so that neither side can see half of a message; a number each, so that an order sent twice is carried out
+once, and an old answer is known as old. While the robot inserts, `output_int_register_25` holds the order's number: the
+trigger. A program that starts answers an old order with VOID. `training/ur_cell.script` is one.
 """
 
 from __future__ import annotations
@@ -96,7 +93,7 @@ REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED)
 
 
 class UrCell:
-    """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot (`orders`).
+    """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot.
 
     host, trigger, samples, channels, rate_hz, before, port : as in `RtdeRecorder`; the trace is recorded while the robot
     inserts.  order_timeout : seconds for each order to be answered.  start_timeout : seconds, at first, for the program to

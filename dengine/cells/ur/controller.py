@@ -5,10 +5,6 @@
 
 It keeps to the published protocol as far as a client can see it, steps 500 times a second (or faster), and can be told to
 do what real ones do on bad days: `Trouble`.
-
-One client's connection, seen from the controller: its recipes, its requests, and what is held back of it.
-
-What a robot's program does, played from a data set: the other side of the handshake, where there is no robot.
 """
 
 from __future__ import annotations

@@ -3,8 +3,6 @@
 A package is its size (uint16, header included), its kind (uint8) and what it carries; all numbers are big-endian. A recipe
 is a list of fields that the controller has given types to: a data package is the recipe's number and the fields' values.
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
-
-What a channel of a trace is called, and which number of the controller it is.
 """
 
 from __future__ import annotations

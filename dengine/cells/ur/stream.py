@@ -1,6 +1,4 @@
 """All that a controller sends, kept in order by a thread that reads, and connects again where the connection is lost.
-
-One RTDE connection: set up, started, and read package by package.
 """
 
 from __future__ import annotations
