@@ -52,9 +52,8 @@ def setting(name: str, values: tuple[Any, ...]) -> Callable[[Dataset, Recipe], V
 
 
 def features(data: Dataset, base: Recipe) -> Variants:
-    """What the features are made of: conv's encoder, the statistics that it replaced, fewer kernels, and rocket's."""
+    """What the features are made of: conv's encoder, smaller ones, and rocket's."""
     others = {
-        "statistics of 0.4": replace(base, params={**base.params, "kernels": 0}),
         "14 kernels": replace(base, params={**base.params, "kernels": 14}),
         "32 directions": replace(base, params={**base.params, "width": 32}),
         "rocket": replace(base, reducer="rocket", params={}, encoder_budget=0.0),

@@ -40,7 +40,7 @@ from dengine.folds import content_hash, fold_of, own_hash
 from dengine.reducers.base import StopRule, own_places
 from dengine.reducers.conv import HELD_OUT, ConvReducer
 from dengine.reducers.encoder import principal_axes, weights_of
-from dengine.reducers.scored import in_chunks
+from dengine.reducers.heads import in_chunks
 from dengine.reducers.training import EncoderTraining
 from dengine.traces import as_traces
 
@@ -89,7 +89,7 @@ def train(model: ModelPrediction, data: Dataset, steps: int) -> tuple[list[Row],
 def encoder_training(model: ModelPrediction) -> EncoderTraining:
     """Where the model's encoder is trained; SettingError for a recipe that has none."""
     if not isinstance(model.spaces, ConvReducer) or model.spaces.training_ is None:
-        raise SettingError("Expected a recipe with an encoder to train, conv with kernels; see models/recipes/conv.toml.")
+        raise SettingError("Expected a recipe with an encoder to train, conv; see models/recipes/conv.toml.")
     return model.spaces.training_
 
 

@@ -49,30 +49,25 @@ def label_agreement(
     again = (times[part] > 1) & (parts != 0)
     if len(np.unique(part[again])) < FEWEST_PARTS:
         return 1.0
-    rest = np.zeros(len(labels))
+    rest = np.zeros(len(labels))  # of a label, beyond what its place explains
     for space in np.unique(spaces):
         here = np.flatnonzero(spaces == space)
         rest[here] = labels[here] - _rate_of_others(points[here], labels[here], part[here])
+    own, squares, m = (np.bincount(part[again], w, len(times)) for w in (rest[again], rest[again] ** 2, None))
+    alike, pairs = own**2 - squares, m * (m - 1.0)  # products of different traces of one part, and their number
     spread = float((rest[again] ** 2).mean())
-    own = np.bincount(part[again], rest[again], len(times))
-    alike = own**2 - np.bincount(part[again], rest[again] ** 2, len(times))  # products of different traces of one part
-    pairs = np.where(times > 1, times * (times - 1.0), 0.0) * (np.bincount(part[again], minlength=len(times)) > 0)
-    if spread == 0.0:
-        return 1.0  # every label as its place says: nothing to see
     rho = float(alike.sum() / (pairs.sum() * spread))
     error = float(np.sqrt(((alike / spread - rho * pairs) ** 2).sum()) / pairs.sum())
     return float(np.clip(rho + CONFIDENCE * error, 0.0, 1.0))
 
 
 def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(n,) success rate among the nearest points of other parts."""
+    """(n,) success rate among the nearest points of other parts; one half where there is none."""
     from scipy.spatial.distance import cdist
 
     distances = cdist(points, points, "sqeuclidean")
     distances[part[:, None] == part] = np.inf
     k = min(NEIGHBOURS, len(points) - 1)
-    if k < 1:
-        return np.full(len(points), 0.5)
     nearest = np.argpartition(distances, k - 1, axis=1)[:, :k]
     return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
 

@@ -266,3 +266,8 @@ def seed_of(random_state: Any) -> int | None:
     if isinstance(random_state, np.random.RandomState):
         return int(random_state.randint(2**31 - 1))
     raise SettingError(f"Expected random_state None, an integer or a RandomState, got {random_state!r}.")
+
+
+def part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
+    """The arrays of a state whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

@@ -4,7 +4,7 @@
       -> conv, F kernels of 9 taps at each of D dilations, at P places                           (B, D, P, F)
       -> a ramp from 0 to 1 around a threshold, its mean over R regions, plus twice that over all (B, D*R*F)
       -> standardised, clipped
-      -> linear: W principal components of these, and W directions that `vicreg.py` trains       (B, 2*W)
+      -> linear: W principal components of these, and W directions that `training.py` trains     (B, 2*W)
 
 It starts as MiniRocket does, from kernels of fixed weights and thresholds drawn from what they give on the first traces, so
 it is of use before anything was trained; then kernels, thresholds and half of the linear layer are trained without labels,
@@ -15,7 +15,6 @@ Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, f
 Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36, for several channels.
 """
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -25,9 +24,8 @@ from torch import Tensor, nn
 
 from ..errors import SettingError
 from ..files import read_archive
-from .features import CLIP, Carry, Features
+from .features import CLIP, TAPS, Carry, Features, dilations_of, rocket_kernels
 
-TAPS = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
 FRAMES = 200  # a trace is averaged to about so many samples
 KEPT = 0.8  # share of the traces' variance that averaging must leave, or less is averaged
 PLACES = 600  # of each kernel and dilation, at most; else one at each frame: on traces that oscillate fewer say less
@@ -58,19 +56,17 @@ class ConvEncoder(Features):
     def __init__(
         self, channels: int, samples: int, average: int, kernels: int, dilations: int, regions: int, width: int
     ) -> None:
-        if samples < 2:
-            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         frames = samples // average
         places = max(1, min(frames, PLACES) // regions) * regions
         taps = _taps(frames, dilations, places)
         n_pooled = len(taps) * regions * kernels
-        super().__init__(channels, n_pooled)
+        super().__init__(channels, samples, n_pooled)
         self.average, self.frames = average, frames
         self.head = samples - frames * average  # left out at the start: the end of an insertion tells most
         self.n_dilations, self.n_regions, self.n_kernels, self.n_places = len(taps), regions, kernels, places
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
         self.register_buffer("pool", _pool(regions, places // regions))
-        # Trained by a copy of this module (`vicreg.py`); the one that answers takes the values over.
+        # Trained by a copy of this module (`training.py`); the one that answers takes the values over.
         self.kernel = nn.Parameter(torch.zeros(channels * TAPS, kernels), requires_grad=False)
         self.threshold = nn.Parameter(torch.zeros(len(taps), 1, kernels), requires_grad=False)
         self.mix = nn.Parameter(torch.zeros(n_pooled, width), requires_grad=False)
@@ -238,8 +234,7 @@ def principal_axes(g: Tensor, width: int) -> Tensor:
 
 def _taps(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """(D, P, 9) positions in the averaged trace; `frames`, one beyond its end, where there is none."""
-    widest = np.log2((frames - 1) / (TAPS - 1)) if frames > TAPS else 0.0
-    spread = np.unique(np.floor(2.0 ** np.linspace(0.0, widest, dilations)).astype(np.int64))
+    spread = np.array(dilations_of(frames, dilations), dtype=np.int64)
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
     taps = middle[:, None] + spread[:, None, None] * (np.arange(TAPS) - TAPS // 2)
     return np.where((taps < 0) | (taps >= frames), frames, taps)
@@ -253,11 +248,8 @@ def _pool(regions: int, per_region: int) -> Tensor:
 
 def _kernels(channels: int, n: int, rng: np.random.Generator) -> Tensor:
     """(C*9, n) kernels of three 2s among -1s, of unit size, drawn at random; each reads a few of the channels."""
-    places = list(combinations(range(TAPS), 3))
-    drawn = [places[i % len(places)] for i in rng.permutation(max(n, len(places)))[:n]]
-    kernels = torch.full((n, TAPS), -1.0)
-    for row, three in enumerate(drawn):
-        kernels[row, list(three)] = 2.0
+    every = rocket_kernels()
+    kernels = every[torch.from_numpy(rng.permutation(max(n, len(every)))[:n] % len(every))]
     read = torch.zeros(channels, n)
     for row in range(n):
         some = rng.permutation(channels)[: int(2.0 ** rng.uniform(0.0, np.log2(channels + 1)))]

@@ -3,12 +3,11 @@
     x (B, C, T) -> 84 kernels of length 9, each at D dilations -> share of outputs over a bias     (B, 84*D)
                 -> standardise -> head k: P(success), from outside fold k                           (B, K, d)
 
-Nothing of a kernel is learned; its bias is a quantile of what it gives on the first traces it is fitted on, labels unread.
-So a trace's features are computed once and kept, and a retrain is the heads' closed form. The strongest cheap rival.
+No kernel is learned; a bias is a quantile of what its kernel gives on the first traces, labels unread. So features are
+computed once a trace, and a retrain is the heads' convex fit. The strongest cheap rival.
 Source: Dempster, Schmidt and Webb (2021), MiniRocket, KDD; arXiv:2012.08791. Here with one bias a kernel and dilation.
 """
 
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..errors import SettingError
-from .features import Features
-from .scored import FeatureReducer
-
-LENGTH = 9  # of a kernel; 84 = 9 choose 3 ways to place its three 2s among -1s
+from .features import Features, dilations_of, rocket_kernels
+from .heads import FeatureReducer
 
 
 class RocketFeatures(Features):
@@ -30,13 +26,9 @@ class RocketFeatures(Features):
     bias: Tensor
 
     def __init__(self, channels: int, samples: int, dilations: int) -> None:
-        if samples < 2:
-            raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
-        widest = np.log2((samples - 1) / (LENGTH - 1)) if samples > LENGTH else 0.0
-        spread = np.unique(np.floor(2.0 ** np.linspace(0.0, max(0.0, widest), dilations)).astype(int))
-        kernels = _kernels()
-        super().__init__(channels, len(kernels) * len(spread))
-        self.dilations = [int(d) for d in spread]
+        kernels, spread = rocket_kernels(), dilations_of(samples, dilations)
+        super().__init__(channels, samples, len(kernels) * len(spread))
+        self.dilations = spread
         self.register_buffer("kernel", kernels[:, None, :].repeat(1, channels, 1))  # (84, C, 9)
         self.register_buffer("bias", torch.zeros(len(spread), len(kernels), 1))
 
@@ -71,8 +63,6 @@ class RocketReducer(FeatureReducer):
     n_components, folds, l2, max_iter, random_state : as in `ConvReducer`.
     """
 
-    keeps_features = True  # no kernel or bias ever changes
-
     def __init__(
         self,
         *,
@@ -93,11 +83,3 @@ class RocketReducer(FeatureReducer):
     def make_features(self, channels: int, samples: int) -> Features:
         """Shares of positive values."""
         return RocketFeatures(channels, samples, self.dilations)
-
-
-def _kernels() -> Tensor:
-    """(84, 9): every way to place three 2s among -1s; each kernel sums to zero, so offsets do not matter."""
-    kernels = torch.full((84, LENGTH), -1.0)
-    for row, places in enumerate(combinations(range(LENGTH), 3)):
-        kernels[row, list(places)] = 2.0
-    return kernels

@@ -22,7 +22,7 @@ from dengine import Action, DataEngine, Dataset, Recipe, ReplayCell, export_torc
 
 ACTIONS = tuple(Action)
 LEARNED, ASKED = 130, 60  # traces that a kept engine learned from, and that it is asked about afterwards
-STORES = ("conv", "pca", "umap")
+STORES = ("pca", "umap")
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,8 @@ class Case:
         }
 
 
-FORMER = {"params": {"kernels": 0}}  # the features of conv before its encoder was trained
 LOOSE = {"alpha": 0.2, "lower_bound": 0.8}
 REPLAYS = {
-    "conv-90": Case("conv", 0, 600, FORMER),
-    "conv-95": Case("conv", 1, 600, FORMER, policy={"alpha": 0.05, "lower_bound": 0.95}),
-    "conv-adaptive": Case("conv", 2, 400, FORMER | {"fraction": 0.35, "reject_fraction": 0.08}),
-    "conv-window-audits": Case("conv", 3, 400, FORMER | {"window": 200}, LOOSE | {"audit_rate": 0.1}, {"confirm": True}),
     "rocket-90": Case("rocket", 4, 300),
     "rocket-in-order": Case("rocket", 5, 300, {"retrain_every": 70}, LOOSE, {"shuffle": False}),
     "pca-80": Case("pca", 6, 600, policy=LOOSE),
@@ -75,7 +70,7 @@ def kept_recipe(name: str) -> Recipe:
     return recipe.with_policy(**LOOSE, audit_rate=0.1)
 
 
-def fill(name: str, url: str) -> DataEngine:
+def fill(name: str, url: str | None) -> DataEngine:
     """An engine that learned, retrained, and took labels after its last retrain."""
     engine = DataEngine(recipe=kept_recipe(name), store=url, seed=11, replaying=True)
     list(engine.run(ReplayCell(short(), np.arange(LEARNED)), LEARNED))
@@ -106,13 +101,13 @@ def make(folder: Path) -> None:
     for name, case in REPLAYS.items():
         np.savez_compressed(folder / f"replay-{name}.npz", **case.play())
     answers: dict[str, Any] = {}
+    with fill("conv", None) as engine:
+        export_torchscript(engine, folder / "model.ts")
+        answers["model.ts"] = ask(load_exported(folder / "model.ts").decide)
     for name in STORES:
         path = folder / f"{name}.sqlite"
         path.unlink(missing_ok=True)
-        with fill(name, str(path)) as engine:
-            if name == "conv":
-                export_torchscript(engine, folder / "model.ts")
-                answers["model.ts"] = ask(load_exported(folder / "model.ts").decide)
+        fill(name, str(path)).close()
         with DataEngine.open(str(path)) as engine:
             answers[name] = [[engine.version, engine.new_labels], ask(engine.decide)]
         path.unlink()

@@ -31,7 +31,7 @@ from dengine import (
 )
 from dengine.errors import SettingError, StoreError
 from dengine.recipe import RECIPES
-from dengine.reducers.scored import FIRST_STEPS
+from dengine.reducers.heads import FIRST_STEPS
 
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
@@ -171,7 +171,7 @@ def ours(**changes) -> ModelPrediction:
         ({"reducer": PCA(2)}, {"reducer": PCA(3)}),
         ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
         ({"reducer": "pca"}, {"reducer": PCA(2)}),
-        ({"reducer": "conv"}, {"reducer": ConvReducer(filters=2)}),
+        ({"reducer": "conv"}, {"reducer": ConvReducer(width=32)}),
         ({"reducer": make_pipeline(PCA(2))}, {"reducer": make_pipeline(PCA(3))}),
         ({"reducer": make_pipeline(PCA(2))}, {"reducer": PCA(2)}),
     ],
@@ -216,7 +216,7 @@ def test_a_seed_that_could_not_be_read_back_is_refused(seed, tmp_path: Path) -> 
 
 
 def test_an_object_of_ours_keeps_the_neighbourhood_of_its_recipe() -> None:
-    assert DataEngine(ConvReducer(filters=2)).recipe.radius == RECIPES["conv"].radius
+    assert DataEngine(ConvReducer(width=32)).recipe.radius == RECIPES["conv"].radius
     assert DataEngine(PCA(2)).recipe.radius == Recipe().radius
 
 

@@ -65,15 +65,11 @@ KINDS = {
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_on_traces_that_oscillate_conv_is_certain_of_about_as_much_as_rocket_and_of_far_more_than_segment_statistics(
-    kind: str,
-) -> None:
+def test_on_traces_that_oscillate_conv_is_certain_of_about_as_much_as_rocket(kind: str) -> None:
     make, sizes, share = KINDS[kind]
     data, seeds = make(*sizes), 3 if PROOF else 1
     conv = certain(data, RECIPES["conv"], seeds)
-    statistics = replace(RECIPES["conv"], params={"kernels": 0}, encoder_budget=0.0)
     assert conv >= share * certain(data, RECIPES["rocket"], seeds)
-    assert conv >= 1.2 * certain(data, statistics, seeds)
 
 
 @pytest.mark.skipif(not PROOF, reason="takes minutes: make proof")
