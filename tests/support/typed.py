@@ -17,8 +17,10 @@ for stream in (1, 2):
     os.dup2(screen, stream)
 sys.argv = ARGV  # noqa: F821
 try:
-    if sys.argv[0] == "dengine":
-        runpy.run_module("dengine", run_name="__main__")
+    if sys.argv[0] in ("dengine", "-m"):
+        module = sys.argv[0] if sys.argv[0] == "dengine" else sys.argv.pop(1)
+        sys.path.insert(0, os.getcwd())
+        runpy.run_module(module, run_name="__main__")
     else:
         sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
         runpy.run_path(sys.argv[0], run_name="__main__")

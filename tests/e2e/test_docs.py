@@ -1,7 +1,7 @@
 """Every command and snippet of the README and of the site runs, page by page, as a newcomer would type it; only smaller.
 
 Each page has a desk of its own and runs from top to bottom. A long command gets options behind its own, of which the last
-counts. What needs the network or would call this very suite is held to what can be known without running it.
+counts. `make test` runs four pages, `make test-all` every one.
 """
 
 import json
@@ -13,14 +13,15 @@ import shlex
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-REPO = Path(__file__).resolve().parents[3]
+REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
+QUICK = {"README.md", "docs/tutorials/first_part.md", "docs/howto/own_reducer.md", "docs/howto/labels.md"}
 
 ONE_REPLAY = "--seeds 100:101 --cycles 60 --policies 0.2:0.8 --n-jobs 1"
 SMALL = "--data small.npz --samples 100"
@@ -57,10 +58,11 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "cmake --build build/cpp": "--parallel 2",
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
 }
-HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")
 NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what installs
 CPP = ("cmake", "build/")
-PYTHON = ("dengine ", "python training/", "python snippet.py")
+HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
+PYTHON = ("dengine ", "python training/", "python -m tests.", "python snippet.py")
+HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
     ["dengine.cli", "dengine.engine.engine", "dengine.experiments.grid", "dengine.store.sql", *HEAVY]
@@ -68,9 +70,8 @@ FORKS.set_forkserver_preload(
 RUNS, STEP_S = 80, 0.0012  # of the recordings that stand in for the public ones
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block of a page."""
+class Block(NamedTuple):
+    """A fenced block of a page; a title names the file that a reader would save it as."""
 
     language: str
     title: str
@@ -83,18 +84,12 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """A page's fenced blocks; a title names the file that a reader would save a block as."""
-    found = re.findall(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', page.read_text(encoding="utf-8"), flags=re.S | re.M)
-    return [Block(*each) for each in found]
+    fenced = r'^```(sh|python)(?: title="([^"]+)")?\n(.*?)^```$'
+    return [Block(*each) for each in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)]
 
 
 def name(page: Path) -> str:
     return str(page.relative_to(REPO))
-
-
-COMMANDS = [command for page in PAGES for block in blocks(page) if block.language == "sh" for command in block.commands]
-TYPED = [page for page in PAGES if any(block.language in ("sh", "python") for block in blocks(page))]
-HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
 
 
 @pytest.fixture
@@ -138,10 +133,9 @@ def shell(command: str, desk: Path) -> None:
 
 def python(words: list[str], desk: Path) -> None:
     """Run a script or `dengine` in a fork of a process that has imported torch already: eighty would wait for it."""
-    said = desk / "said.txt"
+    said, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
     given = {"WHERE": str(desk), "ARGV": words, "SAID": str(said)}
-    typed = {"init_globals": given, "run_name": "typed"}
-    process = FORKS.Process(target=runpy.run_path, args=(str(REPO / "tests" / "typed.py"),), kwargs=typed)
+    process = FORKS.Process(target=runpy.run_path, args=(str(typed),), kwargs={"init_globals": given, "run_name": "typed"})
     process.start()
     process.join(300)
     process.kill()
@@ -150,8 +144,7 @@ def python(words: list[str], desk: Path) -> None:
 
 def smaller(command: str) -> str:
     """The command with its quick options, where it has any."""
-    extra = [options for beginning, options in SMALLER.items() if command.startswith(beginning)]
-    return " ".join([command, *extra])
+    return " ".join([command, *(options for beginning, options in SMALLER.items() if command.startswith(beginning))])
 
 
 def type_in(command: str, desk: Path) -> None:
@@ -168,23 +161,27 @@ def type_in(command: str, desk: Path) -> None:
 
 def snippet(block: Block, desk: Path) -> None:
     """A block of Python: saved where it has a file's name, run where it has none."""
-    if block.title:
-        (desk / block.title).write_text(block.text, encoding="utf-8")
-        return
-    (desk / "snippet.py").write_text(block.text, encoding="utf-8")
-    for _ in range(2 if "open_or_create" in block.text else 1):  # a cell's program is started again
+    (desk / (block.title or "snippet.py")).write_text(block.text, encoding="utf-8")
+    # A cell's program is started again.
+    for _ in range(0 if block.title else 2 if "open_or_create" in block.text else 1):
         shell("python snippet.py", desk)
 
 
-@pytest.mark.parametrize("page", TYPED, ids=name)
+def typed_pages() -> list:
+    """The pages with something to type; those that are not quick are slow."""
+    marks = {page: () if name(page) in QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)}
+    return [pytest.param(page, marks=mark, id=name(page)) for page, mark in marks.items()]
+
+
+@pytest.mark.parametrize("page", typed_pages())
 def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page: Path, desk: Path) -> None:
     for block in blocks(page):
         if block.language == "python":
             snippet(block, desk)
-        if block.language == "sh":
-            for command in block.commands:
-                type_in(command, desk)
+        for command in block.commands if block.language == "sh" else ():
+            type_in(command, desk)
 
 
 def test_every_shortened_command_is_on_a_page() -> None:
-    assert [beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in COMMANDS)] == []
+    commands = [command for page in PAGES for block in blocks(page) if block.language == "sh" for command in block.commands]
+    assert [beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in commands)] == []
