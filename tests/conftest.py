@@ -33,7 +33,15 @@ GROUPS |= dict.fromkeys(("test_golden", "test_estimators", "test_reducers"), "um
 SLOW = REPO / "tests" / "slow"
 SLOW_CASES = ("umap", "postgres")
 # What is slow and yet run before each merge; single tests are marked where they stand.
-MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_store_kill")
+MERGE = (
+    "test_cpp",
+    "test_c_interface",
+    "test_onnx_program",
+    "test_estimators",
+    "test_store_postgres",
+    "test_store_kill",
+    "test_site",
+)
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups, and -m the marks

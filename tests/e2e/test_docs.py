@@ -36,6 +36,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine run --cell simulated": "--cycles 15",
     "dengine costs": "--repeats 2 --cycles 70 --alphas 0.5 --lower-bounds 0.8 --n-jobs 1",
     "dengine simulate": "--n 12 --n-jobs 1",
+    "dengine compare --data recordings": "--repeats 1 --cycles 60 --n-jobs 1",
     "dengine replay --data recordings": "--repeats 1 --cycles 80",
     "dengine replay --data numbered.npz": "--cycles 80",
     "dengine train --data insertion": "--data small.npz --retrains 1",
