@@ -1,5 +1,4 @@
-"""All that a controller sends, kept in order by a thread that reads, and connects again where the connection is lost.
-"""
+"""All that a controller sends, in order, by a thread that reads and connects again where the connection is lost."""
 
 from __future__ import annotations
 
