@@ -25,9 +25,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from dengine import Dataset, Recipe, Replay, load_dataset
-from dengine.experiments.contenders import Contender
 from dengine.experiments.figures import GREEN, LIMIT, save
 from dengine.experiments.grid import Task, play_tasks
+from dengine.experiments.replay import Contender
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
 from dengine.reducers.training import AUGMENTATIONS
 

@@ -29,7 +29,7 @@ from rich.table import Table
 from dengine import Policy, Recipe
 from dengine.cells.simulation.conditions import CellParameters, first_change
 from dengine.experiments.figures import LIMIT, RECIPES, SMALL, draw_verified, plain, save
-from dengine.experiments.replay import RunLog, replay
+from dengine.experiments.replay import Replay, replay
 from dengine.experiments.tables import write_csv
 
 WINDOW = 100  # cycles
@@ -50,7 +50,7 @@ class Run:
 
     scenario: str
     method: str
-    log: RunLog
+    log: Replay
 
 
 def stream(scenario: str, cycles: int, seed: int, n_jobs: int, folder: Path) -> Path:
@@ -90,7 +90,7 @@ def row_of(run: Run) -> dict[str, object]:
     }
 
 
-def escapes(log: RunLog, part: slice) -> float:
+def escapes(log: Replay, part: slice) -> float:
     """Bad parts accepted per 1,000 parts that were passed on, checked or not; NaN where none was."""
     bad = int(log.false_positive[part].sum())
     passed = int(log.finished[part].sum()) + bad
@@ -106,7 +106,7 @@ def alarm_and_back(safe_mode: np.ndarray, change: int) -> tuple[int | None, int 
     return int(on[0]) + 1, int(off[0]) if len(off) else None
 
 
-def seconds_saved(log: RunLog) -> float:
+def seconds_saved(log: Replay) -> float:
     """Against verifying every part, by the cell's times: checks left out, less stops, less good parts sent back."""
     cell, total = CellParameters(), log.stretch(slice(None))
     lost = cell.stop_s * total["stops"] + (cell.cycle_s + cell.verify_s) * total["false_negative"]

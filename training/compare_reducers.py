@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 
 from dengine import Replay, load_dataset
-from dengine.experiments.contenders import Contender, contenders
-from dengine.experiments.grid import Task, iterate_replays
+from dengine.experiments.grid import Task, contenders, iterate_replays
 from dengine.experiments.metrics import pooled_error
+from dengine.experiments.replay import Contender
 from dengine.experiments.rivals import RIVALS
 from dengine.experiments.tables import frame_of, pool, write_csv
 

@@ -21,7 +21,7 @@ from rich.table import Table
 from dengine import DataEngine, Recipe, SimulatedCell
 from dengine.cells.simulation.conditions import RATE_HZ, SCENARIOS, first_change
 from dengine.experiments.figures import BAD, GOOD, LIMIT, SMALL, draw_errors, draw_verified, plain, save
-from dengine.experiments.replay import RunLog, watch
+from dengine.experiments.replay import Replay, watch
 
 WINDOW = 100  # cycles
 CHANGES = {"wear": "wear begins to grow", "variant": "the new variant comes", "bias_jump": "the offset jumps"}
@@ -33,7 +33,7 @@ class Run:
 
     scenario: str
     traces: np.ndarray
-    log: RunLog
+    log: Replay
 
 
 def run(scenario: str, cycles: int, recipe: Recipe, seed: int) -> Run:

@@ -136,9 +136,9 @@ def costs(
         if name in choice.settings:
             flag = name.replace("_", "-")
             raise click.UsageError(f"--{flag} names one value, here it is asked for: name those to be tried, --{flag}s.")
-    from ..experiments.contenders import Contender
     from ..experiments.costs import ALPHAS, LOWER_BOUNDS, cost_tasks, curve_of
     from ..experiments.metrics import Costs
+    from ..experiments.replay import Contender
 
     priced = Costs(**prices)
     tried: dict[str, Any] = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | lists

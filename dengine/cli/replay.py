@@ -44,10 +44,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.contenders import Contender
     from ..experiments.costs import Forecast
     from ..experiments.grid import Task
-    from ..experiments.replay import Replay
+    from ..experiments.replay import Contender, Replay
 
 ANSWERS_WITHIN = "5 s"  # what a scheduler has for it, before it counts as not there
 
@@ -336,7 +335,7 @@ def replay(
 
     Ctrl-C shows the replays that were finished.
     """
-    from ..experiments.contenders import Contender
+    from ..experiments.replay import Contender
 
     contender = Contender(choice.name, choice.load())
     _play("replay", [contender], {"confirms": [confirm]}, source, stream, out, as_json)
@@ -425,7 +424,7 @@ def _distinct(asked: list[str]) -> list[str]:
 
 def _contender(asked: str, choice: RecipeChoice) -> Contender:
     """A rival by its name, else a recipe; with the settings that were given."""
-    from ..experiments.contenders import Contender
+    from ..experiments.replay import Contender
     from ..experiments.rivals import RIVALS
 
     if asked in RIVALS:

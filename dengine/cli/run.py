@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..cells.base import Cell
     from ..decision.certificate import Certificate
     from ..engine.engine import DataEngine
-    from ..experiments.replay import RunLog
+    from ..experiments.replay import Replay
     from ..records import Cycle
     from ..store.base import Store
 
@@ -137,7 +137,7 @@ class Told:
 
 def _drive(
     engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
-) -> tuple[RunLog, list[ModeChange], CellError | None]:
+) -> tuple[Replay, list[ModeChange], CellError | None]:
     """What was done, and what ended it, where the cell failed: what was done before that is shown first."""
     from ..experiments.replay import RunRecorder
 
@@ -223,11 +223,11 @@ CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
 
 
 def _report(
-    log: RunLog, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: OutFolder | None, as_json: bool
+    log: Replay, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: OutFolder | None, as_json: bool
 ) -> None:
     from ..experiments.tables import retrain_line
 
-    total, stretches = log.summary(), log.stretches(STRETCHES)
+    total, stretches = log.stretch(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
     with refusals_last() as attempt:
@@ -294,7 +294,7 @@ def _cells(row: dict[str, Any], timed: bool) -> list[str]:
     ]
 
 
-def _save(log: RunLog, title: str, out: OutFolder) -> list[Path]:
+def _save(log: Replay, title: str, out: OutFolder) -> list[Path]:
     from ..experiments.figures import run_picture, save
     from ..experiments.tables import write_csv
 

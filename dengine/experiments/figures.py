@@ -41,7 +41,7 @@ from ..recipe import Recipe
 from ..records import Action
 from ..reducers import reducer_class
 from .costs import CostCurve, PolicyCost
-from .replay import Replay, RunLog
+from .replay import Replay
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -307,7 +307,7 @@ def _draw_tolerance(top: Axes, bottom: Axes, lower_bounds: set[float]) -> None:
         bottom.axhline(tolerated, label=f"tolerance 100 - LB = {tolerated:g} %", **LIMIT)
 
 
-def run_picture(log: RunLog, title: str = "", window: int = 100) -> Figure:
+def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     """A live run: verified share, errors so far and, with a clock, parts an hour."""
     window = min(window, max(1, len(log) // 3))
     figure, axes = panels(2 if log.clock_s is None else 3, (9.0, 6.0 if log.clock_s is None else 8.5))
@@ -325,7 +325,7 @@ def run_picture(log: RunLog, title: str = "", window: int = 100) -> Figure:
     return figure
 
 
-def _draw_rate(axes: Axes, log: RunLog, clock_s: Floats, window: int) -> None:
+def _draw_rate(axes: Axes, log: Replay, clock_s: Floats, window: int) -> None:
     x, took = np.arange(1, len(log) + 1), np.diff(clock_s, prepend=0.0)
     rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
     settled = x >= window  # a rate over few cycles is mostly luck

@@ -5,15 +5,9 @@
 joblib runs the replays, with the backend that the caller picked: `joblib.parallel_config(backend="dask")` sends the same
 replays to a cluster, and the same decisions come back.
 
-Finished replays on disk, by what they are: an interrupted grid goes on where it was.
-
-    kept = KeptReplays("out/kept", data)
-    replay = kept.get(task) or ...            # the very same, but for the times of that run
-    kept.put(task, replay)
-
-A file's name is a hash of all that its decisions depend on: the traces and labels, every setting, the seed, dengine's own
-source, and the versions of the libraries that compute. Nothing is unpickled. A file that cannot be read is a replay that is
-not there.
+Finished replays are kept on disk, so that an interrupted grid goes on where it was. A file's name is a hash of all that its
+decisions depend on: traces and labels, every setting, the seed, dengine's own source, and the versions of the libraries
+that compute. Nothing is unpickled. A file that cannot be read is a replay that is not there.
 """
 
 from __future__ import annotations
@@ -26,25 +20,32 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from inspect import getsourcefile
+from inspect import getsourcefile, isfunction
 from pathlib import Path
+from pickle import PicklingError
 from typing import TYPE_CHECKING, Any, NamedTuple
 from uuid import uuid4
 
 import numpy as np
 
 from ..datasets import Dataset, load_dataset
+from ..engine.settings import flat
+from ..errors import SettingError
+from ..recipe import PLAIN, described
 from ..records import RetrainReport
-from .contenders import Contender, contenders, parts_of
-from .replay import Replay, replay
+from ..reducers import reducer_class
+from .replay import Contender, Replay, replay
 from .rivals import require
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Folder = str | os.PathLike[str]
+OnDone = Callable[[Replay], None] | None
+TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
 # What of a replay is no array, beside its recipe.
 ABOUT = ("name", "dataset", "seed", "confirm", "seconds", "encoder_steps", "encoder_seconds", "slice_max_s")
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
@@ -66,8 +67,11 @@ class Task:
     @property
     def description(self) -> str:
         """All that its decisions depend on beside the data."""
+        who, reducer = self.contender, self.contender.recipe.reducer
         own = {"seed": self.seed, "cycles": self.cycles, "shuffle": self.shuffle, "confirm": self.confirm}
-        return f"{self.contender.description}\n{json.dumps(own)}"
+        handed_in = "" if isinstance(reducer, str) else f"\n{described(reducer)}\n{_digest_of_reducer(reducer)}"
+        rival = f"{who.rival} {sorted(who.params.items())}"
+        return f"{who.recipe.to_toml()}{handed_in}\n{rival}\n{json.dumps(own)}"
 
 
 class KeptReplays:
@@ -95,10 +99,8 @@ class KeptReplays:
 
     def _own_source(self, contender: Contender) -> str:
         """The text of the files that a reducer and its parts stand in: what it does changes with them."""
-        from ..reducers import reducer_class
-
         own = contender.recipe.reducer
-        parts = [reducer_class(own)] if isinstance(own, str) else parts_of(own)
+        parts = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
         self._own |= {part: _source_of(part) for part in parts if part not in self._own}
         return "".join(self._own[part] for part in parts)
 
@@ -156,8 +158,67 @@ def _source_of(part: Any) -> str:
         return ""  # typed at a prompt, or compiled
 
 
-Folder = str | os.PathLike[str]
-OnDone = Callable[[Replay], None] | None
+def _parts_of(reducer: Any) -> list[Any]:
+    """The classes of a transformer and of the estimators that it is made of, and its functions."""
+    held = reducer.get_params(deep=True).values()
+    kinds = [type(part) for part in [reducer, *(each for each in held if hasattr(each, "fit"))]]
+    return list(dict.fromkeys([*kinds, *(each for each in held if isfunction(each))]))
+
+
+def _digest_of_reducer(reducer: Any) -> str:
+    """Of all that a transformer holds: arrays and functions too, which its description only names."""
+    from joblib import hash as digest
+
+    try:
+        return str(digest(reducer))
+    except (PicklingError, TypeError, AttributeError) as error:
+        raise SettingError(
+            f"Expected a reducer that can be told apart from others, to keep its replays; {described(reducer)} holds what "
+            f"has no name in a module, as a lambda ({error}); define it in a module, or leave keep out."
+        ) from error
+
+
+def contenders(asked: Sequence[Any]) -> list[Contender]:
+    """Each as it was asked for, under a name of its own: equal names are followed by the settings in which they differ.
+
+    Recipes that differ in `TOLD_APART` alone keep one name. Transformers whose settings read alike, as two functions of one
+    name, are numbered. SettingError where two do not differ at all.
+    """
+    loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
+    named = [_told_apart(one, [other for other in loaded if other.name == one.name and other is not one]) for one in loaded]
+    held: dict[str, list[int]] = {}  # the transformers behind each name
+    for one in named:
+        of_name = held.setdefault(one.name, [])
+        if not isinstance(one.recipe.reducer, str) and id(one.recipe.reducer) not in of_name:
+            of_name.append(id(one.recipe.reducer))
+    return [
+        replace(one, name=f"{one.name} {1 + held[one.name].index(id(one.recipe.reducer))}")
+        if len(held[one.name]) > 1 and not isinstance(one.recipe.reducer, str)
+        else one
+        for one in named
+    ]
+
+
+def _told_apart(one: Contender, others: Sequence[Contender]) -> Contender:
+    """Named by the settings in which it differs from others of its name."""
+    if one in others:
+        raise SettingError(f"Expected each to be asked for once, got {one.name} twice with the same settings.")
+    own, theirs = _flat(one), [_flat(other) for other in others]
+    differing = [key for key in own if any(other.get(key) != own[key] for other in theirs)]
+    return replace(one, name=" ".join([one.name, *(f"{key}={own[key]}" for key in differing)]))
+
+
+def _flat(one: Contender) -> dict[str, Any]:
+    """Every setting by its name, without those that have columns of their own."""
+    plain = {key: value for key, value in flat(one.recipe).items() if key not in (*TOLD_APART, "params")}
+    own = plain["reducer"]
+    if not isinstance(own, str):  # of a transformer's settings, a part or a function by what it is called
+        short = {
+            key: value if isinstance(value, PLAIN) or value is None else getattr(value, "__name__", type(value).__name__)
+            for key, value in own.get_params().items()
+        }
+        plain |= {"reducer": type(own).__name__} | short
+    return {**plain, **one.recipe.params, **one.params}
 
 
 class Played(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from ..decision.intervals import wilson_interval
 from ..errors import SettingError, shortened
 from ..records import is_number
-
-if TYPE_CHECKING:
-    from .replay import Replay
 
 SIDES = ("accepted", "rejected")
 VERIFY_SECONDS = 5.0  # what a height check costs a cycle, in the paper's cell
@@ -59,7 +56,22 @@ class ErrorRate:
     upper: float
 
 
-def pooled_error(replays: Sequence[Replay], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
+class Decided(Protocol):
+    """What is asked of a replay of n cycles: (n,) index of its traces in the data set, and masks of its decisions."""
+
+    @property
+    def index(self) -> NDArray[np.int64]: ...
+    @property
+    def accepted(self) -> NDArray[np.bool_]: ...
+    @property
+    def rejected(self) -> NDArray[np.bool_]: ...
+    @property
+    def false_positive(self) -> NDArray[np.bool_]: ...
+    @property
+    def false_negative(self) -> NDArray[np.bool_]: ...
+
+
+def pooled_error(replays: Sequence[Decided], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
     """Share of wrong ones among all parts that were accepted (or rejected), with an interval that is honest of shuffles.
 
     Thirty shuffles of one set play the same traces thirty times, so they are no thirty samples of the world. A trace is
@@ -71,7 +83,7 @@ def pooled_error(replays: Sequence[Replay], side: str = "accepted", alpha: float
     """
     if side not in SIDES:
         raise SettingError(f"Expected side {' or '.join(SIDES)}, got {side!r}.")
-    size = 1 + max((int(r.index.max()) for r in replays if len(r)), default=0)
+    size = 1 + max((int(r.index.max()) for r in replays if len(r.index)), default=0)
     decided, wrong = np.zeros(size), np.zeros(size)
     for one in replays:
         mask, bad = (one.accepted, one.false_positive) if side == "accepted" else (one.rejected, one.false_negative)

@@ -1,19 +1,17 @@
-"""One recorded stream through one engine: the paper's prototype online environment.
+"""One stream through one engine, cycle by cycle: the paper's prototype online environment, and live runs.
 
 >>> replay("insertion", "conv", seed=0).summary()["certain"]
-
-What happened while an engine drove a cell, cycle by cycle: one record of live runs and of replays.
-
-log = watch(DataEngine(), SimulatedCell(cycles=600), cycles=600)
-log.stretches(6)
+>>> watch(DataEngine(), SimulatedCell(cycles=600), cycles=600).stretches(6)
 """
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,80 +22,137 @@ from ..cells.replay import ReplayCell
 from ..datasets import Dataset, load_dataset
 from ..engine.engine import DataEngine
 from ..errors import SettingError
-from ..recipe import Recipe
+from ..recipe import RECIPES, Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
-from .contenders import Contender
 from .metrics import Costs, decided_rates
+from .rivals import RIVALS, make_rival
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+WHOLE = slice(None)
 COLUMNS = (  # of a run as a frame
     "action", "reason", "truth", "lower", "upper", "n_success", "n_failure", "stopped", "safe_mode", "version"
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Contender:
+    """Who plays a stream: dengine by a recipe, or a rival method in the same loop.
+
+    >>> Contender.load("conv")        # a recipe's name, a TOML file, module:Class, a transformer, a Recipe
+    >>> Contender.load("knn")         # a name in `rivals.RIVALS`
+
+    name : in tables, pictures and file names.
+    recipe : every setting of the engine; of a rival's, those of the loop and the policy that the rival is made with.
+    rival : a name in `RIVALS` that decides in place of reducer and neighbours.  params : the rival's own settings.
+    """
+
+    name: str
+    recipe: Recipe
+    rival: str | None = None
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, asked: Any) -> Contender:
+        """From a contender, a rival's name (its chosen settings), or what `Recipe.load` takes; SettingError for else."""
+        if isinstance(asked, Contender):
+            return asked
+        if isinstance(asked, str) and asked in RIVALS:
+            return cls(asked, Recipe(), asked, RIVALS[asked].tries[RIVALS[asked].chosen])
+        recipe = Recipe.load(asked)
+        by_name = isinstance(asked, str | os.PathLike) and (str(asked) in RECIPES or Path(asked).is_file())
+        return cls(Path(asked).stem if by_name else recipe.name, recipe)
+
+    def with_policy(self, **changes: Any) -> Contender:
+        """The same with another alpha, lower_bound, interval, guarantee or stops."""
+        return replace(self, recipe=self.recipe.with_policy(**changes))
+
+    def engine(self, seed: int) -> DataEngine:
+        """A fresh engine in memory that repeats exactly under a seed."""
+        rival = None if self.rival is None else make_rival(self.rival, self.recipe.policy, seed, **self.params)
+        return DataEngine(recipe=self.recipe, model=rival, seed=seed, replaying=True)
+
+
 @dataclass(frozen=True, kw_only=True)
-class RunLog:
-    """One run of a cell; n cycles were finished, which may be none.
+class Replay:
+    """One run of a cell, a replay or a live one; n cycles were finished, which may be none.
 
     action : (n,) str, the engine's.  stopped : (n,) bool, the system stopped on an accepted part.
-    truth : (n,) 1 good, 0 bad, NaN where the cell does not tell: real ones tell only what was verified.
+    truth : (n,) good or not: bool in a replay; in a live run float, NaN where the cell does not tell.
     lower, upper, n_success, n_failure : (n,) the evidence.
     position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
-    reason : (n,) str, why each decision is what it is, as in `Reason`.
-    version : (n,) of the model that answered; 0 before the first retrain.
+    reason : (n,) str, as in `Reason`.  version : (n,) of the model that answered; 0 before the first retrain.
     safe_mode : (n,) bool, every part is verified after this cycle, whatever the model says.
     decide_seconds : (n,) wall time of each decision.
     clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
-    retrains : the reports of those that ended in this run.
+    retrains : the reports of those that ended in this run.  recipe : of the engine.  name : of who played, in tables.
+
+    Of a replay alone:
+    index : (n,) position in the data set of the trace that each cycle played.  dataset : its name.
+    seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
+    seconds : wall time of the whole replay.
+    encoder_steps : of label-free training between cycles.  encoder_seconds : assumed for them, so many a step whatever
+        they took, so that a seed repeats exactly.  slice_max_s : wall time of the longest slice of them.
     """
 
     action: NDArray[np.str_]
-    truth: NDArray[np.float64] | NDArray[np.bool_]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    truth: NDArray[Any]
+    lower: Floats
+    upper: Floats
     n_success: NDArray[np.int64]
     n_failure: NDArray[np.int64]
-    position: NDArray[np.float64]
-    decide_seconds: NDArray[np.float64]
-    stopped: NDArray[np.bool_]
+    position: Floats
+    decide_seconds: Floats
+    stopped: Bools
     reason: NDArray[np.str_]
     version: NDArray[np.int64]
-    safe_mode: NDArray[np.bool_]
-    clock_s: NDArray[np.float64] | None = None
+    safe_mode: Bools
+    clock_s: Floats | None = None
     retrains: tuple[RetrainReport, ...] = ()
+    recipe: Recipe = field(default_factory=Recipe)
+    name: str = ""
+    index: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    dataset: str = ""
+    seed: int = 0
+    confirm: bool = False
+    seconds: float = float("nan")
+    encoder_steps: int = 0
+    encoder_seconds: float = 0.0
+    slice_max_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.action)
 
     @property
-    def verified(self) -> NDArray[np.bool_]:
+    def verified(self) -> Bools:
         """(n,) the part was checked."""
         return np.asarray(self.action == Action.VERIFY)
 
     @property
-    def accepted(self) -> NDArray[np.bool_]:
+    def accepted(self) -> Bools:
         """(n,) the part went on without a check."""
         return np.asarray(self.action == Action.ACCEPT)
 
     @property
-    def rejected(self) -> NDArray[np.bool_]:
+    def rejected(self) -> Bools:
         """(n,) the part went back to the bin without a check."""
         return np.asarray(self.action == Action.REJECT)
 
     @property
-    def false_positive(self) -> NDArray[np.bool_]:
+    def false_positive(self) -> Bools:
         """(n,) accepted and bad, as far as the truth is known."""
         return np.asarray(self.accepted & (self.truth == 0.0))
 
     @property
-    def false_negative(self) -> NDArray[np.bool_]:
+    def false_negative(self) -> Bools:
         """(n,) rejected and good, as far as the truth is known."""
         return np.asarray(self.rejected & (self.truth == 1.0))
 
     @property
-    def novel(self) -> NDArray[np.bool_]:
+    def novel(self) -> Bools:
         """(n,) verified as unlike all that was learned from."""
         return np.asarray(self.reason == Reason.NOVEL)
 
@@ -107,164 +162,9 @@ class RunLog:
         return bool(np.isfinite(self.position).any())
 
     @property
-    def finished(self) -> NDArray[np.bool_]:
+    def finished(self) -> Bools:
         """(n,) a good part was passed on, as far as the truth is known."""
         return np.asarray(~self.rejected & (self.truth == 1.0))
-
-    @property
-    def retrain_seconds(self) -> NDArray[np.float64]:
-        """Wall time of each retrain."""
-        return np.array([each.seconds for each in self.retrains], dtype=np.float64)
-
-    def to_frame(self) -> pd.DataFrame:
-        """A row a cycle, numbered from 1: what was decided, why, on what evidence, and what was true."""
-        import pandas as pd
-
-        told = {name: getattr(self, name) for name in COLUMNS}
-        axes = {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
-        clock = {} if self.clock_s is None else {"clock_s": self.clock_s}
-        index = pd.RangeIndex(1, len(self) + 1, name="cycle")
-        return pd.DataFrame(told | {"decide_us": 1e6 * self.decide_seconds} | axes | clock, index=index)
-
-    def summary(self) -> dict[str, Any]:
-        """Counts over all cycles; parts an hour where there is a clock."""
-        return self.stretch(slice(None))
-
-    def stretches(self, n: int) -> list[dict[str, Any]]:
-        """The run cut into at most n stretches of about equal length, each as in `stretch`."""
-        edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
-        return [self.stretch(slice(a, b)) for a, b in pairwise(edges)]
-
-    def stretch(self, part: slice) -> dict[str, Any]:
-        """Counts over some of the cycles; parts an hour where there is a clock."""
-        begin, end, _ = part.indices(len(self))
-        return {
-            "first_cycle": begin + 1,
-            "last_cycle": end,
-            "verified_share": float(self.verified[part].mean()) if end > begin else float("nan"),
-            "verified": int(self.verified[part].sum()),
-            "accepted": int(self.accepted[part].sum()),
-            "rejected": int(self.rejected[part].sum()),
-            "false_positive": int(self.false_positive[part].sum()),
-            "false_negative": int(self.false_negative[part].sum()),
-            "stops": int(self.stopped[part].sum()),
-            "novel": int(self.novel[part].sum()),
-            "safe_mode": int(self.safe_mode[part].sum()),
-            "parts_per_hour": self._parts_per_hour(begin, end),
-        }
-
-    def _parts_per_hour(self, begin: int, end: int) -> float | None:
-        if self.clock_s is None or end <= begin:
-            return None
-        seconds = self.clock_s[end - 1] - (self.clock_s[begin - 1] if begin else 0.0)
-        return float(3600.0 * self.finished[begin:end].sum() / seconds) if seconds > 0 else None
-
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """One cycle, and what the cell told about it on the side."""
-
-    cycle: Cycle
-    truth: float
-    clock: float | None
-
-
-class RunRecorder:
-    """Gathers a run while it happens, so that one that is broken off can still be shown.
-
-        recorder = RunRecorder(cell)
-        with suppress(KeyboardInterrupt):
-            recorder.follow(engine, cycles=600)
-        recorder.log()
-
-    `truth` and `clock` are read off a cell that has them.
-    """
-
-    def __init__(self, cell: Cell) -> None:
-        self.cell = cell
-        self._seen: list[_Seen] = []
-
-    def follow(self, engine: DataEngine, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> None:
-        """Let the engine drive the cell, and gather every cycle. on_cycle : called after each."""
-        for cycle in engine.run(self.cell, cycles):
-            self.add(cycle)
-            if on_cycle is not None:
-                on_cycle(cycle)
-
-    def add(self, cycle: Cycle) -> None:
-        """Take in the cycle that was just finished, before the cell's next part."""
-        known = getattr(self.cell, "truth", cycle.success)
-        truth = float("nan") if known is None else float(known)
-        self._seen.append(_Seen(cycle, truth, getattr(self.cell, "clock", None)))
-
-    def log(self) -> RunLog:
-        """What was gathered so far."""
-        cycles = [each.cycle for each in self._seen]
-        decisions = [cycle.decision for cycle in cycles]
-        return RunLog(
-            action=np.array([str(d.action) for d in decisions], dtype=np.str_),
-            truth=np.array([each.truth for each in self._seen], dtype=np.float64),
-            lower=np.array([d.lower for d in decisions], dtype=np.float64),
-            upper=np.array([d.upper for d in decisions], dtype=np.float64),
-            n_success=np.array([d.n_success for d in decisions], dtype=np.int64),
-            n_failure=np.array([d.n_failure for d in decisions], dtype=np.int64),
-            position=_positions(decisions),
-            decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
-            stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
-            reason=np.array([str(d.reason) for d in decisions], dtype=np.str_),
-            version=np.array([d.model_version for d in decisions], dtype=np.int64),
-            safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
-            clock_s=self._clock(),
-            retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
-        )
-
-    def _clock(self) -> NDArray[np.float64] | None:
-        if getattr(self.cell, "clock", None) is None:
-            return None
-        return np.array([each.clock for each in self._seen], dtype=np.float64)
-
-
-def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> RunLog:
-    """Drive a cell and keep what figures and tables need; `RunRecorder` is for a run that may be broken off."""
-    recorder = RunRecorder(cell)
-    recorder.follow(engine, cycles, on_cycle)
-    return recorder.log()
-
-
-def _positions(decisions: list[Decision]) -> NDArray[np.float64]:
-    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
-    means = [np.mean(each.embedding, axis=0) if each.embedding else None for each in decisions]
-    known = [mean for mean in means if mean is not None]
-    positions = np.full((len(means), len(known[-1]) if known else 2), np.nan)
-    for i, mean in enumerate(means):
-        if mean is not None and len(mean) == positions.shape[1]:
-            positions[i] = mean
-    return positions
-
-
-@dataclass(frozen=True, kw_only=True)
-class Replay(RunLog):
-    """What happened in one replay, cycle by cycle, as in `RunLog`; the truth is known of every part, as bool.
-
-    index : (n,) position in the data set of the trace that each cycle played.
-    name : of who played, in tables.  recipe : of the engine.  dataset : its name.
-    seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
-    seconds : wall time of the whole replay.
-    encoder_steps : of label-free training between cycles.  encoder_seconds : that were assumed for them, so many a step
-        whatever they took, so that a seed repeats exactly.  slice_max_s : wall time of the longest slice of them.
-    """
-
-    truth: NDArray[np.bool_]
-    index: NDArray[np.int64]
-    name: str
-    recipe: Recipe
-    dataset: str
-    seed: int
-    confirm: bool = False
-    seconds: float = float("nan")
-    encoder_steps: int = 0
-    encoder_seconds: float = 0.0
-    slice_max_s: float = 0.0
 
     @property
     def first_certain(self) -> float:
@@ -272,9 +172,44 @@ class Replay(RunLog):
         certain = np.flatnonzero(~self.verified)
         return float(certain[0] + 1) if len(certain) else float("nan")
 
+    @property
+    def retrain_seconds(self) -> Floats:
+        """Wall time of each retrain."""
+        return np.array([each.seconds for each in self.retrains], dtype=np.float64)
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row a cycle, numbered from 1: what was decided, why, on what evidence, and what was true."""
+        import pandas as pd
+
+        columns = {name: getattr(self, name) for name in COLUMNS} | {"decide_us": 1e6 * self.decide_seconds}
+        columns |= {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
+        clock = {} if self.clock_s is None else {"clock_s": self.clock_s}
+        return pd.DataFrame(columns | clock, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
+
+    def stretches(self, n: int) -> list[dict[str, Any]]:
+        """The run cut into at most n stretches of about equal length, each as in `stretch`."""
+        edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
+        return [self.stretch(slice(a, b)) for a, b in pairwise(edges)]
+
+    def stretch(self, part: slice = WHOLE) -> dict[str, Any]:
+        """Counts over some of the cycles; parts an hour where there is a clock."""
+        begin, end, _ = part.indices(len(self))
+        names = ("verified", "accepted", "rejected", "false_positive", "false_negative", "stopped", "novel", "safe_mode")
+        counts = {name: int(getattr(self, name)[part].sum()) for name in names}
+        counts["stops"] = counts.pop("stopped")
+        share = counts["verified"] / (end - begin) if end > begin else float("nan")
+        about = {"first_cycle": begin + 1, "last_cycle": end, "verified_share": share}
+        return about | counts | {"parts_per_hour": self._parts_per_hour(begin, end)}
+
+    def _parts_per_hour(self, begin: int, end: int) -> float | None:
+        if self.clock_s is None or end <= begin:
+            return None
+        seconds = self.clock_s[end - 1] - (self.clock_s[begin - 1] if begin else 0.0)
+        return float(3600.0 * self.finished[begin:end].sum() / seconds) if seconds > 0 else None
+
     def summary(self) -> dict[str, Any]:
         """One row of a table: counts over the whole stream; precision and NPV are NaN where nothing was decided."""
-        counts, policy = self.stretch(slice(None)), self.recipe.policy
+        counts, policy = self.stretch(), self.recipe.policy
         certain = counts["accepted"] + counts["rejected"]
         wrong = {name: counts[name] for name in ("false_positive", "false_negative")}
         return {
@@ -306,6 +241,75 @@ class Replay(RunLog):
             "net_s": Costs().saved(certain, **wrong),
             "seconds": self.seconds,
         }
+
+
+class RunRecorder:
+    """Gathers a run while it happens, so that one that is broken off can still be shown.
+
+        recorder = RunRecorder(cell)
+        with suppress(KeyboardInterrupt):
+            recorder.follow(engine, cycles=600)
+        recorder.log()
+
+    `truth` and `clock` are read off a cell that has them.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self._recipe = Recipe()
+        self._seen: list[tuple[Cycle, float, float | None]] = []  # and what the cell told on the side: truth, clock
+
+    def follow(self, engine: DataEngine, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> None:
+        """Let the engine drive the cell, and gather every cycle. on_cycle : called after each."""
+        self._recipe = engine.recipe
+        for cycle in engine.run(self.cell, cycles):
+            known = getattr(self.cell, "truth", cycle.success)
+            truth = float("nan") if known is None else float(known)
+            self._seen.append((cycle, truth, getattr(self.cell, "clock", None)))
+            if on_cycle is not None:
+                on_cycle(cycle)
+
+    def log(self) -> Replay:
+        """What was gathered so far."""
+        cycles = [cycle for cycle, _, _ in self._seen]
+        decisions = [cycle.decision for cycle in cycles]
+        has_clock = getattr(self.cell, "clock", None) is not None
+        return Replay(
+            action=np.array([str(d.action) for d in decisions], dtype=np.str_),
+            truth=np.array([truth for _, truth, _ in self._seen], dtype=np.float64),
+            lower=np.array([d.lower for d in decisions], dtype=np.float64),
+            upper=np.array([d.upper for d in decisions], dtype=np.float64),
+            n_success=np.array([d.n_success for d in decisions], dtype=np.int64),
+            n_failure=np.array([d.n_failure for d in decisions], dtype=np.int64),
+            position=_positions(decisions),
+            decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
+            stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
+            reason=np.array([str(d.reason) for d in decisions], dtype=np.str_),
+            version=np.array([d.model_version for d in decisions], dtype=np.int64),
+            safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
+            clock_s=np.array([clock for _, _, clock in self._seen], dtype=np.float64) if has_clock else None,
+            retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
+            recipe=self._recipe,
+            name=self._recipe.name,
+        )
+
+
+def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> Replay:
+    """Drive a cell and keep what figures and tables need; `RunRecorder` is for a run that may be broken off."""
+    recorder = RunRecorder(cell)
+    recorder.follow(engine, cycles, on_cycle)
+    return recorder.log()
+
+
+def _positions(decisions: list[Decision]) -> NDArray[np.float64]:
+    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
+    means = [np.mean(each.embedding, axis=0) if each.embedding else None for each in decisions]
+    known = [mean for mean in means if mean is not None]
+    positions = np.full((len(means), len(known[-1]) if known else 2), np.nan)
+    for i, mean in enumerate(means):
+        if mean is not None and len(mean) == positions.shape[1]:
+            positions[i] = mean
+    return positions
 
 
 def replay(
@@ -344,11 +348,20 @@ def collect(
     """Drive any engine over a replay cell and gather its cycles; a model of your own comes in through the engine."""
     begin = time.perf_counter()
     log = watch(engine, cell, len(cell.order), on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
-    told = vars(log) | {"truth": log.truth.astype(np.bool_), "index": cell.order, "confirm": cell.confirm}
-    about: dict[str, Any] = {"name": name or engine.recipe.name, "recipe": engine.recipe, "seed": seed}
     spent = engine.encoder_time
-    trained: dict[str, Any] = {"encoder_steps": spent.steps, "encoder_seconds": spent.seconds, "slice_max_s": spent.longest}
-    return Replay(**told, **about, **trained, dataset=data.name, seconds=time.perf_counter() - begin)
+    return replace(
+        log,
+        truth=log.truth.astype(np.bool_),
+        index=cell.order,
+        confirm=cell.confirm,
+        name=name or log.name,
+        dataset=data.name,
+        seed=seed,
+        seconds=time.perf_counter() - begin,
+        encoder_steps=spent.steps,
+        encoder_seconds=spent.seconds,
+        slice_max_s=spent.longest,
+    )
 
 
 def order_of(data: Dataset, seed: int, cycles: int | None = None, shuffle: bool = True) -> NDArray[np.int64]:

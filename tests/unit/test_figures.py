@@ -16,7 +16,7 @@ from sklearn.decomposition import PCA
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
 from dengine.cells.simulation.conditions import first_change
 from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
-from dengine.experiments.replay import Replay, RunLog, RunRecorder
+from dengine.experiments.replay import Replay, RunRecorder
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, write_csv
 
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
@@ -195,15 +195,15 @@ def test_a_ball_that_grows_has_no_radius_to_draw() -> None:
 # ---------------------------------------------------------------------------------------------------------- runs
 
 
-def log_of(clock_s: np.ndarray | None) -> RunLog:
+def log_of(clock_s: np.ndarray | None) -> Replay:
     action = np.array(["verify"] * 60 + ["accept"] * 30 + ["reject"] * 10)
     truth = np.array([1.0] * 59 + [0.0] + [1.0] * 29 + [0.0] + [0.0] * 9 + [1.0])
-    return RunLog(action=action, truth=truth, stopped=np.arange(100) == 89, clock_s=clock_s, **evidence(100))
+    return Replay(action=action, truth=truth, stopped=np.arange(100) == 89, clock_s=clock_s, **evidence(100))
 
 
 def test_a_run_is_summed_up_by_stretches_that_add_up() -> None:
     log = log_of(np.cumsum(np.full(100, 36.0)))
-    total, parts = log.summary(), log.stretches(7)
+    total, parts = log.stretch(), log.stretches(7)
     for name in ("verified", "accepted", "rejected", "false_positive", "false_negative", "stops"):
         assert total[name] == sum(part[name] for part in parts)
     assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
@@ -212,14 +212,14 @@ def test_a_run_is_summed_up_by_stretches_that_add_up() -> None:
 
 def test_a_cell_without_a_clock_has_no_rate_and_one_panel_less() -> None:
     log = log_of(None)
-    assert log.summary()["parts_per_hour"] is None
+    assert log.stretch()["parts_per_hour"] is None
     assert len(run_picture(log).axes) == 2
     assert len(run_picture(log_of(np.arange(1.0, 101.0))).axes) == 3
 
 
 def test_a_run_that_verified_every_part_lies_on_its_own_baseline() -> None:
     clock_s, never = 52.0 * np.arange(1, 51), np.zeros(50, dtype=bool)
-    log = RunLog(action=np.array(["verify"] * 50), truth=np.ones(50), stopped=never, clock_s=clock_s, **evidence(50))
+    log = Replay(action=np.array(["verify"] * 50), truth=np.ones(50), stopped=never, clock_s=clock_s, **evidence(50))
     run, baseline = run_picture(log).axes[2].lines
     np.testing.assert_allclose(run.get_ydata(), baseline.get_ydata())
 
@@ -231,7 +231,7 @@ def blank() -> Replay:
     return replay
 
 
-def no_run(clock: float | None) -> RunLog:
+def no_run(clock: float | None) -> Replay:
     return RunRecorder(SimpleNamespace(clock=clock)).log()
 
 
@@ -270,7 +270,7 @@ def test_no_legend_lies_on_the_data(name: str) -> None:
 def test_novel_parts_and_cycles_of_safe_mode_are_counted_in_their_stretch() -> None:
     novel, safe = np.arange(100) % 10 == 0, np.arange(100) >= 70
     log = replace(log_of(None), reason=np.where(novel, "novel", "uncertain"), safe_mode=safe)
-    assert (log.summary()["novel"], log.summary()["safe_mode"]) == (10, 30)
+    assert (log.stretch()["novel"], log.stretch()["safe_mode"]) == (10, 30)
     assert [part["safe_mode"] for part in log.stretches(4)] == [0, 0, 5, 25]
 
 
