@@ -16,7 +16,7 @@ from typing import Any
 
 from ..errors import DataError
 from .dataset import Fault, UnreadableError
-from .text import fitting, read_lines, split_line
+from .text import read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "0")
@@ -153,29 +153,26 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> tup
     """
     source = Path(path).name
     try:
-        header, lines, delimiter = read_lines(Path(path))
+        table = read_table(Path(path))
+        cells = table.frame(as_text=True).to_numpy().tolist()
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
+    header, lines = table.header, table.lines
     if header[0].lower().endswith(".csv"):
-        header, lines = ["file", "label"], [(1, delimiter.join(header)), *lines]
+        cells, lines, header = [header, *cells], [1, *lines], ["file", "label", *header[2:]]
     of_file, of_label = _columns(header, path)
     if part != "part" and part not in header:
         raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
     of_part = header.index(part) if part in header else None
     rows: dict[str, tuple[int, str, str, str | None]] = {}
-    faults = []
-    for number, line in lines:
-        try:
-            words = fitting(split_line(line, delimiter), len(header))
-        except UnreadableError as error:
-            faults.append(Fault(source, number, error.what))
-            continue
+    for number, row in zip(lines, cells, strict=True):
+        words = [str(word).strip() for word in row]
         key = "/".join(_words(words[of_file]))
         if key in rows:
-            faults.append(Fault(source, number, f"Expected each file once, {words[of_file]} came before"))
+            table.faults.append(Fault(source, number, f"Expected each file once, {words[of_file]} came before"))
         else:
             rows[key] = number, words[of_file], words[of_label], None if of_part is None else words[of_part] or None
-    return Listed(source, list(rows.values()), names), faults
+    return Listed(source, list(rows.values()), names), table.faults
 
 
 def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:

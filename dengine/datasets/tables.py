@@ -6,7 +6,6 @@ as many. Or a column a channel, whose cells are lists of numbers, as Parquet kee
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping
 from importlib import import_module
@@ -24,7 +23,7 @@ from .dataset import Asked, Dataset, Fault, UnreadableError
 from .folders import FORCE
 from .labels import LABEL_COLUMNS, label_of
 from .lengths import Collected, as_dataset
-from .text import NOTHING, is_number, read_lines
+from .text import is_number, numbers, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,35 +33,18 @@ NUMBERED = re.compile(r"(.*?)[_\-. \[]*(\d+)\]?")
 
 def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
     """One CSV file with a header."""
-    import pandas as pd
-
     try:
-        header, lines, delimiter = read_lines(path)
+        table = read_table(path)
+        if 2 * sum(is_number(word) and not word.isdecimal() for word in table.header) > len(table.header) > 2:
+            raise DataError(
+                f"Expected a header in {path}, its first line is of numbers; name the columns FZ_0, FZ_1, ..., label."
+            )
+        if not table.rows:
+            raise DataError(f"Expected rows that can be read in {path}, found none.")
+        frame = table.frame().set_axis(table.header, axis=1)
     except UnreadableError as error:
         raise DataError(f"Cannot read {path}: {error.fault(path.name)}.") from error
-    if 2 * sum(is_number(word) and not word.isdecimal() for word in header) > len(header) > 2:
-        raise DataError(
-            f"Expected a header in {path}, its first line is of numbers; name the columns FZ_0, FZ_1, ..., label."
-        )
-    faults, rows = [], []
-    for number, line in lines:
-        columns = line.count(delimiter) + 1
-        if columns == len(header) or '"' in line:
-            rows.append((number, line))
-        elif columns > len(header) and not any(word.strip() for word in line.split(delimiter)[len(header) :]):
-            rows.append((number, delimiter.join(line.split(delimiter)[: len(header)])))
-        else:
-            faults.append(Fault(path.name, number, f"Expected {len(header)} columns, got {columns}"))
-    if not rows:
-        raise DataError(f"Expected rows that can be read in {path}, found none.")
-    comma = delimiter != "," and any("," in line for _, line in rows)
-    body = io.StringIO("\n".join(line for _, line in rows))
-    how: dict[str, Any] = {"sep": delimiter, "decimal": "," if comma else ".", "float_precision": "round_trip"}
-    try:
-        frame = pd.read_csv(body, header=None, names=header, index_col=False, low_memory=False, **how)
-    except (ValueError, OverflowError, pd.errors.ParserError) as error:
-        raise DataError(f"Cannot read {path} as CSV: {' '.join(str(error).split())}.") from error
-    return from_frame(frame, asked, name, path.name, faults, [number for number, _ in rows])
+    return from_frame(frame, asked, name, path.name, table.faults, table.lines)
 
 
 def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
@@ -133,7 +115,10 @@ def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[t
         chosen = _chosen(lists, asked)
         return chosen, [_of_lists(row, i, wrong) for i, row in enumerate(frame[list(chosen)].to_numpy())]
     columns = _sample_columns(list(frame.columns), asked)
-    block = np.stack([_numbers(frame, names, wrong) for names in columns.values()], axis=1)
+    found = [numbers(frame[names]) for names in columns.values()]
+    for what in (what for _, faults in found for what in faults.items()):
+        wrong.setdefault(*what)
+    block = np.stack([values for values, _ in found], axis=1)
     known: NDArray[np.bool_] = np.asarray(~np.isnan(block).all(axis=1))
     ends = np.where(known.any(axis=1), block.shape[2] - np.argmax(known[:, ::-1], axis=1), block.shape[2])
     return tuple(columns), [row[:, :end] for row, end in zip(block, ends.tolist(), strict=True)]
@@ -212,22 +197,6 @@ def _chosen(have: Mapping[str, list[str]], asked: Asked) -> tuple[str, ...]:
     if FORCE in have or len(have) == 1:
         return (FORCE,) if FORCE in have else tuple(have)
     raise DataError(f"Expected the channel to be named, as in channel={next(iter(have))!r}; there are {listed(have)}.")
-
-
-def _numbers(frame: pd.DataFrame, names: list[str], wrong: dict[int, str]) -> NDArray[np.float32]:
-    """(n, T); a row with what is no number is named in `wrong`."""
-    import pandas as pd
-
-    block = frame[names]
-    for column in [c for c in names if not pd.api.types.is_numeric_dtype(block[c])]:
-        words = block[column]
-        numbers = pd.to_numeric(words, errors="coerce")
-        empty = words.isna() | words.astype(str).str.strip().str.lower().isin(NOTHING)
-        for i in np.flatnonzero(numbers.isna() & ~empty):
-            wrong.setdefault(int(i), f"Expected a number in column {column}, got {str(words.iloc[i])[:20]!r}")
-        block = block.assign(**{column: numbers})
-    with np.errstate(over="ignore"):
-        return np.asarray(block.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float32)
 
 
 def _labels(column: pd.Series, wrong: dict[int, str]) -> NDArray[np.int8]:
