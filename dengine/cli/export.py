@@ -72,7 +72,7 @@ def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> 
     JOURNAL is the CSV file that the program wrote, of this version or an
     earlier one. Each line counts once, however often it is imported.
     """
-    from ..datasets.importing import import_journal
+    from ..export.cell_journal import import_journal
 
     report = import_journal(store, journal, any_model=any_model)
     if as_json:

@@ -1,20 +1,20 @@
-"""What was asked of `load_dataset`, handed from one reader to another.
-
-A data set in memory: labelled traces of one form, what is known of them, and what could not be read.
-"""
+"""A data set in memory: labelled traces of one form, what is known of them, and what could not be read."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
 from ..records import FITS, TraceSpec
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +79,22 @@ class Dataset:
         """The contract by which a live engine takes traces of the same form, `DataEngine(trace=data.spec)`."""
         n_channels = 1 if self.X.ndim == 2 else self.X.shape[1]
         return TraceSpec(self.X.shape[-1], self.rate_hz, n_channels, self.unit, fit=self.fit, columns=self.channels)
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row a trace: `label`, `part` and `cause` where known, and `FZ_0 ...`, a column a sample of each channel.
+
+        `data.to_frame().to_parquet("data.parquet")` writes what `load_dataset` reads.
+        """
+        import pandas as pd
+
+        X = self.X if self.X.ndim == 3 else self.X[:, None]
+        channels = self.channels or ("x",) if X.shape[1] == 1 else self.channels or [f"x{c}" for c in range(X.shape[1])]
+        samples = pd.DataFrame(
+            X.reshape(len(X), -1), columns=[f"{name}_{i}" for name in channels for i in range(X.shape[2])]
+        )
+        known = {"label": self.y, "part": self.part, "cause": self.cause}
+        about = pd.DataFrame({name: values for name, values in known.items() if values is not None})
+        return pd.concat([about, samples], axis=1)
 
     def cut(self, samples: int) -> Dataset:
         """The first `samples` samples of every trace: an earlier, harder moment to decide at."""

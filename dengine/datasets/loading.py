@@ -9,11 +9,13 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import DataError
 from ..files import is_database
 from .arrays import from_pair, read_hdf5, read_npz
 from .bags import is_stream, read_bag
-from .dataset import Asked, Dataset, names_of
+from .dataset import Asked, Dataset, make_dataset, names_of
 from .folders import read_folder
 from .lengths import refit
 from .tables import from_frame, read_csv, read_parquet
@@ -101,14 +103,38 @@ def _read(path: Path, asked: Asked) -> Dataset:
     suffix = path.suffix.lower()
     if is_database(path):
         asked.refuse("a store", "label", "labels")
-        from .stores import read_store  # a database is imported where one is read
-
-        found: Dataset = read_store(path, path.stem, asked)
-        return found
+        return read_store(path, path.stem, asked)
     if suffix not in (".npz", *READERS) and not zipfile.is_zipfile(path):
         raise DataError(f"Expected a file .npz, .csv, .parquet, .h5 or .mcap, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
+
+
+def read_store(path: Path, name: str, asked: Asked) -> Dataset:
+    """Every labelled trace of a store, in the order of the labels, as they count now, without bad and forgotten ones.
+
+    Where everything was verified these are all parts. Where the model decided they are a choice of its own: those that it
+    was not certain of, audits, and what became known of accepted ones.
+    DataError for a store without a label.
+    """
+    from ..engine.settings import trace_in
+    from ..store.base import open_store
+
+    store = open_store(path, must_exist=True)
+    try:
+        held, spec = store.labelled(), trace_in(store.settings())
+    finally:
+        store.close()
+    if spec is None or not len(held.labels):
+        raise DataError(
+            f"Expected a store with labelled traces, {path} has none; record some first, as in the shadow mode."
+        )
+    again = len(np.unique(held.hashes)) < len(held.hashes)
+    about = {"rate_hz": spec.rate_hz, "unit": spec.unit, "channels": tuple(spec.columns), "fit": spec.fit}
+    X = held.traces[:, 0] if spec.channels == 1 else held.traces
+    # By the hash that is counted with: a part that came again has one vote there too.
+    part = held.hashes.astype(np.str_) if again else None
+    return refit(make_dataset(X, held.labels, part=part, name=name, **about), asked)
 
 
 def _refuse(source: Any) -> Dataset:

@@ -1,7 +1,8 @@
-"""What a cell program wrote down of its parts: the lines of its journal, each checked before it is believed.
+"""What a cell program wrote down of its parts: the lines of its journal, checked, and imported into a store.
 
     journal = read_journal("cell.csv", TraceSpec(1000))
     journal.lines                                          # parts and labels, in the order in which they became known
+    report = import_journal("engine.db", "cell.csv")       # what a cell program learned on its own
 
 A last line without its end was being written when the program was killed: it is left out, and `cut` says so. Anything else
 that does not fit is a DataError that names the line.
@@ -11,19 +12,31 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ..errors import DataError
-from ..records import Action, Reason, TraceSpec
-from ..traces import as_trace
+from ..datasets.importing import CHUNK, ImportReport, import_ids
+from ..decision.policy import Policy
+from ..engine.decide import source_of
+from ..engine.settings import trace_in
+from ..errors import DataError, StoreError
+from ..folds import own_hash
+from ..recipe import Recipe
+from ..records import REASONS, Action, Decision, Reason, TraceSpec
+from ..store.base import NewLabel, Store, opening
+from ..store.outbox import OwnedStore
+from ..traces import TraceGate, as_trace
 
 HEAD = "# dengine "
 LABELS = {"1": True, "0": False}
 LARGEST_COUNT = 2**62
+EXPORTED = "export"  # the kind of the events that note a model's sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,3 +238,112 @@ def _number(word: str) -> float:
             f"could not convert string to float: {word!r}"
         )  # Python's own numbers have them, a cell's have not
     return float(word)
+
+
+def import_journal(
+    store: str | os.PathLike[str] | Store,
+    path: str | os.PathLike[str],
+    on_traces: Callable[[int], None] | None = None,
+    any_model: bool = False,
+) -> ImportReport:
+    """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
+
+    Parts keep their numbers, the bounds that they were decided by and the sources of their labels, so that the rule and the
+    certificate count them as the engine's own. The report counts labels.
+    any_model : take a journal of a model that the store has not noted as exported from it.
+    Raises DataError, before anything is stored, for a journal that is damaged, or of a model of another store; StoreError
+    while an engine runs on the cell.
+    """
+    with opening(store, must_exist=True) as opened:
+        if isinstance(opened, OwnedStore):
+            opened.own()  # an engine that runs would never learn of these labels
+        known = opened.settings()
+        spec = trace_in(known)
+        if spec is None or "recipe" not in known:
+            raise StoreError(
+                f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
+            )
+        policy = Recipe.from_toml(known["recipe"]).policy
+        journal = read_journal(path, spec)
+        if not any_model:
+            _must_be_of(opened, journal, path)
+        lines = _with_known_outcomes(journal, policy.stops)
+        report = _import_lines(opened, lines, spec, policy, on_traces)
+    opened.close()
+    return replace(report, cut=journal.cut)
+
+
+def _must_be_of(store: Store, journal: Journal, path: str | os.PathLike[str]) -> None:
+    """DataError where a journal's model was not exported from the store. Earlier forms are of exports not noted always."""
+    exports = {event.text.split()[0] for event in store.events() if event.kind == EXPORTED}
+    if journal.version > 2 and exports and journal.sum not in exports:
+        raise DataError(
+            f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
+            "which is none of its exports; name the store that it came from, or say --any-model if it is right."
+        )
+
+
+def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
+    """Where all stops are reported, the next decision confirmed an accepted part, unless its stop came late.
+
+    Of the last part nothing is known yet.
+    """
+    if stops == "some":
+        return journal.lines
+    late = {line.id: line.label for line in journal.lines if line.late}
+    waits = [line for line in journal.lines if line.label is None][-1:] if journal.waits else []
+    return [
+        replace(line, label=True) if line.label is None else line
+        for line in journal.lines
+        if not any(line is each for each in waits) and not _is_elsewhere(line, late.get(line.id) if line.id else None)
+    ]
+
+
+def _is_elsewhere(line: JournalLine, late: bool | None) -> bool:
+    """Whether another line brings an accepted part's label: the late one its stop, the first one its confirmation."""
+    return line.action is Action.ACCEPT and late is not None and line.late == late
+
+
+def _import_lines(
+    store: Store, lines: list[JournalLine], spec: TraceSpec, policy: Policy, on_traces: Callable[[int], None] | None
+) -> ImportReport:
+    gate, counts = TraceGate(spec), Counter[str]()
+    looks = [gate(torch.from_numpy(line.trace)) for line in lines]
+    made = import_ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
+    ids = [line.id or id_ for line, id_ in zip(lines, made, strict=True)]
+    counts_silence = policy.stops == "some"
+    since = int(store.settings().get("policy_since", 0))
+    silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
+    for start in range(0, len(lines), CHUNK):
+        labels: list[NewLabel] = []
+        for i in range(start, min(start + CHUNK, len(lines))):
+            line, (fault, hash_), held = lines[i], looks[i], store.get_decision(ids[i])
+            if held is None:
+                decision = _decided(ids[i], line, fault, policy.audit_rate)
+                store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
+            elif held.source is not None:  # a forgotten one has a label too
+                if line.label is not None:
+                    counts["known" if line.label == held.success else "contradicted"] += 1
+                continue
+            if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
+                silent += (line.label is None) - (held is not None)
+            if line.label is not None:
+                source = source_of(ids[i], line.action, line.reason is Reason.AUDIT, line.label)
+                labels.append(NewLabel(ids[i], line.label, source, 0, None, 0 if fault else silent))
+                silent = silent if fault else 0
+                counts["quarantined" if fault else "imported"] += 1
+        if labels:
+            store.put_labels(labels)
+        if on_traces is not None:
+            on_traces(min(CHUNK, len(lines) - start))
+    store.flush()
+    return ImportReport(
+        counts["imported"], counts["quarantined"], counts["known"], True, contradicted=counts["contradicted"]
+    )
+
+
+def _decided(id_: str, line: JournalLine, fault: int, audit_rate: float) -> Decision:
+    audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
+    counted = line.lower, line.upper, line.n_success, line.n_failure
+    propensity = 1.0 if line.predicted is Action.VERIFY else audit_rate
+    return Decision(id_, line.action, line.predicted, *counted, None, 0, reason, audit, propensity, line.part)

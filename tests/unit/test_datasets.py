@@ -1,5 +1,6 @@
 """Labelled traces: files, arrays, names, and what is wrong with them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,3 +111,15 @@ def test_the_real_set_is_read(screw_driving: Path) -> None:
     assert data.X.shape[-1] == 400
     assert set(np.unique(data.y)) == {0, 1}
     assert np.isfinite(data.X).all()
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(make_data, channels: int, tmp_path: Path) -> None:
+    data = make_data(8, samples=30, channels=channels)
+    data = replace(data, part=np.array([f"P{i // 2}" for i in range(8)]), channels=("FX", "FZ")[2 - channels :])
+    frame = data.to_frame()
+    assert frame.columns[:3].tolist() == ["label", "part", f"{data.channels[0]}_0"]
+    frame.to_parquet(tmp_path / "data.parquet")
+    loaded = load_dataset(tmp_path / "data.parquet", channel=data.channels)
+    for name in ("X", "y", "part"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(data, name))

@@ -12,10 +12,9 @@ from click.testing import CliRunner
 
 from dengine import Dataset, Policy, Recipe, TraceSpec, load_exported
 from dengine.cli.export import export, import_labels
-from dengine.datasets.importing import import_journal
 from dengine.engine.engine import DataEngine
 from dengine.errors import DataError
-from dengine.export.cell_journal import read_journal
+from dengine.export.cell_journal import import_journal, read_journal
 from dengine.folds import content_hash, part_hash
 from dengine.records import Reason
 

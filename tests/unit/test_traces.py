@@ -22,8 +22,8 @@ from dengine import (
     export_torchscript,
     load_exported,
 )
-from dengine.datasets.importing import read_journal
 from dengine.decision.rule import script
+from dengine.export.cell_journal import read_journal
 from dengine.records import FITS
 from dengine.traces import REASONS, TraceGate, as_trace, as_traces, fits, fitted, spec_of
 

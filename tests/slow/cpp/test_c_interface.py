@@ -13,10 +13,10 @@ from click.testing import CliRunner
 import dengine
 from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript, load_exported
 from dengine.cli.export import export_cpp, make_key
-from dengine.datasets.importing import import_journal
 from dengine.engine.engine import DataEngine
 from dengine.errors import ExportError
 from dengine.export import export_sources
+from dengine.export.cell_journal import import_journal
 from dengine.records import ACTIONS, Action
 
 SAMPLES = 80

@@ -27,9 +27,9 @@ from dengine import (
     export_torchscript,
     load_exported,
 )
-from dengine.datasets.importing import import_journal
 from dengine.engine.engine import DataEngine
 from dengine.export import ExportedModel, read_metadata
+from dengine.export.cell_journal import import_journal
 from dengine.records import Action, Reason
 
 SAMPLES = 100

@@ -13,7 +13,8 @@ from click.testing import CliRunner
 
 from dengine import Action, DataEngine, DengineError, Recipe, TraceSpec, load_dataset, open_store
 from dengine.cli import main as command_line
-from dengine.datasets.importing import import_journal, import_labelled
+from dengine.datasets.importing import import_labelled
+from dengine.export.cell_journal import import_journal
 from dengine.testing import toy_traces
 
 from .oddities import ODD, SAMPLES, TOML, WORDS, odd_trace, spoilt
