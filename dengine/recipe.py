@@ -84,6 +84,16 @@ class Recipe:
             raise SettingError(f"Expected encoder_budget >= 0 seconds a cycle, got {shortened(self.encoder_budget)}.")
         if not (is_number(self.novelty) and 0.0 <= self.novelty < float("inf")):
             raise SettingError(f"Expected a finite novelty of 0 or more, got {shortened(self.novelty)}; 0 turns it off.")
+        self._check_params()
+        if not isinstance(self.reducer, str) and not callable(getattr(self.reducer, "fit", None)):
+            raise SettingError(f"Expected a reducer's name, or a scikit-learn transformer, got {shortened(self.reducer)}.")
+        if not isinstance(self.policy, Policy):
+            raise SettingError(f"Expected policy to be a Policy, got {shortened(self.policy)}.")
+        Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
+        if self.reject_fraction is not None and self.policy.guarantee == "pooled":
+            raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
+
+    def _check_params(self) -> None:
         if not isinstance(self.params, Mapping):
             raise SettingError(f"Expected params to be a table of the reducer's settings, got {shortened(self.params)}.")
         for name, value in self.params.items():
@@ -92,13 +102,6 @@ class Recipe:
                     f"Expected params of plain names and values, got {shortened(name)}: "
                     f"{shortened(value)}; hand an object in."
                 )
-        if not isinstance(self.reducer, str) and not callable(getattr(self.reducer, "fit", None)):
-            raise SettingError(f"Expected a reducer's name, or a scikit-learn transformer, got {shortened(self.reducer)}.")
-        if not isinstance(self.policy, Policy):
-            raise SettingError(f"Expected policy to be a Policy, got {shortened(self.policy)}.")
-        Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
-        if self.reject_fraction is not None and self.policy.guarantee == "pooled":
-            raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
 
     @property
     def name(self) -> str:

@@ -1,6 +1,6 @@
 """Where things are, from the package itself: the tree of the README.
 
-    python docs/hooks/tree.py        # writes it anew after a module came, went or changed its first words
+python docs/hooks/tree.py        # writes it anew after a module came, went or changed its first words
 """
 
 from __future__ import annotations

@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import argparse
 import functools
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from .certificate import PROPENSITIES, STREAMS
 from .pieces import Piece, Row, finish
@@ -18,6 +21,7 @@ from .replays import Case, noise_cases, planted_cases
 from .report import write_report
 
 CHUNK = 10  # seeds a piece
+QUICK = ("conv", "pca", "rocket")
 PARTS = ("counts", "certificate", "planted", "noise", "collapse", "garbage")
 
 
@@ -40,24 +44,19 @@ def pieces_of(part: str, repeats: int) -> list[Piece]:
         return _cases(part, noise_cases(), repeats)
     if part == "planted":
         return _cases(part, planted_cases(), repeats)
-    pieces: list[Piece] = []
-    if part == "counts":
-        for reducer in ("conv", "pca", "rocket"):
-            for data in ("white noise", "insertion"):
-                pieces += seeds_in_pieces(part, {"reducer": reducer, "data": data, "p": 0.8}, max(2, repeats // 5))
-    if part == "certificate":
-        for stream in STREAMS:
-            for propensity in PROPENSITIES:
-                about = {"stream": stream, "propensity": propensity, "alpha": 0.1}
-                pieces += seeds_in_pieces(part, about, max(2, repeats // 10))
-    if part == "garbage":
-        for reducer in ("conv", "pca", "rocket", "umap"):
-            pieces += seeds_in_pieces(part, {"reducer": reducer}, 1 if reducer == "umap" else max(1, repeats // 40), 1)
-    if part == "collapse":
-        for guarantee in ("local", "pooled"):
-            for stops in ("some", "all"):
-                pieces += seeds_in_pieces(part, {"guarantee": guarantee, "stops": stops}, min(30, max(2, repeats // 4)), 5)
-    return pieces
+    count, chunk, cases = {
+        "counts": (max(2, repeats // 5), CHUNK, _product(reducer=QUICK, data=("white noise", "insertion"), p=(0.8,))),
+        "certificate": (max(2, repeats // 10), CHUNK, _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
+        "garbage": (max(1, repeats // 40), 1, _product(reducer=QUICK)),
+        "collapse": (min(30, max(2, repeats // 4)), 5, _product(guarantee=("local", "pooled"), stops=("some", "all"))),
+    }[part]
+    pieces = [piece for case in cases for piece in seeds_in_pieces(part, case, count, chunk)]
+    return pieces + (seeds_in_pieces(part, {"reducer": "umap"}, 1) if part == "garbage" else [])
+
+
+def _product(**axes: Iterable[Any]) -> list[dict[str, Any]]:
+    """Every combination of settings, the last axis quickest."""
+    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*axes.values())]
 
 
 def main() -> None:
