@@ -118,7 +118,7 @@ class HttpApi:
         return Response(body, media_type=kind)
 
     async def healthz(self, request: Request) -> Response:
-        """Whether the engine answers: ok; degraded (200): its store cannot be written, labels wait in a journal; down (503).
+        """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503).
 
         It asks for no token.
         """

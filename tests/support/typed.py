@@ -19,7 +19,7 @@ sys.argv = ARGV  # noqa: F821
 try:
     if sys.argv[0] in ("dengine", "-m"):
         module = sys.argv[0] if sys.argv[0] == "dengine" else sys.argv.pop(1)
-        sys.path.insert(0, os.getcwd())
+        sys.path.insert(0, str(Path.cwd()))
         runpy.run_module(module, run_name="__main__")
     else:
         sys.path.insert(0, str(Path(sys.argv[0]).resolve().parent))
