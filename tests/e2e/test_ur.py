@@ -125,15 +125,6 @@ def test_what_a_controller_refuses_is_said_at_once(how: dict, said: str) -> None
         RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force"), (ORDER,))
 
 
-def test_a_second_writer_of_one_register_is_refused_and_the_first_stays() -> None:
-    with FakeController(speed=None) as fake:
-        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
-        with pytest.raises(CellError, match="another client"):
-            RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
-        assert first.rows()
-        first.close()
-
-
 def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
@@ -164,21 +155,6 @@ def test_the_controllers_own_words_are_in_the_error() -> None:
         with pytest.raises(CellError, match=r"hung up.*the input buffer overflows"):
             read_on(client)
         client.close()
-
-
-def test_a_client_that_does_not_read_is_hung_up_on_and_the_controller_goes_on() -> None:
-    with FakeController(speed=None, patience=0.2) as fake:
-        idle = RtdeClient(fake.host, fake.port, ("timestamp", "actual_TCP_force", "actual_q"))
-        with RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
-            while fake._connections[0].started:
-                stream.after(stream.position, WAIT)
-            begun = stream.position
-            assert stream.after(begun + 100, 0.0)[0] == []
-            while stream.position < begun + 100:
-                stream.after(stream.position, WAIT)
-        with pytest.raises(CellError, match="Expected packages"):
-            read_on(idle)
-        idle.close()
 
 
 @pytest.mark.parametrize(
@@ -273,19 +249,6 @@ def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
     assert cell.last.missing == 0
 
 
-def test_a_connection_that_breaks_off_abruptly_loses_what_it_loses_and_says_so(parts: Dataset) -> None:
-    with FakeController(RobotProgram(parts), speed=20.0) as fake, cell_of(fake) as cell:
-        for part in range(12):
-            timer = threading.Timer(0.002 * part, fake.hang_up, kwargs={"abruptly": True})
-            timer.start()
-            trace = cell.insert()
-            there = ~np.isnan(trace)
-            np.testing.assert_array_equal(trace[there], parts.X[part][there])
-            assert cell.last.missing == np.isnan(trace).sum()
-            timer.join()
-            cell.reject()
-
-
 def test_a_controller_whose_clock_begins_anew_ends_the_trace_it_was_in(parts: Dataset) -> None:
     with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(1, 30, "reset")]) as fake, cell_of(fake) as cell:
         traces = []
@@ -297,15 +260,6 @@ def test_a_controller_whose_clock_begins_anew_ends_the_trace_it_was_in(parts: Da
     np.testing.assert_array_equal(traces[1][:30], parts.X[1][:30])
     assert np.isnan(traces[1][30:]).all()
     np.testing.assert_array_equal(traces[2], parts.X[2])
-
-
-def test_an_insertion_that_no_start_was_seen_of_is_all_missing(parts: Dataset) -> None:
-    trouble = Trouble(0, 0, "drop", SAMPLES + 1)
-    with FakeController(RobotProgram(parts), speed=None, troubles=[trouble]) as fake, cell_of(fake) as cell:
-        assert np.isnan(cell.insert()).all()
-        assert cell.last.missing == SAMPLES
-        cell.reject()
-        np.testing.assert_array_equal(cell.insert(), parts.X[1])
 
 
 class Signals:
@@ -410,13 +364,6 @@ def test_a_robots_cell_is_a_cell(parts: Dataset) -> None:
             else:
                 cell.reject()
         assert cell.incomplete == 0
-
-
-def test_a_confirming_line_says_so(parts: Dataset) -> None:
-    with FakeController(RobotProgram(parts, confirm=True), speed=None) as fake, cell_of(fake) as cell:
-        for i in range(5):
-            cell.insert()
-            assert cell.proceed() is (Outcome.CONFIRMED if parts.y[i] else Outcome.STOPPED)
 
 
 def decisions(cell: Cell, cycles: int, **how) -> list[dict]:
@@ -641,17 +588,6 @@ def test_a_controller_without_a_robot_is_started_from_the_shell() -> None:
             process.terminate()
 
 
-def test_an_owner_that_thinks_for_long_between_two_orders_goes_on(parts: Dataset) -> None:
-    with FakeController(RobotProgram(parts), speed=None) as fake, cell_of(fake) as cell:
-        cell.insert()
-        cell.recorder.stream._most = 20  # packages that are kept, instead of a minute's
-        begun = cell.recorder.stream.position
-        while cell.recorder.stream.position < begun + 200:
-            assert cell.recorder.stream.after(10**9, 0.01)[0] == []
-        cell.recorder.stream._most = 10**5
-        assert cell.verify() == bool(parts.y[0])
-
-
 def test_orders_are_numbered_so_that_they_fit_a_register_for_ever() -> None:
     assert after(0) == 1
     assert after(2 * 10**8) == 1
@@ -667,24 +603,6 @@ def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: 
         assert f"{verb}_integer_register({number}" in text
     for each in (*Verb, *Answer):
         assert f"{type(each).__name__.upper()}_{each.name} = {each.value}\n" in text
-
-
-def test_every_block_of_the_robots_program_is_closed_where_it_was_opened(repo: Path) -> None:
-    blocks: list[int] = []
-    for line in (repo / "training" / "ur_cell.script").read_text(encoding="utf-8").splitlines():
-        indent, words = len(line) - len(line.lstrip()), line.split("#")[0].split()
-        if not words:
-            continue
-        if words[0] in ("def", "if", "while"):
-            assert words[-1].endswith(":"), line
-            blocks.append(indent)
-        elif words[0] in ("end", "elif"):
-            assert indent == blocks[-1], line
-            if words == ["end"]:
-                blocks.pop()
-        else:
-            assert indent == 2 * len(blocks), line
-    assert not blocks
 
 
 # Another client than ours, against the same controller.
