@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from dataclasses import fields, replace
 from importlib.resources import files
 
@@ -11,8 +10,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from dengine.cells.base import Cell
-from dengine.cells.simulation.cell import CAUSES, SimulatedCell, insert_once
+from dengine.cells.simulation.cell import SimulatedCell, insert_once
 from dengine.cells.simulation.conditions import (
     JUMP_N,
     SCENARIOS,
@@ -37,22 +35,12 @@ def good(**changes: float | str) -> Conditions:
     return replace(draw_conditions(ALWAYS_GOOD, np.random.default_rng(0)), force_limit_n=40.0, **changes)
 
 
-def test_it_is_a_cell() -> None:
-    assert isinstance(SimulatedCell(), Cell)
-
-
 @pytest.mark.parametrize(("channels", "shape"), [("z", (1000,)), ("all", (6, 1000))])
 def test_a_trace_has_one_thousand_samples_per_channel(channels: str, shape: tuple[int, ...]) -> None:
     trace = SimulatedCell(channels=channels).insert()
     assert trace.shape == shape
     assert trace.dtype == np.float32
     assert np.isfinite(trace).all()
-
-
-def test_all_channels_contain_the_same_z_force() -> None:
-    one = insert_once(CellParameters(), seed=3, cycle=1, channels="z").trace
-    six = insert_once(CellParameters(), seed=3, cycle=1, channels="all").trace
-    np.testing.assert_array_equal(six[2], one)
 
 
 def test_a_well_aligned_part_seats_and_meets_the_bottom_late() -> None:
@@ -69,10 +57,6 @@ def test_a_part_beside_the_hole_rests_on_the_rim_at_the_force_limit() -> None:
     assert pushed.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
 
 
-def test_debris_holds_the_part_up_by_its_thickness() -> None:
-    assert push(good(fault="debris", debris_mm=2.0)).height_mm == pytest.approx(2.0, abs=0.5)
-
-
 def test_a_weak_grip_slips_at_its_own_force() -> None:
     pushed = push(good(fault="weak_grip", grip_n=12.0, offset_x_mm=5.0))
     assert pushed.slip_mm > 1
@@ -83,17 +67,6 @@ def test_a_missed_grasp_meets_nothing() -> None:
     pushed = push(good(fault="missed_grasp"))
     assert np.abs(pushed.wrench[:, 2]).max() < 2
     assert pushed.height_mm < -10
-
-
-def test_a_longer_part_stands_out_of_the_fixture() -> None:
-    assert push(good(fault="wrong_part", extra_length_mm=2.0)).height_mm == pytest.approx(2.0, abs=0.3)
-
-
-def test_the_label_is_the_height_alone() -> None:
-    traces = simulate(12, seed=5, n_jobs=1)
-    np.testing.assert_array_equal(traces.y == 1, np.abs(traces.height_mm) <= CellParameters().height_tolerance_mm)
-    assert set(traces.cause) <= set(CAUSES)
-    np.testing.assert_array_equal(traces.cause == "none", traces.y == 1)
 
 
 def test_a_trace_depends_on_seed_and_cycle_only() -> None:
@@ -125,12 +98,6 @@ def test_quotas_keep_the_first_of_each_label_in_order(monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(whole.X[traces.cycle], traces.X)
     for label in (0, 1):
         np.testing.assert_array_equal(np.flatnonzero(whole.y == label)[:2], traces.cycle[traces.y == label])
-
-
-def test_progress_is_told_of_every_trace() -> None:
-    seen: list[tuple[int, int]] = []
-    simulate(3, n_jobs=1, progress=lambda done, of: seen.append((done, of)))
-    assert seen == [(1, 3), (2, 3), (3, 3)]
 
 
 def test_the_clock_charges_cycles_verifications_and_stops() -> None:
@@ -184,13 +151,6 @@ def test_a_part_is_taken_once(call: str) -> None:
     getattr(cell, call)()
     with pytest.raises(DengineError, match=r"insert\(\) before"):
         getattr(cell, call)()
-
-
-def test_two_inserts_in_a_row_are_refused() -> None:
-    cell = SimulatedCell()
-    cell.insert()
-    with pytest.raises(DengineError, match="after insert"):
-        cell.insert()
 
 
 def test_scenarios_change_what_they_say_and_nothing_else() -> None:
@@ -247,19 +207,6 @@ def test_the_sensor_draw_does_not_touch_the_world() -> None:
 def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         bad()  # type: ignore[operator]
-
-
-def test_a_missing_mujoco_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def without(name: str, *args: object, **kwargs: object) -> object:
-        if name == "mujoco":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(DengineError, match=r"pip install dengine\[sim\]"):
-        SimulatedCell().insert()
 
 
 @pytest.mark.parametrize(("channels", "shape"), [("z", (4, 1000)), ("all", (4, 6, 1000))])

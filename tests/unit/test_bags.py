@@ -10,7 +10,6 @@ from click.testing import CliRunner
 
 from dengine import load_dataset
 from dengine.cli import main
-from dengine.datasets.cutting import slots, usual_step
 from dengine.datasets.triggers import ContactTrigger
 from dengine.errors import DataError
 
@@ -126,12 +125,6 @@ def test_it_is_cut_by_the_same_triggers_as_a_live_one(bag: Bag, tmp_path: Path, 
             load_dataset(tmp_path / "a.mcap", **asked)
 
 
-def test_several_channels_under_either_name(bag: Bag, tmp_path: Path) -> None:
-    data = load_dataset(bag.write(tmp_path / "cell.mcap"), channel="FX,MuZ_Base", **ASKED)
-    np.testing.assert_array_equal(data.X, bag.traces[:, [0, 5]].astype(np.float32))
-    assert data.unit == "mixed units"
-
-
 def test_a_bag_of_several_files_is_one_recording(bag: Bag, tmp_path: Path) -> None:
     folder = tmp_path / "cell"
     folder.mkdir()
@@ -169,13 +162,6 @@ def test_a_message_that_came_late_is_not_lost(bag: Bag, tmp_path: Path) -> None:
     data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32))
     assert not data.faults
-
-
-def test_a_clock_that_is_a_little_fast_loses_nothing_in_a_long_recording(bag: Bag, tmp_path: Path) -> None:
-    bag.stamps = BEGIN + (np.arange(len(bag.stamps)) * STEP * 1.0007).astype(np.int64)
-    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
-    assert (len(data), data.faults) == (8, ())
-    assert data.rate_hz == 499.7
 
 
 def test_times_that_turn_back_are_a_fault_unless_a_rate_is_stated(bag: Bag, tmp_path: Path) -> None:
@@ -217,12 +203,6 @@ def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(
         load_dataset(bag.write(tmp_path / "few.mcap"), **ASKED)
 
 
-def test_an_insertion_is_two_seconds_where_nothing_else_was_asked(bag: Bag, tmp_path: Path) -> None:
-    asked = {**ASKED, "samples": None}
-    with pytest.raises(DataError, match="found none of 1"):  # the whole file is shorter than one
-        load_dataset(bag.write(tmp_path / "cell.mcap"), **asked)
-
-
 def without(name: str) -> Callable[[dict], dict]:
     return lambda asked: {key: value for key, value in asked.items() if key != name}
 
@@ -252,14 +232,7 @@ def test_a_trigger_for_what_is_cut_already_is_refused(tmp_path: Path) -> None:
             load_dataset(source, trigger="contact=5")
 
 
-def test_a_bag_of_another_storage_says_what_to_do(tmp_path: Path) -> None:
-    (tmp_path / "metadata.yaml").write_text("", encoding="utf-8")
-    (tmp_path / "cell_0.db3").write_bytes(b"")
-    with pytest.raises(DataError, match="ros2 bag convert"):
-        load_dataset(tmp_path, **ASKED)
-
-
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(8))
 def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(bag: Bag, tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     raw = bytearray(bag.write(tmp_path / "cell.mcap").read_bytes())
@@ -272,13 +245,6 @@ def test_a_damaged_file_is_refused_or_read_and_never_raises_anything_else(bag: B
     except DataError:
         return
     np.testing.assert_array_equal(data.X, bag.traces[:, 2].astype(np.float32)[: len(data)])
-
-
-def test_lost_messages_leave_their_places_and_late_ones_do_not() -> None:
-    times = np.delete(np.arange(1000) * 0.002, [100, 101, 500])
-    times[300] += 0.009
-    assert usual_step(times) == pytest.approx(0.002)
-    np.testing.assert_array_equal(slots(times, 0.002), np.delete(np.arange(1000), [100, 101, 500]))
 
 
 def test_a_bag_is_looked_at_and_replayed_from_the_shell(bag: Bag, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What a report may say: a label that is one, an id that is one; anything else is refused before it is stored."""
 
+import re
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -8,40 +9,47 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import Action, DataEngine, Outcome, Reason, ReplayCell, export_torchscript, load_exported
-from dengine.errors import DataError, ReportError, StoreError, TraceError
-from dengine.model.neighbours import ModelPrediction
+from dengine import Action, DataEngine, Outcome, Reason, ReplayCell
+from dengine.errors import ReportError, StoreError, TraceError, shortened
 from dengine.records import LONGEST, Decision, Source, as_success
-from dengine.store import MemoryStore
 from dengine.store.base import NewLabel, open_store
 
 GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.array(1), np.array(True), Fraction(1)]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
 NONE = [
-    *(100, -1, 255, 2**70, 0.5, 1.0000001, float("nan"), float("inf"), 1j, None, "0", "1", "NG", "True", b"\x01", ""),
+    *(
+        100,
+        -1,
+        255,
+        2**70,
+        10**5000,
+        "x" * 2**20,
+        list(range(10**5)),
+        0.5,
+        1.0000001,
+        float("nan"),
+        float("inf"),
+        1j,
+        None,
+        "0",
+        "1",
+        "NG",
+        "True",
+        b"\x01",
+        "",
+    ),
     *(np.array([1]), np.array([]), np.array("1"), np.nan, np.float16("nan"), [True], (), {}, {1}, torch.tensor(1)),
 ]
 
 
-@pytest.mark.parametrize("value", GOOD)
-def test_true_and_exactly_one_are_a_success(value) -> None:
-    assert as_success(value) is True
+def test_a_bool_and_exactly_one_or_zero_are_labels() -> None:
+    assert [as_success(value) for value in GOOD] == [True] * len(GOOD)
+    assert [as_success(value) for value in BAD] == [False] * len(BAD)
 
 
-@pytest.mark.parametrize("value", BAD)
-def test_false_and_exactly_zero_are_a_failure(value) -> None:
-    assert as_success(value) is False
-
-
-@pytest.mark.parametrize("value", NONE, ids=lambda value: repr(value)[:20])
+@pytest.mark.parametrize("value", NONE, ids=lambda value: shortened(value)[:20])
 def test_anything_else_is_no_label_and_the_error_says_what_to_do(value) -> None:
-    with pytest.raises(ReportError, match=r"Expected a label.*turn it into one of these"):
-        as_success(value)
-
-
-@pytest.mark.parametrize("value", ["x" * 2**20, 10**5000, list(range(10**5))], ids=["text", "integer", "list"])
-def test_what_is_refused_is_shown_in_one_line_however_long_it_is(value) -> None:
-    with pytest.raises(ReportError) as caught:
+    with pytest.raises(ReportError, match=r"Expected a label.*turn it into one of these") as caught:
         as_success(value)
     assert len(str(caught.value)) < 400
 
@@ -52,7 +60,7 @@ def engine(request: pytest.FixtureRequest, tmp_path: Path):
         yield engine
 
 
-@pytest.mark.parametrize("value", NONE, ids=lambda value: repr(value)[:20])
+@pytest.mark.parametrize("value", NONE, ids=lambda value: shortened(value)[:20])
 def test_a_report_of_no_label_writes_nothing_and_the_next_one_counts(engine: DataEngine, value, make_data) -> None:
     decision = engine.decide(make_data(1).X[0])
     with pytest.raises(ReportError):
@@ -102,7 +110,7 @@ def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(ans
     engine = DataEngine("pca")
     with pytest.raises(ReportError, match=r"of decision \S+, by verify\(\)") as caught:
         list(engine.run(Muddled(make_data(5)), 5))
-    (id_,) = [word.rstrip(",") for word in str(caught.value).split() if word.rstrip(",") in engine.store._open]
+    id_ = re.search(r"of decision (\S+),", str(caught.value))[1]
     assert engine.store.status()["decisions"] == 1
     engine.report(id_, True)  # what it really was, once somebody has looked
     assert engine.store.status()["labels"] == 1
@@ -169,15 +177,6 @@ def test_a_rival_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wro
         assert engine.store.status()["write_failures"] == 0
 
 
-def test_a_rival_that_counts_in_floats_is_taken_at_its_word(make_data) -> None:
-    data = make_data(6)
-    with DataEngine(model=Rival(n_success=np.float64(3.0)), retrain_every=3) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            decision = engine.decide(x)
-            engine.report(decision.id, y)
-    assert (decision.n_success, decision.reason) == (3, Reason.UNCERTAIN)
-
-
 @pytest.fixture(params=["memory", "sqlite"])
 def store(request: pytest.FixtureRequest, tmp_path: Path):
     opened = open_store(None if request.param == "memory" else tmp_path / "store.db")
@@ -223,32 +222,3 @@ def test_no_store_takes_a_label_that_is_none(store) -> None:
     with pytest.raises(ReportError, match="Expected a label"):
         store.put_labelled([replace(FINE, id="b")], x[None], np.array([1]), np.array([100]), Source.VERIFICATION)
     assert store.status()["labels"] == 0
-
-
-def test_an_exported_decision_learns_from_labels_alone(make_data, tmp_path: Path) -> None:
-    data = make_data(60)
-    with DataEngine("pca", retrain_every=50) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, y)
-        model = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
-    held = model.metadata["references"]
-    for value in (100, -1, "NG", None, float("nan")):
-        with pytest.raises(ReportError, match="Expected a label"):
-            model.learn(data.X[0] + 1, value)
-    assert model.learn(data.X[0] + 1, np.int8(1)) == held + 1
-
-
-def test_the_models_own_references_are_of_successes_and_failures_alone(make_data) -> None:
-    data = make_data(60)
-    model = ModelPrediction("pca")
-    with pytest.raises(DataError, match="Expected labels 1"):
-        model.fit(data.X, np.where(data.y == 1, 100, -4))
-    model.fit(data.X, data.y)
-    with pytest.raises(ReportError, match="Expected a label"):
-        model.add(data.X[0], 100)
-
-
-def test_memory_and_database_name_the_same_faults() -> None:
-    with pytest.raises(StoreError) as caught:
-        MemoryStore().put_decision(replace(FINE, n_success=2**70), np.zeros((1, 5), dtype=np.float32), 1, False)
-    assert "whole number from 0 to below 2**63" in str(caught.value)

@@ -1,7 +1,5 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +21,11 @@ from dengine import (
     load_exported,
 )
 from dengine.decision.rule import script
-from dengine.export.cell_journal import read_journal
 from dengine.records import FITS
 from dengine.traces import REASONS, TraceGate, as_trace, as_traces, fits, fitted, spec_of
 
 LENGTHS, CHANNELS = (152, 800, 1000), (1, 2, 3, 6)
+NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
 
 
 def ramp(samples: int = 100, channels: int = 1) -> np.ndarray:
@@ -52,11 +50,6 @@ def test_any_length_and_number_of_channels_becomes_channels_by_samples(samples: 
     assert as_traces(np.stack([x, x, x]), spec).shape == (3, channels, samples)
 
 
-def test_a_flat_trace_is_one_channel() -> None:
-    np.testing.assert_array_equal(as_trace(ramp()[0], None), ramp())
-    np.testing.assert_array_equal(as_traces(ramp(channels=4), None), ramp(channels=4)[:, None, :])
-
-
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
 def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     x = np.arange(100).astype(dtype)
@@ -66,44 +59,26 @@ def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     np.testing.assert_array_equal(got[0], x.astype(np.float32))
 
 
-def test_lists_and_strided_views_are_traces_too() -> None:
-    x = ramp(200)
-    np.testing.assert_array_equal(as_trace(x[0].tolist(), None), x)
-    np.testing.assert_array_equal(as_trace(x[0, ::-2], None)[0], x[0, ::-2])
+AGREED = TraceSpec(samples=100, channels=6)
 
 
-def test_a_float64_beyond_float32_becomes_an_infinity_that_the_gate_finds() -> None:
-    x = ramp(10).astype(np.float64)
-    x[0, 3] = 1e300
-    assert reason_of(as_trace(x, None)) is Reason.NOT_FINITE
-
-
-@pytest.mark.parametrize("bad", [np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5))])
-def test_what_is_not_one_trace_says_what_was_expected_and_what_came(bad) -> None:
-    with pytest.raises(TraceError, match=r"Expected one trace, \(samples,\) or \(channels, samples\), got shape"):
-        as_trace(bad, None)
-
-
-@pytest.mark.parametrize("bad", [np.zeros(5), np.zeros((2, 0)), np.zeros((1, 2, 3, 4))])
-def test_what_is_not_a_block_of_traces_says_so(bad) -> None:
-    with pytest.raises(TraceError, match=r"Expected traces \(n, samples\)"):
-        as_traces(bad)
-
-
-@pytest.mark.parametrize("bad", [np.array(["a", "b"]), np.array([1 + 2j]), np.array([None, 1]), "force"])
-def test_what_is_not_real_numbers_names_its_dtype(bad) -> None:
-    with pytest.raises(TraceError, match="Expected real numbers, got dtype"):
-        as_trace(bad, None)
-
-
-def test_a_wrong_length_says_what_was_expected_what_came_and_what_to_do() -> None:
-    with pytest.raises(TraceError, match=r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s\.$"):
-        as_trace(np.ones(998), TraceSpec(samples=1000))
-
-
-def test_a_wrong_number_of_channels_says_what_was_expected_what_came_and_what_to_do() -> None:
-    with pytest.raises(TraceError, match=r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"):
-        as_trace(np.ones(100), TraceSpec(samples=100, channels=6))
+@pytest.mark.parametrize(
+    ("trace", "spec", "message"),
+    [
+        *((bad, None, r"Expected one trace, \(samples,\) or \(channels, samples\), got shape") for bad in NO_TRACES),
+        *((np.array(bad), None, "Expected real numbers, got dtype") for bad in (["a", "b"], [1 + 2j], [None, 1], "force")),
+        (np.ones(998), TraceSpec(1000), r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s\.$"),
+        (np.ones(100), AGREED, r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"),
+        *(
+            (np.ones(shape), TraceSpec(100, fit=fit), "Expected")
+            for fit in FITS[1:]
+            for shape in ((1, 0), (2, 90), (90, 1))
+        ),
+    ],
+)
+def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(trace, spec, message: str) -> None:
+    with pytest.raises(TraceError, match=message):
+        as_trace(trace, spec)
 
 
 # -------------------------------------------------------------------------------------------------- the world
@@ -119,27 +94,22 @@ def test_one_sample_that_is_not_finite_is_found_anywhere(value, where, channels,
     assert reason_of(x, compiled=compiled) is Reason.NOT_FINITE
 
 
-@pytest.mark.parametrize("level", [0.0, -3.5, 25.0])
-@pytest.mark.parametrize("channels", [1, 2])
-def test_a_trace_constant_as_a_whole_is_a_dead_sensor(level: float, channels: int) -> None:
-    assert reason_of(np.full((channels, 50), level, dtype=np.float32)) is Reason.CONSTANT
+PLATEAU = np.minimum(ramp(100), 8.0)
+QUIET = ramp(100, 2) * np.array([[1.0], [0.0]], dtype=np.float32)
 
 
-def test_a_plateau_is_no_fault_and_neither_is_one_quiet_channel() -> None:
-    plateau = ramp(100)
-    plateau[0, 40:] = plateau[0, 40]
-    quiet = ramp(100, 2)
-    quiet[1] = 0.0
-    assert reason_of(plateau) is Reason.CERTAIN
-    assert reason_of(quiet) is Reason.CERTAIN
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_sample_at_the_sensors_range_saturates_on_either_side(sign: float) -> None:
-    x = sign * ramp(100)  # reaches 20
-    assert reason_of(x, limit=20.0) is Reason.SATURATED
-    assert reason_of(x, limit=20.5) is Reason.CERTAIN
-    assert reason_of(x) is Reason.CERTAIN
+@pytest.mark.parametrize(
+    ("x", "limit", "reason"),
+    [
+        *((np.full((channels, 50), level), None, Reason.CONSTANT) for channels in (1, 2) for level in (0.0, -3.5, 25.0)),
+        (as_trace(np.where(np.arange(10) == 3, 1e300, np.arange(10.0)), None), None, Reason.NOT_FINITE),
+        *((sign * ramp(100), 20.0, Reason.SATURATED) for sign in (1.0, -1.0)),  # reaches 20
+        *((x, 20.5, Reason.CERTAIN) for x in (ramp(100), -ramp(100), PLATEAU, QUIET)),
+        *((x, None, Reason.CERTAIN) for x in (ramp(100), PLATEAU, QUIET)),
+    ],
+)
+def test_dead_and_saturated_sensors_are_found_and_a_plateau_or_one_quiet_channel_is_no_fault(x, limit, reason) -> None:
+    assert reason_of(np.asarray(x, dtype=np.float32), limit) is reason
 
 
 # ------------------------------------------------------------------------------------------------------ other lengths
@@ -182,13 +152,6 @@ def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(
         kept = min(have, samples - 1)
         assert torch.equal(got[:, :kept], x[:, :kept])
         assert got[:, kept:].isnan().all()
-
-
-@pytest.mark.parametrize("fit", FITS[1:])
-@pytest.mark.parametrize("bad", [np.zeros(0), np.zeros((1, 0)), np.ones((2, 90)), np.ones((90, 1))])
-def test_an_empty_trace_or_a_wrong_number_of_channels_is_never_fitted(fit: str, bad: np.ndarray) -> None:
-    with pytest.raises(TraceError, match="Expected"):
-        as_trace(bad, TraceSpec(SAMPLES, fit=fit))
 
 
 def other_lengths(data: Dataset) -> list[np.ndarray]:
@@ -248,25 +211,6 @@ def test_a_trace_that_cannot_be_fitted_is_verified_kept_and_never_learned_from(l
     assert engine.decide(np.linspace(0, 9, SAMPLES)).reason is not Reason.NOT_FINITE
 
 
-def test_what_the_file_learns_of_another_length_is_what_it_learns_of_the_fitted_one(live) -> None:
-    engine, path, traces = live
-    raw, ready = load_exported(path), load_exported(path)
-    for i, x in enumerate(traces[:40]):
-        assert raw.learn(x, i % 3 > 0) == ready.learn(as_trace(x, engine.trace), i % 3 > 0)
-    for x in traces[40:80]:
-        assert raw.decide(x)[:6] == ready.decide(as_trace(x, engine.trace))[:6]
-
-
-def test_a_journal_of_traces_of_other_lengths_is_read_as_the_engine_would(tmp_path: Path) -> None:
-    x = ramp(97, 2)
-    path, spec = tmp_path / "cell.csv", TraceSpec(SAMPLES, channels=2, fit="pad")
-    path.write_text("1," + ",".join(f"{value:.9g}" for value in x.ravel()) + "\n")
-    np.testing.assert_array_equal(read_journal(path, spec).lines[0].trace, as_trace(x, spec))
-    for bad in (TraceSpec(SAMPLES, channels=2), TraceSpec(SAMPLES, channels=3, fit="pad")):
-        with pytest.raises(DengineError, match="Expected"):
-            read_journal(path, bad)
-
-
 # --------------------------------------------------------------------------------------------------------- the contract
 
 
@@ -284,13 +228,6 @@ def test_a_journal_of_traces_of_other_lengths_is_read_as_the_engine_would(tmp_pa
 def test_a_contract_that_no_trace_can_keep_is_refused(settings: dict, message: str) -> None:
     with pytest.raises(DengineError, match=message):
         TraceSpec(**settings)
-
-
-def test_a_contract_comes_back_from_json_and_from_what_an_earlier_version_wrote() -> None:
-    spec = TraceSpec(10, channels=2, fit="pad", columns=("a", "b"))
-    assert TraceSpec(**json.loads(json.dumps(asdict(spec)))) == spec
-    old = {"samples": 10, "rate_hz": 500.0, "channels": 2, "unit": "N", "limit": None}
-    assert TraceSpec(**old) == TraceSpec(10, channels=2)
 
 
 # --------------------------------------------------------------------------------------------------------- DataFrames
@@ -329,26 +266,12 @@ def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
         as_trace(recording()[["Timestamp"]], None)
 
 
-def test_an_engine_takes_recordings_as_they_are_and_keeps_to_the_firsts_columns() -> None:
-    with DataEngine("pca") as engine:
-        engine.decide(recording())
-        assert engine.trace == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
-        engine.decide(recording()[["FZ", "FY", "FX"]])
-        with pytest.raises(TraceError, match="Expected 60 samples, got 58"):
-            engine.decide(recording(58))
-
-
 def test_a_first_array_with_more_channels_than_samples_looks_transposed() -> None:
     with pytest.raises(TraceError, match=r"got 1000 channels of 2 samples, which looks transposed; pass trace\.T"):
         DataEngine("pca").decide(np.ones((1000, 2)))
     with pytest.raises(TraceError, match=r"looks transposed: pass trace\.T"):
         as_trace(np.ones((1000, 2)), TraceSpec(1000, channels=2))
     assert as_trace(np.ones((5, 2)), TraceSpec(2, channels=5)).shape == (5, 2)
-
-
-def test_traces_need_no_pandas() -> None:
-    source = Path(as_trace.__code__.co_filename).read_text(encoding="utf-8")
-    assert "import pandas" not in source
 
 
 def test_a_first_dataframe_with_a_row_a_trace_is_refused_and_not_taken_for_many_channels() -> None:

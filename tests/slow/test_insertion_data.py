@@ -43,12 +43,6 @@ def test_the_counts_are_those_of_the_paper(stored: dict[str, np.ndarray]) -> Non
     assert (stored["y"] == 0).sum() == 700
 
 
-def test_it_is_small_and_says_that_it_is_simulated(stored: dict[str, np.ndarray]) -> None:
-    assert len((DATA / "insertion.npz").read_bytes()) <= 4e6
-    assert bool(stored["simulated"])
-    assert "**Simulated.**" in (DATA / "insertion.md").read_text(encoding="utf-8")
-
-
 def test_labels_are_the_height_alone(stored: dict[str, np.ndarray]) -> None:
     np.testing.assert_array_equal(stored["y"] == 1, np.abs(stored["height_mm"]) <= 0.5)
 
@@ -78,11 +72,6 @@ def test_the_forces_are_those_of_real_insertions(stored: dict[str, np.ndarray], 
 
 def test_the_nearest_neighbour_is_right_in_92_to_96_percent(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
     assert 0.92 <= accuracy(traces, stored["y"], KNeighborsClassifier(1)) <= 0.96
-
-
-def test_a_forest_is_right_in_94_to_97_percent(stored: dict[str, np.ndarray], traces: np.ndarray) -> None:
-    every_fifth = traces[:, ::5]  # as good as all samples, and five times faster
-    assert 0.94 <= accuracy(every_fifth, stored["y"], forest()) <= 0.97
 
 
 @pytest.mark.parametrize("what", ["offset", "noise", "held", "samples"])
