@@ -33,6 +33,7 @@ from ..errors import (
     shortened,
     without_password,
 )
+from ..history.status import Status
 from ..records import Action, Decision
 from ..store.records import StoredDecision
 from ..store.views import PastDecision
@@ -198,6 +199,8 @@ HIDDEN = ("content_hash",)  # JavaScript has no integers of 64 bits
 DECISION = fields_of(Decision)
 STORED = fields_of(StoredDecision, without=("trace", *HIDDEN))
 PAST = fields_of(PastDecision, without=HIDDEN)
+STATUS = fields_of(Status, without=("settings", "retrains"))  # `ever.retrains` counts these
+LINE = {"waiting": int, "late": int, "busy": int, "deadline": float}  # of the service
 
 
 def answer_type(name: str, about: str, kinds: Mapping[str, Any], *documented: type, **optional: Any) -> type[Struct]:
@@ -213,36 +216,6 @@ class Health(Struct):
     status: Annotated[str, Meta(extra_json_schema={"enum": ["ok", "degraded", "down"]})]
     store_fault: str
     waiting: int
-
-
-class Status(Struct):
-    """How the engine stands.
-
-    cell : the cell's name in its store.  version : of the model that answers.  policy : the user's numbers in force.
-    trace : the traces' contract; null before the first.  shadow : all is verified, the model is only asked.
-    safe_mode : why everything is verified; empty where it is not.
-    new_labels : since the last retrain began.  retrain_every : labels that set one off.
-    store_fault : why the store cannot be written, and labels wait in its journal; empty where it can.
-    waiting : requests in line.  late, busy : deadlines exceeded and requests refused, since the server began.
-    deadline : seconds in line, after which the answer is verify.  store : what the store counts, and its newest events.
-    """
-
-    cell: str
-    version: int
-    policy: dict[str, Any]
-    reducer: str
-    trace: dict[str, Any] | None
-    shadow: bool
-    safe_mode: str
-    retraining: bool
-    new_labels: int
-    retrain_every: int
-    store_fault: str
-    waiting: int
-    late: int
-    busy: int
-    deadline: float
-    store: dict[str, Any]
 
 
 class Problem(Struct):
@@ -261,6 +234,10 @@ class Problem(Struct):
 LATE = (
     "late : deadline exceeded in the queue; recorded as VERIFY.  seconds : from the request to the answer, in the server."
 )
+ABOUT_LINE = (
+    "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
+    "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at."
+)
 PastAnswer = answer_type("PastDecision", "A decision as it was recorded.", PAST, Decision, PastDecision)
 ANSWERS: dict[str, Any] = {
     "Answer": answer_type(
@@ -269,7 +246,7 @@ ANSWERS: dict[str, Any] = {
     "Told": answer_type("Told", "The label is on the disk.", fields_of(Told), Told),
     "Decision": answer_type("Decision", "A decision with its label.", STORED, Decision, StoredDecision, trace=TRACE),
     "Decisions": answer_type("Decisions", "Newest first.", {"decisions": list[PastAnswer]}),  # type: ignore[valid-type]  # made above
-    "Status": Status,
+    "Status": answer_type("Status", f"{Status.__doc__}\n{ABOUT_LINE}", STATUS | LINE | {"alarm": str}),
     "Health": Health,
     "Problem": Problem,
 }

@@ -209,13 +209,19 @@ class Guard:
         if scope["type"] != "http":  # there is no websocket here
             await send({"type": "websocket.close", "code": 1008})
             return
+        connection = scope.get("state", {}).get("connection")  # of `connections`; a test has none
+        if connection is not None:
+            connection.begin_request()
         try:
             self._look(scope)
         except Refusal as refusal:
             answer = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
             await answer(scope, receive, _with_headers(send))
-            return
-        await self.app(scope, Body(receive, self.access).receive, _with_headers(send))
+        else:
+            await self.app(scope, Body(receive, self.access).receive, _with_headers(send))
+        finally:
+            if connection is not None:
+                connection.end_request()
 
     def _look(self, scope: MutableMapping[str, Any]) -> None:
         headers = Headers(scope=scope)

@@ -1,109 +1,151 @@
-"""Connections of uvicorn with limits that it does not set: how many at once, and how long a request's head may take.
+"""Connections with limits that uvicorn does not set: places, in all and for each address, and a time for a request's head.
 
-Whatever ends a connection is answered before: 400 to what is no HTTP, and to half a request whose client says that no more
-comes; 408 to a head that takes too long (a body's time is `guard.Body`'s), and so to a new connection on which nothing was
-sent. Only a connection that waits for a further request ends without a word, and whatever is left when the server ends.
+What ends a connection is answered before: 503 where there is no place, 408 to a head that takes too long (a body's time is
+`auth.Body`'s), 400 to what is no HTTP and to half a head of which no more comes. `Connection` stands between the socket and
+uvicorn's own protocol; `auth.Guard` tells it when a request has come and when it is answered.
 """
 
 from __future__ import annotations
 
 import asyncio
 import socket
+from collections import Counter
 from http import HTTPStatus
 from typing import Any
 
-import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from .api import PROBLEM, problem
+from .api import problem
 
 HEAD_SECONDS = 10.0  # from a connection, or from the first byte after an answer, to the end of the request's head
+FEWEST = 8  # places of one address, where half of all are fewer
 FULL = "Expected fewer connections at once (dengine serve --connections); verify the part, and try again."
 
 
-def limited(connections: int, head_seconds: float = HEAD_SECONDS) -> type[H11Protocol]:
-    """A protocol for `uvicorn.Config(http=...)` that keeps to these limits."""
-    return type("LimitedProtocol", (Limited,), {"most": connections, "head_seconds": head_seconds})
+class Places:
+    """The connections that a server has.  `uvicorn.Config(http=Places(100).connection)` keeps to them."""
+
+    def __init__(self, connections: int, head_seconds: float = HEAD_SECONDS) -> None:
+        self.most, self.of_address, self.head_seconds = connections, max(FEWEST, connections // 2), head_seconds
+        self.taken: Counter[str] = Counter()  # by address
+
+    def connection(self, app_state: dict[str, Any], **options: Any) -> Connection:
+        """A protocol for one connection, made as uvicorn makes its own."""
+        made = Connection(self)
+        made.inner = H11Protocol(app_state=app_state | {"connection": made}, **options)
+        return made
 
 
-class Limited(H11Protocol):
-    """HTTP/1.1 over one connection."""
+class Connection(asyncio.Protocol):
+    """One connection, handed on to uvicorn's protocol; it is that protocol's transport as well.
 
-    most = 100
-    head_seconds = HEAD_SECONDS
+    asked : whether a request is being answered.
+    """
 
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self._head: asyncio.TimerHandle | None = None
+    inner: asyncio.Protocol
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn's own
+    def __init__(self, places: Places) -> None:
+        self._places, self._address, self._has_place = places, "", False
+        self._transport: Any = None  # before `connection_made`, TLS asks what a protocol has
+        self._timer: asyncio.TimerHandle | None = None
+        self.asked = self._begun = self._ended = self._reading = False
+
+    def __getattr__(self, name: str) -> Any:
+        """What a transport has, and is not changed here."""
+        return getattr(self._transport, name)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take a connection, or say that there are too many."""
-        super().connection_made(transport)
+        assert isinstance(transport, asyncio.Transport)  # uvicorn listens for streams alone
+        self._transport, places = transport, self._places
         raw = transport.get_extra_info("socket")
         if raw is not None and raw.family in (socket.AF_INET, socket.AF_INET6):
             # Else an answer's second piece waits 40 ms for word that its first has come; asyncio sets it on some sockets.
             raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if len(self.connections) > self.most:
-            transport.write(_whole(HTTPStatus.SERVICE_UNAVAILABLE, FULL))
-            transport.close()
+        self._address = str((transport.get_extra_info("peername") or ("",))[0])
+        self._has_place = places.taken.total() < places.most and places.taken[self._address] < places.of_address
+        if not self._has_place:
+            self._end(HTTPStatus.SERVICE_UNAVAILABLE, FULL)
             return
-        self._wait_for_head()
-
-    def data_received(self, data: bytes) -> None:
-        """Take bytes; those of a head have to become one in time."""
-        super().data_received(data)
-        if self.cycle is not None and not self.cycle.response_complete:
-            self._stop_waiting()
-        elif self._head is None and not self.transport.is_closing():
-            self._wait_for_head()
-
-    def on_response_complete(self) -> None:
-        """Go on; where half of the next request's head is there already, the rest has to come in time too."""
-        super().on_response_complete()
-        if self._head is None and self._is_begun():
-            self._wait_for_head()
-
-    def eof_received(self) -> None:
-        """Answer half a request, of which no more comes."""
-        if self._is_begun() or (self.conn.our_state is h11.SEND_RESPONSE and self.conn.their_state is h11.SEND_BODY):
-            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
+        places.taken[self._address] += 1
+        self.inner.connection_made(self)  # type: ignore[arg-type]  # it is one by what it can do
+        self._wait()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Let go."""
         self._stop_waiting()
-        super().connection_lost(exc)
+        if self._has_place:
+            self._places.taken[self._address] -= 1
+            self.inner.connection_lost(exc)
 
-    def send_400_response(self, msg: str) -> None:
-        """Answer what is no HTTP, and close."""
-        self._end(HTTPStatus.BAD_REQUEST, "Expected a request as HTTP/1.1 has it.")
+    def pause_writing(self) -> None:
+        """The client reads more slowly than it is answered."""
+        self.inner.pause_writing()
+
+    def resume_writing(self) -> None:
+        """It has caught up."""
+        self.inner.resume_writing()
+
+    def data_received(self, data: bytes) -> None:
+        """Hand bytes on; those of a head have to become one in time."""
+        if not self._has_place:
+            return
+        if not self.asked:
+            self._begun = True
+            self._wait()
+        self._reading = True
+        try:
+            self.inner.data_received(data)
+        finally:
+            self._reading = False
+
+    def eof_received(self) -> bool:
+        """The client sends no more: what it asked is answered, half a head is refused."""
+        self._ended = True
+        if self._begun and not self.asked:  # a head that is whole is told of by then, or within this turn of the loop
+            asyncio.get_running_loop().call_soon(self._refuse_half)
+        return self._begun or self.asked
+
+    def write(self, data: bytes) -> None:
+        """Write an answer; what uvicorn says to bytes as it reads them is that they are no HTTP, which is said here."""
+        if not self._reading:
+            self._transport.write(data)
+        else:
+            self._end(HTTPStatus.BAD_REQUEST, "Expected a request as HTTP/1.1 has it.")
+
+    def begin_request(self) -> None:
+        """A request's head has come."""
+        self.asked, self._begun = True, False
+        self._stop_waiting()
+
+    def end_request(self) -> None:
+        """It is answered."""
+        self.asked = False
+        if self._ended:
+            self._transport.close()
+
+    def _refuse_half(self) -> None:
+        if not self.asked:
+            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
 
     def _end(self, status: HTTPStatus, detail: str) -> None:
-        """Answer, if nothing was answered yet, and close."""
-        if not self.transport.is_closing():
-            if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-                self.transport.write(_whole(status, detail))
-            self.transport.close()
+        """Answer outside of HTTP's course, and close."""
+        if self._transport.is_closing():
+            return
+        answer = problem(status, detail, {"connection": "close"})
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in answer.raw_headers)
+        first = f"HTTP/1.1 {status.value} {status.phrase}\r\n".encode("ascii")
+        self._transport.write(first + head + b"\r\n" + bytes(answer.body))
+        self._transport.close()
 
-    def _is_begun(self) -> bool:
-        """Whether there is half a head."""
-        return self.conn.our_state is h11.IDLE and bool(self.conn.trailing_data[0]) and not self.transport.is_closing()
-
-    def _wait_for_head(self) -> None:
-        self._head = self.loop.call_later(self.head_seconds, self._give_up)
+    def _wait(self) -> None:
+        if self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(self._places.head_seconds, self._give_up)
 
     def _stop_waiting(self) -> None:
-        if self._head is not None:
-            self._head.cancel()
-            self._head = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
 
     def _give_up(self) -> None:
-        self._head = None
-        self._end(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {self.head_seconds:g} s.")
-
-
-def _whole(status: HTTPStatus, detail: str) -> bytes:
-    """An answer outside of HTTP's course, after which the connection is closed."""
-    body = problem(status, detail).body
-    head = f"HTTP/1.1 {status.value} {status.phrase}\r\ncontent-type: {PROBLEM}\r\ncontent-length: {len(body)}\r\n"
-    later = "retry-after: 1\r\n" if status is HTTPStatus.SERVICE_UNAVAILABLE else ""
-    return f"{head}{later}connection: close\r\n\r\n".encode("ascii") + bytes(body)
+        self._end(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {self._places.head_seconds:g} s.")

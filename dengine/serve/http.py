@@ -26,7 +26,9 @@ from .api import (
     DECISION,
     HANDLERS,
     JSON,
+    LINE,
     PAST,
+    STATUS,
     STORED,
     DetailQuery,
     ListQuery,
@@ -92,9 +94,12 @@ class HttpApi:
         return answered(await self.service.report(said.id, said.success))
 
     async def status(self, request: Request) -> Response:
-        """How the engine stands, and what its store counts."""
-        counts = await self.service.look(lambda store: store.status())
-        return answered(plain(facts(self.service) | {"store": counts}))
+        """How the cell is doing."""
+        service = self.service
+        await service.ask(lambda engine: engine.flush())
+        found = await service.status()
+        line = {name: getattr(service, name) for name in LINE}
+        return answered(plain(record(found, STATUS, alarm=found.alarm, **line)))
 
     async def decision(self, request: Request) -> Response:
         """One decision with its label; with trace=true its trace too."""
@@ -134,28 +139,6 @@ class HttpApi:
     async def docs(self, request: Request) -> Response:
         """The same, to read."""
         return HTMLResponse("\n".join(as_page(document(self.operations(), __version__))))
-
-
-def facts(service: CellService) -> dict[str, Any]:
-    """How the engine and the line in front of it stand."""
-    engine = service.engine
-    return {
-        "cell": engine.store.cell_id,
-        "version": engine.version,
-        "policy": engine.policy,
-        "reducer": engine.recipe.name,
-        "trace": engine.trace,
-        "shadow": engine.shadow,
-        "safe_mode": engine.safe_mode,
-        "retraining": engine.retraining,
-        "new_labels": engine.new_labels,
-        "retrain_every": engine.recipe.retrain_every,
-        "store_fault": engine.store_fault,
-        "waiting": service.waiting,
-        "late": service.late,
-        "busy": service.busy,
-        "deadline": service.deadline,
-    }
 
 
 def _newest(store: Store, limit: int, waiting: bool) -> list[PastDecision]:

@@ -1,18 +1,13 @@
-"""What a PLC, a SCADA and a robot's program may want to know of the cell, in a dozen plain numbers and texts.
-
-What Prometheus reads: how many decisions of which kind, how long they took, and how the engine stands.
-"""
+"""What Prometheus reads: how many decisions of which kind, how long they took, and how the engine stands."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from ..history.status import status
 from ..records import RetrainReport
 from .service import Answer, CellService, Told
 
@@ -37,9 +32,9 @@ class Metrics:
         self._report = seconds("report", "From a label to its being on the disk.")
         self._retrain = seconds("retrain", "From the data to the new version answering.", RETRAIN_SECONDS)
         registry.register(Gauges(service))
-        service.observers.append(self.note)
+        service.observers.append(self.observe)
 
-    def note(self, news: Answer | Told | RetrainReport) -> None:
+    def observe(self, news: Answer | Told | RetrainReport) -> None:
         """Count one of these."""
         if isinstance(news, Answer):
             self._decisions.labels(news.decision.action.value, news.decision.reason.value).inc()
@@ -57,7 +52,7 @@ class Metrics:
 
 
 class Gauges:
-    """How a service stands, read at the moment it is asked."""
+    """How a service stands, read at the moment it is asked, also while its store is away."""
 
     def __init__(self, service: CellService) -> None:
         self._service = service
@@ -65,73 +60,19 @@ class Gauges:
     def collect(self) -> Iterator[Metric]:
         """What Prometheus's registry asks for."""
         service, engine = self._service, self._service.engine
-        gauges = (
+        for name, about, value in (
             ("model_version", "Of the model that answers; 0 before the first retrain.", engine.version),
             ("safe_mode", "1 while everything is verified for what went wrong.", bool(engine.safe_mode)),
-            ("shadow", "1 while everything is verified, and the model only says what it would have done.", engine.shadow),
-            (
-                "store_fault",
-                "1 while the store cannot be written, and labels wait in its journal.",
-                bool(engine.store_fault),
-            ),
+            ("shadow", "1 while everything is verified, and the model is only asked.", engine.shadow),
+            ("store_fault", "1 while the store cannot be written, and labels wait in a journal.", bool(engine.store_fault)),
             ("retraining", "1 while a retrain is under way.", engine.retraining),
             ("new_labels", "Labels since the last retrain began.", engine.new_labels),
             ("waiting", "Requests in line.", service.waiting),
-        )
-        for name, about, value in gauges:
+        ):
             yield GaugeMetricFamily(f"dengine_{name}", about, value=float(value))
-        yield CounterMetricFamily("dengine_late", "Decisions verified since the line was too long.", value=service.late)
+        yield CounterMetricFamily("dengine_late", "Decisions verified since a deadline was exceeded.", value=service.late)
         yield CounterMetricFamily("dengine_busy", "Requests refused since too many waited.", value=service.busy)
 
 
 def _word(value: bool) -> str:
     return "true" if value else "false"
-
-
-@dataclass(frozen=True, slots=True)
-class Overview:
-    """How the cell is doing.
-
-    decisions, accepted, rejected : since its birth.  verified_share : of the newest 500 decisions; 1 where there is none.
-    bad : accepted parts that are known to have been bad, since its birth.
-    version : of the model that answers; 0 before the first retrain.
-    safe_mode : why everything is verified; "" where it is not.
-    shadow : everything is verified, and the model only says what it would have done.
-    waiting : requests in line.  late, busy : answers that came too late, and requests that were refused, since the start.
-    alarm : what somebody should look at, a line; "" where there is nothing.
-    """
-
-    decisions: int
-    verified_share: float
-    accepted: int
-    rejected: int
-    bad: int
-    version: int
-    safe_mode: str
-    shadow: bool
-    waiting: int
-    late: int
-    busy: int
-    alarm: str
-
-
-async def overview(service: CellService) -> Overview:
-    """How the cell is doing, by its store; no decision waits for it, but where the engine remembers in memory alone."""
-    engine = service.engine
-    stored = await service.read(status)
-    doing = replace(stored, store_fault=engine.store_fault, safe_mode=engine.safe_mode)
-    share = doing.newest.verified_share
-    return Overview(
-        decisions=doing.ever.decisions,
-        verified_share=1.0 if share is None else share,
-        accepted=doing.ever.accepted,
-        rejected=doing.ever.rejected,
-        bad=doing.ever.stops,
-        version=engine.version,
-        safe_mode=engine.safe_mode,
-        shadow=engine.shadow,
-        waiting=service.waiting,
-        late=service.late,
-        busy=service.busy,
-        alarm=doing.alarm,
-    )

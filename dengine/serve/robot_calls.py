@@ -15,16 +15,14 @@ import logging
 import uuid
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from dataclasses import asdict
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..engine.decide import as_decision
-from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, shortened
+from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, UnknownDecisionError, shortened
 from ..records import ACTIONS, Action, Decision, as_id
-from .metrics import overview
 from .service import CellService
 
 log = logging.getLogger("dengine")
@@ -171,18 +169,36 @@ class RobotCalls:
         """What became of a part, True for good. Returns whether it is kept: it is not where nothing under this id was
         recorded, where the server is busy, or where its store is away.
         """
+        if decision_id == "":  # as `decide_recorded` gave it
+            return False
         try:
-            if decision_id == "" or await self._service.find(decision_id) is None:  # "": as `decide_recorded` gave it
-                return False
             await self._service.report(decision_id, success)
+        except UnknownDecisionError:
+            return False
         except (BusyError, StoreError) as error:
             log.warning("a report on %s was not kept: %s", shortened(decision_id), error)
             return False
         return True
 
     async def status(self) -> Answered:
-        """How the cell is doing, as `Overview`."""
-        return asdict(await overview(self._service))
+        """How the cell is doing, in a dozen plain numbers and texts; no decision waits for it.
+
+        decisions, accepted, rejected : since its birth.  bad : accepted parts that are known to have been bad.
+        verified_share : of the newest decisions; 1 where there is none.  version : of the model, 0: none.
+        safe_mode : why everything is verified, or "".  shadow : everything is verified, the model is only asked.
+        waiting : requests in line.  late, busy : deadlines exceeded, requests refused.  alarm : what to look at, or "".
+        """
+        service, found = self._service, await self._service.status()
+        share = found.newest.verified_share
+        return {
+            "decisions": found.ever.decisions,
+            "verified_share": 1.0 if share is None else share,
+            "accepted": found.ever.accepted,
+            "rejected": found.ever.rejected,
+            "bad": found.ever.stops,
+            **{name: getattr(found, name) for name in ("version", "safe_mode", "shadow", "alarm")},
+            **{name: getattr(service, name) for name in ("waiting", "late", "busy")},
+        }
 
     async def _known(self, request: Any) -> Answered | None:
         try:

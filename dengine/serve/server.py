@@ -33,7 +33,7 @@ from ..engine.engine import DataEngine
 from ..errors import SettingError, without_password
 from ..records import RetrainReport
 from .auth import Access, in_url, is_loopback, read_token
-from .connections import limited
+from .connections import Places
 from .http import INTERFACES, Beside, create_app
 from .retraining import retraining_process
 from .robot_calls import Recorder
@@ -172,7 +172,7 @@ def uvicorn_options(serving: Serving) -> dict[str, Any]:
     """What uvicorn is told; its own words in the log are ours to say."""
     limits = {"timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE, "ws": "none", "lifespan": "on"}
     silent = {"log_config": None, "access_log": False, "server_header": False, "proxy_headers": False}
-    return {"http": limited(serving.connections), "loop": "asyncio"} | limits | silent
+    return {"http": Places(serving.connections).connection, "loop": "asyncio"} | limits | silent
 
 
 def _run(server: CellServer, listening: socket.socket, state: object) -> None:

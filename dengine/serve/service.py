@@ -21,13 +21,14 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine
 from ..errors import BusyError
+from ..history.status import Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
 from ..store.base import Store, open_store
 from ..store.records import StoredDecision
@@ -183,6 +184,12 @@ class CellService:
         """Read a store that holds all that was decided so far."""
         await self.ask(lambda engine: engine.flush())
         return await self.read(work)
+
+    async def status(self) -> Status:
+        """How the cell is doing: by its store, and by what the running engine alone knows."""
+        found, engine = await self.read(status), self.engine
+        live = ("version", "shadow", "safe_mode", "new_labels", "store_fault", "retraining")
+        return replace(found, **{name: getattr(engine, name) for name in live})
 
     @property
     def waiting(self) -> int:

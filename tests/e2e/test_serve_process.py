@@ -223,7 +223,7 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
                 answer = inserted(robot, program, parts.X[2])
                 known = process.ask(f"/decisions/{answer['id']}?trace=true")
                 np.testing.assert_array_equal(np.float32(known["trace"]).ravel(), parts.X[2])
-                assert process.ask("/status")["store"]["decisions"] >= 3
+                assert process.ask("/status")["ever"]["decisions"] >= 3
             assert process.end() == 0
     assert "no recording of" in process.said
     assert "Traceback" not in process.said

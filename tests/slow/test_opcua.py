@@ -2,7 +2,6 @@
 
 import asyncio
 import socket
-import struct
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
@@ -19,10 +18,6 @@ from dengine.serve.service import CellService
 pytest.importorskip("asyncua", reason="OPC UA needs the extra `opcua`")
 Client, ua = (getattr(pytest.importorskip("asyncua"), name) for name in ("Client", "ua"))
 opcua = pytest.importorskip("dengine.serve.opcua")
-limits = pytest.importorskip("dengine.serve.opcua")
-from asyncua.common.connection import SecureConnection, TransportLimits  # not before it is known to be there
-from asyncua.crypto.security_policies import SecurityPolicyNone
-from asyncua.ua.ua_binary import struct_to_binary
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 VERIFY, ACCEPT = 0, 1
@@ -93,7 +88,7 @@ class Plant:
 async def running(service: CellService, **options: Any) -> AsyncIterator[Plant]:
     async with (
         opcua.opcua_server(service, port=0, **options) as server,
-        Client(f"opc.tcp://127.0.0.1:{server.port}/dengine") as client,
+        Client(f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine") as client,
     ):
         plant = Plant(service, server, client)
         await plant.look()
@@ -268,7 +263,7 @@ def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset, run,
 def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(plant: Plant, run, monkeypatch) -> None:
     async def scada() -> None:
         before = await plant.value("Decisions")
-        monkeypatch.setattr(opcua, "overview", away)
+        monkeypatch.setattr(plant.service, "status", away)
         await status(ua.StatusCodes.UncertainLastUsableValue)
         assert await plant.value("Decisions") == before
         monkeypatch.undo()
@@ -281,158 +276,10 @@ def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(plant: 
                 await plant.service.ask(lambda engine: None)
                 await asyncio.sleep(0.05)
 
-    async def away(service: CellService) -> None:
+    async def away() -> None:
         raise RuntimeError("the store is away")
 
     run(scada())
-
-
-def message(body: bytes, kind: bytes = b"MSGF") -> bytes:
-    return kind + struct.pack("<I", len(body) + 8) + body
-
-
-HELLO = message(struct.pack("<5I", 0, 65535, 65535, 0, 0) + struct.pack("<i", 20) + b"opc.tcp://x/dengine/", b"HELF")
-
-
-CODES = ua.StatusCodes
-REFUSED = {  # what is sent, and why the server hangs up
-    "HTTP": (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", CODES.BadTcpMessageTypeInvalid),
-    "nulls": (b"\0" * 5000, CODES.BadTcpMessageTypeInvalid),
-    "one byte": (b"\x16", CODES.BadTcpMessageTypeInvalid),
-    "an answer's type": (message(b"x" * 20, b"ACKF"), CODES.BadTcpMessageTypeInvalid),
-    "a part of hello": (HELLO.replace(b"HELF", b"HELC"), CODES.BadTcpMessageTypeInvalid),
-    "a long hello": (b"HELF" + struct.pack("<I", 2**32 - 1) + b"x" * 100, CODES.BadTcpMessageTooLarge),
-    "a long message": (b"MSGF" + struct.pack("<I", 2**31) + b"x" * 100, CODES.BadTcpMessageTooLarge),
-    "a message of more than is taken": (HELLO + message(b"x" * limits.CHUNK), CODES.BadTcpMessageTooLarge),
-    "a length that is none": (HELLO + b"OPNF" + struct.pack("<3I", 4, 0, 0), CODES.BadDecodingError),
-    "an empty message": (HELLO + message(b"1234"), CODES.BadDecodingError),
-    "an empty hello": (message(b"", b"HELF"), CODES.BadDecodingError),
-    "half a hello": (HELLO[:20], CODES.BadTimeout),
-    "half a head": (HELLO + b"OPN", CODES.BadTimeout),
-    "hello alone": (HELLO, CODES.BadTimeout),
-    "no buffer": (message(struct.pack("<5Ii", 0, 100, 65535, 0, 0, -1), b"HELF"), CODES.BadInvalidArgument),
-    "half of hello's fields": (message(b"1234", b"HELF"), CODES.BadDecodingError),
-    "no channel's opening": (HELLO + message(b"\x01" * 200, b"OPNF"), CODES.BadDecodingError),
-    "no security": (HELLO + message(b"\xff" * 200, b"OPNF"), CODES.BadSecurityChecksFailed),
-    "no channel": (HELLO + message(bytes(200)), CODES.BadTcpSecureChannelUnknown),
-    "no channel to close": (HELLO + message(bytes(200), b"CLOF"), CODES.BadTcpSecureChannelUnknown),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_message_is_told_why_and_ends_its_connection_and_no_other(
-    plant: Plant, run, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    sent, code = REFUSED[name]
-    monkeypatch.setattr(limits, "GREETING", 0.2)
-    monkeypatch.setattr(plant.server.iserver, "max_pending_activation_seconds", 0.3)
-
-    async def stranger() -> None:
-        reader, writer = await asyncio.open_connection("127.0.0.1", plant.server.port)
-        writer.write(sent)
-        said = b""
-        async with asyncio.timeout(60):
-            while piece := await reader.read(1000):
-                said += piece
-        writer.close()
-        assert told(said) == (code, ua.StatusCode(code).doc)
-        assert await plant.value("ModelVersion") == plant.service.engine.version
-
-    run(stranger())
-
-
-def told(said: bytes) -> tuple[int, str]:
-    """The code and the reason of the ERR message that is the last of what was said, as OPC UA Part 6, 7.1.2.5, has it."""
-    error = said[said.index(b"ERRF") :]
-    size, code, length = struct.unpack("<IIi", error[4:16])
-    assert (size, length) == (len(error), len(error) - 16)
-    return code, error[16:].decode()
-
-
-@pytest.mark.parametrize(
-    ("change", "code"),
-    [
-        ((0, b"MSGC"), CODES.BadTimeout),  # a part, and no other follows
-        ((8, b"\xff" * 4), CODES.BadTcpSecureChannelUnknown),
-        ((12, b"\xff" * 4), CODES.BadSecurityChecksFailed),  # the channel's token
-        ((16, b"\xff" * 4), CODES.BadSecurityChecksFailed),  # the sequence's number
-        ((24, b"\x09"), CODES.BadDecodingError),  # what the message is, as a number of no kind
-        ((28, b"\x03" * 4), CODES.BadDecodingError),  # whose session, as a text that goes on beyond the message
-    ],
-    ids=["a part", "the channel", "the token", "the sequence", "the kind", "the session"],
-)
-def test_what_does_not_fit_its_channel_is_told_so(
-    plant: Plant, run, monkeypatch: pytest.MonkeyPatch, change: tuple[int, bytes], code: int
-) -> None:
-    monkeypatch.setattr(limits, "GREETING", 0.2)
-    at, bytes_ = change
-
-    async def stranger() -> None:
-        async with channel(plant.server.port) as (said, reader, writer):
-            asked = said.message_to_binary(struct_to_binary(ua.GetEndpointsRequest()), request_id=2)
-            writer.write(asked[:at] + bytes_ + asked[at + len(bytes_) :])
-            assert told(await reader.read())[0] == code
-
-    run(stranger())
-
-
-def test_a_message_of_too_many_parts_is_told_so(plant: Plant, run) -> None:
-    async def stranger() -> None:
-        async with channel(plant.server.port) as (said, reader, writer):
-            writer.write(said.message_to_binary(bytes(limits.MOST + 1), request_id=2))
-            assert told(await reader.read())[0] == CODES.BadRequestTooLarge
-
-    run(stranger())
-
-
-@asynccontextmanager
-async def channel(port: int) -> AsyncIterator[tuple[Any, asyncio.StreamReader, asyncio.StreamWriter]]:
-    """A channel without security: what makes its messages, and the connection."""
-    made = SecureConnection(SecurityPolicyNone(), TransportLimits())
-    opening = ua.OpenSecureChannelRequest()
-    opening.Parameters.SecurityMode = ua.MessageSecurityMode.None_
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    async with asyncio.timeout(60):
-        writer.write(HELLO + made.message_to_binary(struct_to_binary(opening), ua.MessageType.SecureOpen, 1))
-        for _ in range(2):  # an acknowledgement, and the channel
-            head = await reader.readexactly(8)
-            rest = await reader.readexactly(int.from_bytes(head[4:], "little") - 8)
-        made.security_token.ChannelId, made.security_token.TokenId = int.from_bytes(rest[:4], "little"), 13
-        yield made, reader, writer
-    writer.close()
-
-
-def test_one_connection_too_many_is_told_so(plant: Plant, run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plant.server.iserver, "max_connections", 1)
-
-    async def stranger() -> bytes:
-        reader, writer = await asyncio.open_connection("127.0.0.1", plant.server.port)
-        async with asyncio.timeout(60):
-            said = await reader.read()
-        writer.close()
-        return said
-
-    assert told(run(stranger()))[0] == CODES.BadTcpNotEnoughResources
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        struct.pack("<Bi", 0x80, 2**31 - 1),  # nulls
-        struct.pack("<Bii", 0x80 | 12, 2**31 - 1, -4),  # texts of a length that goes back
-        struct.pack("<Bi", 0x80 | 24, 2**31 - 1),  # variants
-        struct.pack("<Bi", 0x80 | 10, 2**31 - 1),  # floats
-        struct.pack("<Bi", 0x80 | 10, -7),
-    ],
-    ids=["nulls", "texts", "variants", "floats", "fewer than none"],
-)
-def test_a_short_message_cannot_ask_for_much(value: bytes) -> None:
-    from asyncua.common.utils import Buffer
-    from asyncua.ua.ua_binary import variant_from_binary
-
-    limits.harden()
-    with pytest.raises((ua.UaError, struct.error)):
-        variant_from_binary(Buffer(value))
 
 
 def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService, run) -> None:
@@ -502,7 +349,7 @@ def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
 
     async def visitors() -> None:
         async with opcua.opcua_server(service, 0, "127.0.0.1", "s3cret", cert, key) as server:
-            assert await connect(server.port, encrypted, "dengine", "s3cret") == service.engine.version
+            assert await connect(server.bserver.port, encrypted, "dengine", "s3cret") == service.engine.version
             for security, user, password in (
                 (encrypted, "dengine", "wrong"),
                 (encrypted, "admin", "s3cret"),
@@ -510,10 +357,10 @@ def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
                 (None, "dengine", "s3cret"),
             ):
                 with pytest.raises((ua.UaError, ConnectionError, TimeoutError)):
-                    await connect(server.port, security, user, password)
+                    await connect(server.bserver.port, security, user, password)
             # A client that does not care for what the server's endpoints are gets no session either.
             monkeypatch.setattr(Client, "find_endpoint", staticmethod(lambda endpoints, *wanted: endpoints[0]))
             with pytest.raises(ua.uaerrors.BadUserAccessDenied):
-                await connect(server.port, None, "dengine", "s3cret")
+                await connect(server.bserver.port, None, "dengine", "s3cret")
 
     run(visitors())
