@@ -308,7 +308,6 @@ def _read(store: str, last: int, out: Path | None) -> Held:
 
 
 def _held(store: Store, settings: dict[str, str], last: int) -> Held:
-    from ..decision.certificate import certificate_of
     from ..history.status import safe_mode_event
     from ..history.status import status as status_of
     from ..recipe import Recipe
@@ -320,7 +319,7 @@ def _held(store: Store, settings: dict[str, str], last: int) -> Held:
         recipe=recipe,
         counts=counts,
         retrains=store.retrains(),
-        certificate=certificate_of(store.outcomes(int(settings.get("policy_since", 0))), recipe.policy),
+        certificate=recipe.policy.certificate(store.outcomes(int(settings.get("policy_since", 0)))),
         novel=int(newest.novel.sum()),
         recent=len(newest.seq) + int(newest.silent.sum()),
         mode=safe_mode_event(store),

@@ -3,56 +3,106 @@
     >>> failure_bound(1203, 24, alpha=0.05)     # 1,203 parts, 24 of them bad: 2 % were seen, 3.5 % is the bound
     0.0349...
 
-With probability 1 - alpha the bound is, at all moments together, at or above the mean of the failure probabilities that
-the parts so far really had. These may differ from part to part and drift; the model may be retrained, and its rule may
-learn from every outcome. What is assumed: an audit's coin falls with the stated probability whatever the part is, and every
-audit's outcome is reported (one that was lost must count as bad). It speaks of parts past, not of those to come.
-Source: see `betting`.
+With probability 1 - alpha the bound is, at all moments together (anytime-valid), at or above the mean of the failure
+probabilities that the parts so far really had. These may differ and drift; the model may be retrained, and its rule may
+learn from every outcome. Assumed: an audit's coin falls with the stated probability whatever the part is, and every audit's
+outcome is reported (a lost one must count as bad). It speaks of parts past, not of those to come.
+
+The evidence is an e-process, the capital of a bettor. He starts with 1 and bets the same b on every part, that it will be
+good. With x = 1 for a bad part that was looked at, else 0,
+
+    capital(theta) = product of (1 - b)^x / (1 - b q theta),   q the propensity, theta the tolerance.
+
+In place of theta put each part's own failure probability p_i, whatever it is and however it depends on the past: x has the
+mean q p_i, so the product M is a martingale that begins at 1, and by Ville's inequality M ever reaches 1 / alpha with
+probability alpha at most. The logarithm is concave, so capital(mean of p_1 ... p_n) <= M, at every n at once: no
+stationarity, one may look after every part, and the running mean may move. For that b must not depend on theta; as a stake
+it is l = b q / (1 - b q theta) on 1 + l (theta - x / q), inverse probability weighting. The capital grows with theta, so
+what is not refuted is an interval. Nobody knows the best b beforehand (1 - odds(q p) / odds(q theta), where all parts have
+one p), so the capital is a mixture, weighted by the bets: large ones matter while n is small.
+
+Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures over bets: Robbins (1970), AMS 41(5).
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import SettingError
-from .rule import log_evidence
-
-if TYPE_CHECKING:
-    from .policy import Policy, Stops
 
 CONFIRMED_SHARE = 0.1  # of alpha, where audits and confirmations both speak: the former see less and need more
 RARE = 0.02  # the audit rate that is assumed where none is set
 ENDLESS = 10**8  # more audits than that are none
 
 
-class Outcomes(Protocol):
-    """How many parts the model was certain of, and what became of them: whole numbers.
+def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0, bets: list[float] | None = None) -> float:
+    """Log capital of a mixture of constant bets that the mean failure probability of n parts is below `tolerance`.
 
-    accepted, rejected : let go without a check, since the policy's settings were last changed.
-    stops, confirmed : of the accepted, those known to be bad, and known to be good.
-    audited_accepts, audited_accepts_bad : checked though the model would have accepted, and those of them that were bad.
-    audited_rejects, audited_rejects_good : checked though the model would have rejected, and those of them that were good.
+    n : parts, looked at or not.  n_bad : those of them that were looked at and were bad.  tolerance : in [0, 1].
+    propensity : in (0, 1], the probability with which each part was looked at; a bad one that was looked at then stands for
+        1 / propensity. Where it changed, the smallest: that is on the safe side.
+    bets : in (0, 1), fixed beforehand; None: a grid for any rate. Few are sharper where the rate is about known.
+    It grows with `tolerance` and falls with `n_bad`. Compiles to TorchScript.
+    """
+    if bets is None:
+        bets = [0.05, 0.1, 0.2, 0.4, 0.7, 0.98]  # never 1: one bad part would lose all for ever
+    rate = propensity * tolerance
+    logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in bets]
+    top = max(logs)
+    capital = 0.0
+    weights = 0.0  # summed in the same order, so that no parts are no evidence, exactly
+    for bet, log in zip(bets, logs):  # noqa: B905  strict is not TorchScript
+        capital += bet * math.exp(log - top)
+        weights += bet
+    return top + math.log(capital / weights)
+
+
+def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
+    """Upper bound on the mean failure probability of n parts, valid at all moments together with probability 1 - alpha.
+
+    n : parts the claim is about.  n_bad : those of them that were looked at and were bad.
+    propensity : probability with which each was looked at: 1 where every outcome is known, the audit rate where only audits
+        are, 0 where nobody looks. Where it changed, the smallest.
+    Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection;
+    never less than n_bad / (n propensity). 1 where nothing is known.
+    """
+    if not 0.0 < alpha < 1.0:
+        raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for 95 % confidence.")
+    if not 0.0 <= propensity <= 1.0:
+        raise SettingError(f"Expected 0 <= propensity <= 1, got {propensity!r}; 0.02 looks at one part in fifty.")
+    if not 0 <= n_bad <= n:
+        raise ValueError(f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once.")
+    enough = math.log(1.0 / alpha)
+    if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if log_evidence(n, n_bad, middle, propensity) >= enough else (middle, high)
+    return high  # the refuted end: rounding widens
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """How many parts the model was certain of since the policy's settings last changed, and what became of them.
+
+    accepted, rejected : let go without a check.  stops, confirmed : of the accepted, known to be bad, and to be good.
+    audited_accepts, audited_accepts_bad : checked though the model would have accepted, and the bad ones of them.
+    audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
+    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
+        none of the counts of labels above.
     """
 
-    @property
-    def accepted(self) -> int: ...
-    @property
-    def stops(self) -> int: ...
-    @property
-    def confirmed(self) -> int: ...
-    @property
-    def audited_accepts(self) -> int: ...
-    @property
-    def audited_accepts_bad(self) -> int: ...
-    @property
-    def rejected(self) -> int: ...
-    @property
-    def audited_rejects(self) -> int: ...
-    @property
-    def audited_rejects_good(self) -> int: ...
+    accepted: int = 0
+    stops: int = 0
+    confirmed: int = 0
+    audited_accepts: int = 0
+    audited_accepts_bad: int = 0
+    rejected: int = 0
+    audited_rejects: int = 0
+    audited_rejects_good: int = 0
+    forgotten_accepts: int = 0
+    forgotten_audited_accepts: int = 0
+    forgotten_audited_rejects: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,84 +205,46 @@ class Certificate:
         """`Bounded.audits_needed` of the accepted parts; `target` is by default the tolerance."""
         return self.accepted.audits_needed(self.tolerance if target is None else target, bad_rate)
 
-    def _sentence(self, part: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
-        parts = f"{part.n:,} part{'s' if part.n != 1 else ''}"
-        if part.n == 0:
+    def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
+        parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
+        if bounded.n == 0:
             return f"Nothing can be said yet: no part was one {which}."
-        if part.propensity == 0.0:
+        if bounded.propensity == 0.0:
             return f"Of {parts} {which} nothing can be said, for {unknown}."
-        if part.propensity < 1.0:
-            which = f"that the model would {verb}, of which {part.n_looked_at:,} were audited"
-        if part.shadowed:
+        if bounded.propensity < 1.0:
+            which = f"that the model would {verb}, of which {bounded.n_looked_at:,} were audited"
+        if bounded.shadowed:
             which = f"that the model would {verb}, each of which was checked"
-        if part.upper >= 1.0:
+        if bounded.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
-        sure, tolerance = _percent(1.0 - self.alpha), _percent(self.tolerance)
+        # A sentence must not promise more than the bound: rounded up.
+        digits = 1 if bounded.upper >= 0.01 else 2 if bounded.upper >= 0.001 else 4
+        upper = f"{math.ceil(bounded.upper * 10.0 ** (digits + 2)) / 10.0**digits:g} %"
         return (
-            f"Of {parts} {which}, at most {_rounded_up(part.upper)} were {wrong} on average, "
-            f"with {sure} confidence, however often one looks; the tolerance is {tolerance}."
+            f"Of {parts} {which}, at most {upper} were {wrong} on average, with {_percent(1.0 - self.alpha)} confidence, "
+            f"however often one looks; the tolerance is {_percent(self.tolerance)}."
         )
 
 
-def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
-    """Upper bound on the mean failure probability of n parts, valid at all moments together with probability 1 - alpha.
+def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float) -> Certificate:
+    """The certificate of what became of all certain decisions so far; `Policy.certificate` is the engine's way to it.
 
-    n : parts the claim is about.  n_bad : those of them that were looked at and were bad.
-    propensity : probability with which each was looked at: 1 where every outcome is known, the audit rate where only audits
-        are, 0 where nobody looks. Where it changed, the smallest.
-    Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection, as
-    the evidence grows with theta; never less than n_bad / (n propensity). 1 where nothing is known.
+    stops : "all" where every bad accepted part stops the system and is reported, so that the outcome of each accepted part
+        is known (leave the newest out while its outcome is open). "some" where silence is no success.
+    audit_rate : probability with which a certain decision is verified all the same. Where it changed since the first of
+        these parts, the smallest.
+
+    Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited: the
+    coin does not know the outcome. It never lies below the share known to be bad. A cell that confirmed or stopped every
+    accepted part knows as much as under "all". Where both are possible they share alpha, so that whoever sees now the one
+    and now the other is still wrong with probability alpha at most. Rejected parts are known by audits alone. A label that
+    was forgotten counts as a wrong decision, like an audit whose outcome was lost: forgetting earns nothing.
     """
-    if not 0.0 < alpha < 1.0:
-        raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for 95 % confidence.")
-    if not 0.0 <= propensity <= 1.0:
-        raise SettingError(f"Expected 0 <= propensity <= 1, got {propensity!r}; 0.02 looks at one part in fifty.")
-    if not 0 <= n_bad <= n:
-        raise ValueError(f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once.")
-    enough = math.log(1.0 / alpha)
-    if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if log_evidence(n, n_bad, middle, propensity) >= enough else (middle, high)
-    return high  # the refuted end: rounding widens
-
-
-def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: Stops, audit_rate: float) -> Certificate:
-    """The certificate of what became of all certain decisions so far.
-
-    stops : "all" where every bad accepted part stops the system and is reported: then the outcome of each accepted part is
-        known (whether the newest is still open is the caller's matter: leave it out). "some" where silence is no success.
-    audit_rate : probability with which a certain decision is verified all the same, in [0, 1]. Where it changed since the
-        first of these parts, the smallest.
-
-    Under "some" the bound comes from audits, and it is about all parts the model would have accepted, let go or audited:
-    the coin does not know the outcome, so the audited stand for all. It never lies below the share known to be bad. A cell
-    that confirmed or stopped every accepted part so far knows as much as under "all", and then the claim is about
-    these. Where both are possible they share alpha, so that whoever sees now the one and now the other is still wrong with
-    probability alpha at most. Rejected parts are known by audits alone.
-    """
-    if stops not in _ACCEPTED:
-        raise SettingError(f"Expected stops among {', '.join(_ACCEPTED)}, got {stops!r}.")
+    if stops not in ("all", "some"):
+        raise SettingError(f"Expected stops among all, some, got {stops!r}.")
     if not 0.0 < tolerance < 1.0:
         raise SettingError(f"Expected 0 < tolerance < 1, got {tolerance!r}; 0.05 tolerates 5 % of errors.")
-    n = outcomes.rejected + outcomes.audited_rejects
-    rejected = _bounded(n, outcomes.audited_rejects, outcomes.audited_rejects_good, audit_rate, alpha)
-    return Certificate(
-        alpha=alpha,
-        tolerance=tolerance,
-        accepted=_ACCEPTED[stops](outcomes, alpha, audit_rate),
-        rejected=replace(rejected, shadowed=audit_rate == 1.0 and outcomes.rejected == 0),
-    )
-
-
-def certificate_of(outcomes: Any, policy: Policy) -> Certificate:
-    """What a store's `Outcomes` certify by a policy. Where all stops are known, a part counts once its silence is over.
-
-    A label that was forgotten counts as a wrong decision, like an audit whose outcome was lost: forgetting earns nothing.
-    """
-    outcomes = replace(
+    o = replace(
         outcomes,
         stops=outcomes.stops + outcomes.forgotten_accepts,
         audited_accepts=outcomes.audited_accepts + outcomes.forgotten_audited_accepts,
@@ -240,28 +252,19 @@ def certificate_of(outcomes: Any, policy: Policy) -> Certificate:
         audited_rejects=outcomes.audited_rejects + outcomes.forgotten_audited_rejects,
         audited_rejects_good=outcomes.audited_rejects_good + outcomes.forgotten_audited_rejects,
     )
-    if policy.stops == "all":
-        outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.confirmed)
-    return certify(outcomes, policy.alpha, 1.0 - policy.lower_bound, policy.stops, policy.audit_rate)
-
-
-def _where_all_stop(outcomes: Outcomes, alpha: float, _audit_rate: float) -> Bounded:
-    return _bounded(outcomes.accepted, outcomes.accepted, outcomes.stops, 1.0, alpha)
-
-
-def _where_some_stop(outcomes: Outcomes, alpha: float, audit_rate: float) -> Bounded:
-    share = CONFIRMED_SHARE if audit_rate > 0.0 else 1.0
-    if 0 < outcomes.accepted == outcomes.stops + outcomes.confirmed:
-        return _bounded(outcomes.accepted, outcomes.accepted, outcomes.stops, 1.0, share * alpha)
-    if audit_rate == 0.0:
-        return _bounded(outcomes.accepted, 0, 0, 0.0, alpha)
-    n, n_bad = outcomes.accepted + outcomes.audited_accepts, outcomes.audited_accepts_bad
-    bounded = _bounded(n, outcomes.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
-    shadowed = audit_rate == 1.0 and outcomes.accepted == 0
-    return replace(bounded, upper=max(bounded.upper, (n_bad + outcomes.stops) / max(1, n)), shadowed=shadowed)
-
-
-_ACCEPTED: dict[str, Callable[[Outcomes, float, float], Bounded]] = {"all": _where_all_stop, "some": _where_some_stop}
+    share = 1.0 if stops == "all" or audit_rate == 0.0 else CONFIRMED_SHARE
+    if stops == "all" or 0 < o.accepted == o.stops + o.confirmed:
+        accepted = _bounded(o.accepted, o.accepted, o.stops, 1.0, share * alpha)
+    elif audit_rate == 0.0:
+        accepted = _bounded(o.accepted, 0, 0, 0.0, alpha)
+    else:
+        n, n_bad = o.accepted + o.audited_accepts, o.audited_accepts_bad
+        accepted = _bounded(n, o.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
+        upper = max(accepted.upper, (n_bad + o.stops) / max(1, n))
+        accepted = replace(accepted, upper=upper, shadowed=audit_rate == 1.0 and o.accepted == 0)
+    rejected = _bounded(o.rejected + o.audited_rejects, o.audited_rejects, o.audited_rejects_good, audit_rate, alpha)
+    rejected = replace(rejected, shadowed=audit_rate == 1.0 and o.rejected == 0)
+    return Certificate(alpha, tolerance, accepted, rejected)
 
 
 def _bounded(n: int, n_looked_at: int, n_bad: int, propensity: float, alpha: float) -> Bounded:
@@ -270,9 +273,3 @@ def _bounded(n: int, n_looked_at: int, n_bad: int, propensity: float, alpha: flo
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.6g} %"
-
-
-def _rounded_up(share: float) -> str:
-    # A sentence must not promise more than the bound.
-    digits = 1 if share >= 0.01 else 2 if share >= 0.001 else 4
-    return f"{math.ceil(share * 10.0 ** (digits + 2)) / 10.0**digits:g} %"

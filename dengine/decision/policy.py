@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from importlib import import_module
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
@@ -12,17 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingError, shortened
 from ..records import ACTIONS, Action, find_class, is_number
+from .certificate import Certificate, Outcomes, certify
 from .intervals import INTERVALS, Bounds, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
 
 Stops = Literal["all", "some"]
-RULES = {  # by guarantee, and by what is known of stops
-    "local": {"some": "dengine.decision.rule:DecisionRule", "all": "dengine.decision.rule:WatchedRule"},
-    "pooled": dict.fromkeys(("some", "all"), "dengine.decision.rule:PooledRule"),
+RULES = {  # classes of `rule`, by guarantee and by what is known of stops
+    "local": {"some": "DecisionRule", "all": "WatchedRule"},
+    "pooled": {"some": "PooledRule", "all": "PooledRule"},
 }
-CURVE = "dengine.experiments.costs"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,37 +69,25 @@ class Policy:
         if self.stops not in get_args(Stops):
             raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
 
-    @classmethod
-    def from_costs(cls, dataset: Any, *, check: float, escape: float, false_reject: float, **how: Any) -> Policy:
-        """The policy that made a part cheapest in replays of the user's own recordings.
-
-        dataset : anything `load_dataset` takes.
-        check, escape, false_reject : what a verification, a bad part accepted and a good part rejected cost, in one unit.
-        how : `recipe`, `alphas`, `lower_bounds`, `repeats`, `n_jobs` and more, as `experiments.cost_curve.cost_curve` takes
-            them; its `CostCurve` says what each policy would have cost, and how sure that is.
-        It pays, or may pay: only `CostCurve.verdict` tells the two apart, so try it in the shadow mode first.
-        Raises SettingError where nothing is cheaper than verifying everything, with what the cheapest policy costs.
-        """
-        curve = import_module(CURVE).cost_curve(  # from far above: it plays engines
-            dataset, check=check, escape=escape, false_reject=false_reject, **how
-        )
-        found: Policy | None = curve.policy
-        if found is None:
-            raise SettingError(f"Expected a policy that costs less than verifying everything. {curve.sentence}")
-        return found
-
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
-        from .rule import DecisionRule  # torch is imported where it is used
+        from . import rule  # torch is imported where it is used
 
-        named = RULES.get(self.guarantee)
-        found = find_class(self.guarantee if named is None else named[self.stops])
-        if not issubclass(found, DecisionRule):
+        own = RULES.get(self.guarantee)
+        found = find_class(self.guarantee) if own is None else getattr(rule, own[self.stops])
+        if not issubclass(found, rule.DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
         try:
-            return found(self.alpha, self.lower_bound, self.interval)
+            made: DecisionRule = found(self.alpha, self.lower_bound, self.interval)
         except TypeError as error:
             raise SettingError(f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}.") from error
+        return made
+
+    def certificate(self, outcomes: Outcomes) -> Certificate:
+        """What may be said of the parts so far; where all stops are known, a part counts once its silence is over."""
+        if self.stops == "all":
+            outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.forgotten_accepts + outcomes.confirmed)
+        return certify(outcomes, self.alpha, 1.0 - self.lower_bound, self.stops, self.audit_rate)
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """(lower, upper) of the success probability, by the policy's interval and alpha."""

@@ -37,7 +37,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..cells.base import Cell
-from ..decision.certificate import Certificate, certificate_of
+from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import DengineError, StoreError
 from ..history.status import history
@@ -165,7 +165,7 @@ class EngineFacts:
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return certificate_of(self.store.outcomes(self._settings.policy_since), self.policy)
+        return self.policy.certificate(self.store.outcomes(self._settings.policy_since))
 
     @property
     def new_labels(self) -> int:

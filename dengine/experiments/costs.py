@@ -234,6 +234,18 @@ def cost_curve(
     return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done), costs)
 
 
+def policy_from_costs(dataset: Any, *, check: float, escape: float, false_reject: float, **how: Any) -> Policy:
+    """The policy that made a part cheapest in replays of the user's own recordings; arguments as in `cost_curve`.
+
+    It pays, or may pay: only `CostCurve.verdict` tells the two apart, so try it in the shadow mode first.
+    Raises SettingError where nothing is cheaper than verifying everything, with what the cheapest policy costs.
+    """
+    curve = cost_curve(dataset, check=check, escape=escape, false_reject=false_reject, **how)
+    if curve.policy is None:
+        raise SettingError(f"Expected a policy that costs less than verifying everything. {curve.sentence}")
+    return curve.policy
+
+
 def cost_tasks(
     recipe: Any, alphas: Sequence[float], lower_bounds: Sequence[float], seeds: range, cycles: int | None = None
 ) -> list[Task]:

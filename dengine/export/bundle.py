@@ -36,7 +36,7 @@ import torch
 
 from .. import __version__
 from ..decision.policy import RULES
-from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS
+from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
 from ..errors import ExportError, OutputError
 from ..files import check_output, write_output
 from ..model.base import Exportable
@@ -199,8 +199,10 @@ def describe(source: Exportable) -> dict[str, Any]:
 
 def _guarantee_of(rule: Any) -> str:
     """What `Policy.guarantee` calls a rule of this class."""
-    own = f"{type(rule).__module__}:{type(rule).__qualname__}"
-    return next((name for name, rules in RULES.items() if own in rules.values()), own)
+    kind = type(rule)
+    own = kind.__module__ == DecisionRule.__module__
+    named = next((name for name, rules in RULES.items() if kind.__name__ in rules.values()), "") if own else ""
+    return named or f"{kind.__module__}:{kind.__qualname__}"
 
 
 def write_export(

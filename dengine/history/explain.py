@@ -131,7 +131,7 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
     rule.load_state_dict(kept)
     for label in told:
         if not label.quarantined:
-            rule.note(label.silent, label.novel)
+            rule.observe(label.silent, label.novel)
             rule.tell(label.lower, label.upper, label.success)
     return rule
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.policy import RULES, Policy
-from ..decision.rule import NOBODY, DecisionRule, WatchedRule
+from ..decision.rule import NOBODY, DecisionRule
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
 from ..store.views import PastDecision
@@ -116,9 +116,9 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
         return None, None, f"{policy.guarantee} decides by its own rule"
     if policy.guarantee == "local" and not found.safe_mode:
         return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the ball around the part"
-    if not isinstance(rule, WatchedRule):
+    if rule is None or rule.evidence is None:
         return None, None, "the levels that held then are not kept"
-    accept_at, reject_at = (float(level) for level in rule.open)
+    accept_at, reject_at = (float(level) for level in rule.evidence.open)
     held = "the lowest level that held then" if policy.guarantee == "pooled" else "what held in safe mode"
     return (
         accept_at if accept_at < NOBODY else None,

@@ -15,7 +15,7 @@ from enum import StrEnum
 from itertools import chain
 from typing import TypeVar
 
-from ..decision.certificate import Certificate, certificate_of
+from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
 from ..errors import SettingError, StoreError
@@ -196,7 +196,7 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
         unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
         recent=len(recent.seq) + int(recent.silent.sum()),
         recent_novel=int(recent.novel.sum()),
-        certificate=certificate_of(store.outcomes(int(settings.get("policy_since", 0))), policy),
+        certificate=policy.certificate(store.outcomes(int(settings.get("policy_since", 0)))),
         retrains=tuple(retrains),
         events=tuple(store.events(EVENTS)),
         watch=watch(store, recipe) if watching else None,
@@ -274,15 +274,14 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
 
 def watch(store: Store, recipe: Recipe) -> Watch | None:
     """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
-    from ..decision.rule import WatchedRule
     from .explain import rule_now  # torch
 
     if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
         return None
     rule = rule_now(store, recipe.policy)
-    if not isinstance(rule, WatchedRule):
+    if rule is None or rule.evidence is None:
         return None
-    accepts, rejects, novelty = (max(0.0, capital / rule.alarm_at) for capital in rule.watch.tolist())
+    accepts, rejects, novelty = (max(0.0, capital / rule.evidence.alarm_at) for capital in rule.evidence.watch.tolist())
     return Watch(accepts, rejects, novelty)
 
 

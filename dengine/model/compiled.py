@@ -61,7 +61,7 @@ class Predictor(nn.Module):
     @torch.jit.export
     def tell(self, lower: float, upper: float, success: bool, silent: int, novel: bool) -> None:
         """Tell the rule what became of a part."""
-        self.neighbours.rule.note(silent, novel)
+        self.neighbours.rule.observe(silent, novel)
         self.neighbours.rule.tell(lower, upper, success)
 
     @torch.jit.export

@@ -27,7 +27,7 @@ from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule, learns
+from ..decision.rule import SAFE_MODE, DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
@@ -244,12 +244,13 @@ class ModelPrediction(ManyPredictions, EngineModel):
     def tell(self, told: Told) -> None:
         """Tell the rule what became of a part."""
         before = dict(self.rule.state_dict())
-        self.rule.note(told.silent, told.novel)
+        self.rule.observe(told.silent, told.novel)
         self.rule.tell(told.lower, told.upper, told.success)
         for name, now in self.rule.state_dict().items():
             if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
                 before[name].copy_(now)
-                setattr(self.rule, name, before[name])
+                path, _, leaf = name.rpartition(".")
+                setattr(self.rule.get_submodule(path), leaf, before[name])
 
     def forget(self) -> None:
         """The rule as it was before it was told anything; in place, for the compiled module reads it."""
@@ -258,7 +259,7 @@ class ModelPrediction(ManyPredictions, EngineModel):
 
     @property
     def remembers(self) -> bool:
-        return learns(self.rule)
+        return self.rule.learns()
 
     def under(self, policy: Policy) -> Self:
         """Another rule, and another module around the same references."""

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..decision.certificate import Outcomes as Outcomes  # counted by every store
 from ..errors import ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
 from ..records import LONGEST, Action, Decision, Reason, RetrainReport, Source, as_id, as_success, is_name
 
@@ -284,32 +285,6 @@ class Evidence:
     success: NDArray[np.bool_]
     novel: NDArray[np.bool_]
     silent: NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Outcomes:
-    """What became of what the model was certain of, counted over all of a cell's store, quarantined ones included.
-
-    accepted, rejected : decisions with that action.
-    stops, confirmed : labels of the accepted, False and True; of the others nothing was heard.
-    audited_accepts, audited_rejects : labelled audits of what the model would have accepted, and rejected.
-    audited_accepts_bad : of these, label False.
-    audited_rejects_good : of these, label True.
-    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
-        none of the counts of labels above.
-    """
-
-    accepted: int
-    stops: int
-    confirmed: int
-    audited_accepts: int
-    audited_accepts_bad: int
-    rejected: int
-    audited_rejects: int
-    audited_rejects_good: int
-    forgotten_accepts: int = 0
-    forgotten_audited_accepts: int = 0
-    forgotten_audited_rejects: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -167,12 +167,12 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model
         mine = {f"ring.{name}": t for name, t in model.index.ring.state_dict().items()}
-        mine |= {f"rule.{name}": t for name, t in model.rule.state_dict().items()}
+        mine |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
         for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
             torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
         assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
-        assert type(model.rule) is DecisionRule or {"rule.members", "rule.watch", "rule.open"} <= kept.keys()
+        assert type(model.rule) is DecisionRule or {"evidence.members", "evidence.watch", "evidence.open"} <= kept.keys()
     assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
     assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED)) > 0
     assert len(modes) > 1 or stops == "some"

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from dengine.decision.rule import log_evidence
+from dengine.decision.certificate import log_evidence
 
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)
 

@@ -1,15 +1,13 @@
 """What is certified of accepted and rejected parts: the bound, what counts as known, and the words."""
 
 import math
-from dataclasses import dataclass
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from dengine.decision.certificate import Certificate, certify, failure_bound
-from dengine.decision.rule import log_evidence
+from dengine.decision.certificate import Certificate, Outcomes, certify, failure_bound, log_evidence
 from dengine.errors import SettingError
 
 counts = st.tuples(st.integers(0, 20_000), st.floats(0.0, 1.0)).map(lambda c: (c[0], int(c[0] * c[1])))
@@ -17,20 +15,8 @@ alphas = st.floats(0.001, 0.5)
 propensities = st.floats(0.005, 1.0)
 
 
-@dataclass(frozen=True)
-class Counts:
-    accepted: int = 0
-    stops: int = 0
-    confirmed: int = 0
-    audited_accepts: int = 0
-    audited_accepts_bad: int = 0
-    rejected: int = 0
-    audited_rejects: int = 0
-    audited_rejects_good: int = 0
-
-
 def certificate(stops: str = "all", audit_rate: float = 0.0, alpha: float = 0.05, /, **counts: int) -> Certificate:
-    return certify(Counts(**counts), alpha, 0.05, stops, audit_rate)  # type: ignore[arg-type]
+    return certify(Outcomes(**counts), alpha, 0.05, stops, audit_rate)
 
 
 # --------------------------------------------------------------------------------------------------- the bound
@@ -77,7 +63,7 @@ def test_settings_and_counts_out_of_range_are_named() -> None:
     with pytest.raises(SettingError, match="among all, some, got 'none'"):
         certificate("none")
     with pytest.raises(SettingError, match="0 < tolerance < 1, got 0"):
-        certify(Counts(), 0.05, 0.0, "all", 0.0)
+        certify(Outcomes(), 0.05, 0.0, "all", 0.0)
 
 
 # --------------------------------------------------------------------------------------------- what counts as known

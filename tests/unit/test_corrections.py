@@ -468,7 +468,7 @@ def test_the_certificate_speaks_of_what_was_decided_since_the_policy_changed(dat
     assert engine.certificate().accepted.n > 0
     engine.set_policy(replace(engine.policy, lower_bound=0.85))
     assert (engine.certificate().accepted.n, engine.certificate().tolerance) == (0, pytest.approx(0.15))
-    assert int(engine.model.rule.members.sum()) == 0
+    assert int(engine.model.rule.evidence.members.sum()) == 0
     assert {d.action for d in (engine.decide(x) for x in data.X[:20])} == {Action.VERIFY}  # nothing is shown yet
 
 
@@ -476,10 +476,10 @@ def test_the_audit_rate_alone_leaves_the_rule_as_it_is(data: Dataset) -> None:
     engine = make(POOLED)
     play(engine, data, slice(0, 170), confirm=False)
     rule = engine.model.rule
-    members = rule.members.clone()
+    members = rule.evidence.members.clone()
     engine.set_policy(replace(engine.policy, audit_rate=0.9))
     assert engine.model.rule is rule
-    assert (rule.members == members).all()
+    assert (rule.evidence.members == members).all()
     looked = [engine.decide(x) for x in data.X[170:] if not engine.safe_mode]
     certain = [d for d in looked if d.predicted is not Action.VERIFY]
     assert sum(d.audit for d in certain) > 0.6 * len(certain) > 0

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from dengine import Dataset, Policy, Recipe
 from dengine.cli import main
 from dengine.errors import SettingError
-from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of
+from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of, policy_from_costs
 from dengine.experiments.figures import cost_picture
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Replay, replay
@@ -134,7 +134,7 @@ def test_the_curve_is_that_of_replays(found: CostCurve, make_data: Callable[...,
 
 def test_a_policy_comes_from_costs_and_with_it_whatever_the_recipe_says(make_data: Callable[..., Dataset]) -> None:
     how = HOW | {"recipe": Recipe.load("pca").with_policy(stops="all")}
-    policy = Policy.from_costs(make_data(160), check=5, escape=20, false_reject=10, **how)
+    policy = policy_from_costs(make_data(160), check=5, escape=20, false_reject=10, **how)
     assert (policy.alpha, policy.stops) == (0.5, "all")
     assert policy.lower_bound in HOW["lower_bounds"]
 
@@ -142,7 +142,7 @@ def test_a_policy_comes_from_costs_and_with_it_whatever_the_recipe_says(make_dat
 def test_where_nothing_pays_there_is_no_policy_from_costs(make_data: Callable[..., Dataset]) -> None:
     coins = replace(make_data(160), y=np.random.default_rng(0).integers(0, 2, 160).astype(np.int8))
     with pytest.raises(SettingError, match=r"verifying everything\. Nothing pays"):
-        Policy.from_costs(coins, check=5, escape=1e6, false_reject=1e6, **HOW)
+        policy_from_costs(coins, check=5, escape=1e6, false_reject=1e6, **HOW)
 
 
 @pytest.mark.parametrize("how", [{"repeats": 1}, {"alphas": (2,)}, {"lower_bounds": (0.4,)}, {"check": -1}])

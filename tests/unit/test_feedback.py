@@ -136,7 +136,7 @@ def test_a_late_stop_whose_write_failed_is_counted_once_when_it_is_told_again(st
     monkeypatch.setattr(engine.store, "put_labels", whole)
     engine.report(decision.id, False)
     evidence_ = engine.store.evidence_since(0)
-    members = engine.model.rule.members[0, 0, 0].tolist()  # of LB's own level
+    members = engine.model.rule.evidence.members[0, 0, 0].tolist()  # of LB's own level
     reached = evidence_.lower >= 0.9
     assert members == [int(reached.sum()), int((reached & ~evidence_.success).sum())]
 
@@ -148,7 +148,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
         engine.decide(x + np.float32(0.02))
     engine.start_retrain()
     known = engine.store.evidence_since(0)
-    assert engine.model.rule.members[0, 0, 0, 0] == (known.lower >= 0.9).sum()
+    assert engine.model.rule.evidence.members[0, 0, 0, 0] == (known.lower >= 0.9).sum()
     assert engine.store.last_version().last_seq == known.seq[-1]
 
 

@@ -7,17 +7,8 @@ import pytest
 import torch
 
 from dengine import Policy
-from dengine.decision.rule import (
-    BETS,
-    FALSE_ALARMS,
-    LOWEST,
-    SAFE_MODE,
-    DecisionRule,
-    PooledRule,
-    WatchedRule,
-    log_evidence,
-    script,
-)
+from dengine.decision.certificate import log_evidence
+from dengine.decision.rule import BETS, FALSE_ALARMS, LOWEST, SAFE_MODE, DecisionRule, PooledRule, WatchedRule, script
 
 ACCEPT, REJECT, VERIFY = 1, 2, 0
 
@@ -26,7 +17,7 @@ def pooled(alpha: float = 0.1, lower_bound: float = 0.9) -> PooledRule:
     return PooledRule(alpha, lower_bound)
 
 
-def tell(rule: WatchedRule, lower: float, *outcomes: bool, upper: float = 1.0) -> None:
+def tell(rule: DecisionRule, lower: float, *outcomes: bool, upper: float = 1.0) -> None:
     for success in outcomes:
         rule.tell(lower, upper, success)
 
@@ -50,7 +41,7 @@ def test_a_policy_names_its_rule(guarantee: str, stops: str, kind: type) -> None
 
 
 def test_levels_go_down_from_lb_in_steps_of_half_the_tolerance() -> None:
-    levels = pooled().levels
+    levels = pooled().evidence.levels
     np.testing.assert_allclose(levels[:3], [0.9, 0.85, 0.8])
     assert levels[-1] == pytest.approx(LOWEST)
     assert len(levels) == 13
@@ -131,7 +122,7 @@ def test_parts_at_the_tolerance_open_a_level_in_at_most_alpha_of_the_streams(alp
 
 
 @pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts(kind: type[WatchedRule]) -> None:
+def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts(kind: type[DecisionRule]) -> None:
     rule = kind(0.1, 0.9)
     tell(rule, 0.95, *[True] * 500)
     bad = 0
@@ -143,7 +134,7 @@ def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts(kind: type[W
 
 
 @pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_safe_mode_verifies_everything_until_fresh_evidence_keeps_the_tolerance(kind: type[WatchedRule]) -> None:
+def test_safe_mode_verifies_everything_until_fresh_evidence_keeps_the_tolerance(kind: type[DecisionRule]) -> None:
     rule = kind(0.1, 0.9)
     tell(rule, 0.95, *[True] * 500, *[False] * 6)
     fresh = 0
@@ -173,16 +164,16 @@ def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> Non
     silent, told = pooled(), pooled()
     for rule in (silent, told):
         tell(rule, 0.95, *[True] * 100)
-    before = silent.members.clone()
-    silent.note(50, False)
-    assert torch.equal(silent.members, before)
+    before = silent.evidence.members.clone()
+    silent.observe(50, False)
+    assert torch.equal(silent.evidence.members, before)
     for _ in range(50):
-        told.note(1, False)
-    torch.testing.assert_close(silent.watch[0], told.watch[0])  # fifty at once, or one by one
+        told.observe(1, False)
+    torch.testing.assert_close(silent.evidence.watch[0], told.evidence.watch[0])  # fifty at once, or one by one
     # Every twentieth accepted part stops the system: within the tolerance, though no success is ever heard of.
     watched = WatchedRule(0.1, 0.9)
     for _ in range(30):
-        watched.note(19, False)
+        watched.observe(19, False)
         watched.tell(0.95, 1.0, False)
     assert watched.safe_mode() == 0
 
@@ -190,14 +181,14 @@ def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> Non
 def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
     few, many = pooled(), pooled()
     for i in range(300):
-        few.note(0, i % 10 == 0)
-        many.note(0, i % 2 == 0)
+        few.observe(0, i % 10 == 0)
+        many.observe(0, i % 2 == 0)
     assert few.safe_mode() == 0
     assert SAFE_MODE[many.safe_mode()] == "too many traces were novel"
 
 
 @pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(kind: type[WatchedRule]) -> None:
+def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(kind: type[DecisionRule]) -> None:
     eager, scripted = kind(0.1, 0.9), script(kind(0.1, 0.9))
     rng = np.random.default_rng(2)
     for _ in range(400):
@@ -205,7 +196,7 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(kind: type[Watched
         upper = float(rng.uniform(lower, 1.0))
         success, silent, novel = bool(rng.random() < 0.97), int(rng.integers(0, 3)), bool(rng.random() < 0.05)
         for rule in (eager, scripted):
-            rule.note(silent, novel)
+            rule.observe(silent, novel)
             rule.tell(lower, upper, success)
         assert eager.safe_mode() == scripted.safe_mode()
     for name, value in eager.state_dict().items():

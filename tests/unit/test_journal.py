@@ -119,7 +119,7 @@ def test_a_journal_brings_bounds_parts_and_sources(
         with DataEngine.open(path) as engine:
             known, last = engine.store.evidence_since(200), engine.store.labelled(n)
             outcomes, sources = engine.store.outcomes(), engine.store.status()["sources"]
-            members = engine.model.rule.state_dict()["members"].clone()
+            members = engine.model.rule.state_dict()["evidence.members"].clone()
         lower, success = [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0], [True, True, False, True, False, False]
         hashes = [part_hash(p) for p in ("P1", "P2", "P3", "", "P4", "P1")]
         hashes[3] = int(content_hash(X[3:4])[0])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dengine.decision.rule import log_evidence
+from dengine.decision.certificate import log_evidence
 
 CLAIM = 0.05
 PROPENSITIES = (1.0, 0.1, 0.02)

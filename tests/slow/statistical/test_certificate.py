@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dengine.decision.certificate import failure_bound
-from dengine.decision.rule import log_evidence
+from dengine.decision.certificate import failure_bound, log_evidence
 from tests.slow.proof.certificate import CLAIM, PROPENSITIES, STREAMS, ever_wrong, most_bad
 
 
