@@ -22,8 +22,7 @@ from dengine.model.base import Told
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 from dengine.records import Reason
-from dengine.reducers import heads as logistic
-from dengine.reducers import scored
+from dengine.reducers import heads
 from dengine.reducers.heads import CrossFittedScores
 from tests.slow.proof.blindness import moved, places, weak_signal
 from tests.slow.proof.counts import count_noise, mean_square, relabelled, white_noise
@@ -103,7 +102,7 @@ def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
 
 
 def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(scored, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+    patch.setattr(heads, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
@@ -111,15 +110,15 @@ def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
         self: Any, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: Any, least: int = 0
     ) -> int:
         g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
-        heads = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
-        steps = logistic._interleave(heads, max_iter, stop, least)
+        every = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
+        steps = heads._interleave(every, max_iter, stop, least)
         new, old, base = (
-            np.mean([f(h) for h in heads])
+            np.mean([f(h) for h in every])
             for f in (lambda h: h.leave_one_out_loss(), lambda h: h.first_loss, lambda h: h.base_rate_loss())
         )
         self.kept.fill_(bool(new > max(old, base)))
         if not self.kept[0]:
-            for k, head in enumerate(heads):
+            for k, head in enumerate(every):
                 self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
         self._turn(g[:, :-1])
         return steps
