@@ -1,5 +1,6 @@
 """The exception tree, and what errors and screens may say of a value: a line of it, and never a password."""
 
+import math
 import re
 import reprlib
 from collections.abc import Iterable
@@ -31,6 +32,11 @@ def listed(names: Iterable[Any]) -> str:
     names = list(names)
     few = ", ".join(str(name)[:100] for name in names[:8])
     return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
+
+
+def percent(share: float, form: str = ".1f") -> str:
+    """A share as a person reads it, 12.3 %; "-" for NaN."""
+    return "-" if math.isnan(share) else f"{100 * share:{form}} %"
 
 
 class DengineError(Exception):

@@ -15,18 +15,17 @@ import click
 
 from .. import __version__
 from ..errors import DengineError, without_password
-from .correct import correct, forget, retrain, rollback, set_policy, shadow
-from .costs import costs
+from .correct import correct, forget, policy, retrain, rollback
 from .data import data, simulate
-from .export import export, export_cpp, import_labels, make_key
+from .export import export
 from .history import explain, history
 from .options import example
 from .output import end_interrupted
-from .replay import compare, replay
+from .replay import compare, costs, replay
 from .run import run
 from .serve import serve
-from .status import cells, status
-from .store import dump, verify
+from .status import status
+from .store import import_labels, verify
 from .train import train
 
 
@@ -72,7 +71,7 @@ def main() -> None:
 
 
 for verb in (
-    *(data, replay, compare, costs, train, run, serve, simulate, status, cells, history, explain, verify, dump),
-    *(correct, forget, rollback, set_policy, shadow, retrain, export, export_cpp, make_key, import_labels),
+    *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
+    *(correct, forget, rollback, policy, retrain, export, import_labels),
 ):
     main.add_command(verb)

@@ -1,16 +1,16 @@
-"""`dengine correct`, `forget`, `rollback`, `set-policy`, `retrain`: what people put right in a store, and train by hand."""
+"""`dengine correct`, `forget`, `rollback`, `policy`, `retrain`: what people put right in a store, and train by hand."""
 
 from __future__ import annotations
 
 import getpass
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import SETTINGS, cell_options, example, json_option
-from .output import certificate_record, show, write_json
+from .options import POLICY, cell_options, example, gathered, given, interval_option, json_option
+from .output import certificate_record, facts, show, write_json
 
 if TYPE_CHECKING:
     from ..engine.corrections import Changed
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 LABELS = {"good": True, "bad": False}
-INTERVALS = ("binomial", "wilson", "clopper_pearson", "jeffreys")  # whose functions are not imported to parse
-POLICY = ("alpha", "lower_bound", "guarantee", "stops", "audit_rate")
 
 
 def store_argument(command: Command) -> Command:
@@ -31,7 +29,7 @@ author_option = click.option("--author", help="Who says so, for the record.  [de
 
 
 def _changed(
-    verb: str, store: str, author: str | None, change: Callable[[DataEngine, str], Changed], as_json: bool
+    verb: str, store: str, author: str | None, change: Callable[[DataEngine, str], list[Changed]], as_json: bool
 ) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine.engine import DataEngine
@@ -39,14 +37,15 @@ def _changed(
 
     who = _login() if author is None else author
     with DataEngine.open(store, wait=UNHURRIED) as engine:
-        changed = change(engine, who)
+        changes = change(engine, who)
         certificate, policy = engine.certificate(), engine.policy
     if as_json:
-        about = {"verb": verb, "store": store, "author": who, "changed": changed.event is not None}
-        write_json(about | asdict(changed) | {"policy": asdict(policy), "certificate": certificate_record(certificate)})
+        about = {"verb": verb, "store": store, "author": who, "changed": any(each.event is not None for each in changes)}
+        write_json(about | asdict(changes[-1]) | {"policy": policy, "certificate": certificate_record(certificate)})
         return
-    recorded = "" if changed.event is None else f" Event {changed.event}, by {who or 'nobody named'}."
-    show(f"{changed.text}{recorded}")
+    for each in changes:
+        recorded = "" if each.event is None else f" Event {each.event}, by {who or 'nobody named'}."
+        show(f"{each.text}{recorded}")
 
 
 def _login() -> str:
@@ -69,7 +68,7 @@ def correct(store: str, decision: str, label: str, author: str | None, as_json: 
     From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
     decided; the correction is a later row. A forgotten label counts again by it.
     """
-    _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
+    _changed("correct", store, author, lambda engine, who: [engine.correct(decision, LABELS[label], who)], as_json)
 
 
 @click.command(epilog=example("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'"))
@@ -84,7 +83,7 @@ def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | No
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
     where one is unknown or has no label, none.
     """
-    _changed("forget", store, author, lambda engine, who: engine.forget(*decisions, author=who, reason=reason), as_json)
+    _changed("forget", store, author, lambda engine, who: [engine.forget(*decisions, author=who, reason=reason)], as_json)
 
 
 @click.command(epilog=example("dengine rollback engine.db 1"))
@@ -97,49 +96,46 @@ def rollback(store: str, version: int, author: str | None, as_json: bool) -> Non
 
     Labels that came since are among its references, and corrections count.
     """
-    _changed("rollback", store, author, lambda engine, who: engine.rollback(version, who), as_json)
+    _changed("rollback", store, author, lambda engine, who: [engine.rollback(version, who)], as_json)
 
 
-def _policy_options(command: Command) -> Command:
-    for name in reversed(POLICY):
-        command = SETTINGS[name](command)
-    return command
-
-
-@click.command("set-policy", epilog=example("dengine set-policy engine.db --alpha 0.05 --lower-bound 0.95"))
+@click.command(epilog=example("dengine policy engine.db --alpha 0.05 --lower-bound 0.95"))
 @store_argument
-@_policy_options
-@click.option("--interval", type=click.Choice(INTERVALS), help="The confidence interval.")
+@gathered("settings", given, POLICY | {"interval": interval_option})
+@click.option(
+    "--shadow",
+    type=click.Choice(["on", "off"]),
+    help="Verify every part, and let the model only say what it would have done; or let it decide again.",
+)
 @author_option
 @json_option
-def set_policy(store: str, author: str | None, as_json: bool, **given: Any) -> None:
-    """Decide by another policy from now on.
+def policy(store: str, settings: dict[str, Any], shadow: str | None, author: str | None, as_json: bool) -> None:
+    """Show the policy in force, or decide by another one.
 
     What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
-    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence.
+    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence. The shadow
+    mode lasts over restarts; `dengine status` counts what the model would have done, and how much of that was wrong.
     """
-    from dataclasses import replace
+    if not settings and shadow is None:
+        _show_policy(store, as_json)
+        return
 
-    asked: Mapping[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if not asked:
-        raise click.UsageError("Expected at least one setting, such as --alpha or --lower-bound; got none.")
-    _changed(
-        "set-policy", store, author, lambda engine, who: engine.set_policy(replace(engine.policy, **asked), who), as_json
-    )
+    def change(engine: DataEngine, who: str) -> list[Changed]:
+        changes = [engine.set_policy(replace(engine.policy, **settings), who)] if settings else []
+        return changes if shadow is None else [*changes, engine.set_shadow(shadow == "on", who)]
+
+    _changed("policy", store, author, change, as_json)
 
 
-@click.command(epilog=example("dengine shadow engine.db on"))
-@store_argument
-@click.argument("state", type=click.Choice(["on", "off"]))
-@author_option
-@json_option
-def shadow(store: str, state: str, author: str | None, as_json: bool) -> None:
-    """Verify every part, or let the model decide again.
+def _show_policy(store: str, as_json: bool) -> None:
+    from ..engine.engine import DataEngine
 
-    In the shadow mode it only says what it would have done. The mode lasts over restarts. `dengine status` counts
-    what the model would have done, and how much of that was wrong.
-    """
-    _changed("shadow", store, author, lambda engine, who: engine.set_shadow(state == "on", who), as_json)
+    with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
+        now = engine.policy
+    if as_json:
+        write_json({"verb": "policy", "store": store, "changed": False, "policy": now})
+        return
+    show(facts(f"{store}: the policy in force", [(name, str(value)) for name, value in asdict(now).items()]))
 
 
 @click.command(epilog=example("dengine retrain engine.db"))

@@ -1,35 +1,33 @@
-"""`dengine simulate`: traces of the simulated cell, into a file.
-
-`dengine data`: what a data set is, before anything is learned from it.
-"""
+"""`dengine data` and `dengine simulate`: what a data set is before anything is learned from it; a simulated one."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
+from ..errors import percent
 from .options import (
+    FILE,
     DataChoice,
     OutFolder,
+    data_argument,
     example,
     force_option,
     json_option,
+    left_out,
     must_have_mujoco,
     n_jobs_option,
     out_option,
-    reading_options,
     scenario_option,
     seed_option,
 )
-from .output import duration, progress, show, write_json
+from .output import duration, facts, progress, show, write_json
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from ..experiments.survey import Drift, Survey
 
 MOST = 10  # faults that are named
@@ -42,8 +40,7 @@ FITTED = {
 
 
 @click.command(epilog=example("dengine data insertion --out out/"))
-@click.argument("data", metavar="NAME|FILE|FOLDER")
-@reading_options
+@data_argument
 @out_option
 @json_option
 def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
@@ -66,19 +63,8 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     if as_json:
         write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
         return
-    show(_table(found))
-    show(*_faults(found), *(f"Wrote {path}" for path in files))
-
-
-def _table(found: Survey) -> Table:
-    from rich.table import Table
-
-    table = Table(title=found.name, show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, text in (*_form(found), *_state(found), *_order(found)):
-        table.add_row(name, text)
-    return table
+    table = facts(found.name, [*_form(found), *_state(found), *_order(found)])
+    show(table, *left_out(dataset, MOST), *(f"Wrote {path}" for path in files))
 
 
 def _form(found: Survey) -> Iterator[tuple[str, str]]:
@@ -108,7 +94,7 @@ def _rate(found: Survey) -> str:
 def _state(found: Survey) -> Iterator[tuple[str, str]]:
     from ..model.neighbours import SUSPICIOUS
 
-    yield "labels", f"{found.good} good, {found.bad} bad: {100 * found.good / found.traces:.1f} % good"
+    yield "labels", f"{found.good} good, {found.bad} bad: {percent(found.good / found.traces)} good"
     if found.parts is not None:
         yield "parts", f"{found.parts}, {found.traces - found.parts} traces are of a part that came before"
     bad = [f"{n} {what}" for n, what in ((found.not_finite, "not finite"), (found.constant, "constant")) if n]
@@ -139,19 +125,11 @@ def _trend(each: Drift) -> str:
     return f"{said} (Spearman's rho {each.rho:+.2f}, p {each.p:.2g})"
 
 
-def _faults(found: Survey) -> list[Any]:
-    if not found.faults:
-        return []
-    n = len(found.faults)
-    rest = [f"and {n - MOST} more."] if n > MOST else []
-    return [f"Left out, {n}:", *(f"- {fault}" for fault in found.faults[:MOST]), *rest]
-
-
 @click.command(epilog=example("dengine simulate --n 50 --out traces.npz --seed 0"))
 @click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate, of 2 s each.")
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=FILE,
     required=True,
     help="The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels.",
 )

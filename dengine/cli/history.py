@@ -1,14 +1,11 @@
-"""`dengine explain`: why one decision came out as it did.
-
-`dengine history`: the decisions of a store, line by line, and what happened between them.
-"""
+"""`dengine history`: the decisions of a store, and what happened between them; `dengine explain`: why one came out so."""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..records import Action, Reason
-from .options import cell_options, example, force_option, json_option, out_file_option
-from .output import duration, show, when, write_json
+from ..errors import percent
+from .options import Known, Naming, cell_options, example, force_option, json_option, out_file_option
+from .output import duration, facts, show, when, write_json
 
 if TYPE_CHECKING:
     from ..history.envelope import Envelope, Excess
@@ -27,7 +24,6 @@ if TYPE_CHECKING:
     from ..store.records import Event
     from ..store.views import PastDecision, PastRetrain
 
-LABELS = ("good", "bad", "none")
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 COLUMNS = ("time (UTC)", "decision", "part", "action", "model", "bound", "good", "bad", "reason", "v", "label")
 RIGHT = ("good", "bad", "v")
@@ -35,6 +31,28 @@ WIDEST = 120  # columns
 PART = COLUMNS.index("part")
 SHORTEST = 5  # characters of a part's number that are shown
 TOLD = {"verification": "verified"}  # in fewer columns
+SHORT = "%y-%m-%d %H:%M:%S"
+
+
+def actions() -> Iterable[str]:
+    """What may have been decided."""
+    from ..records import Action
+
+    return [each.value for each in Action]
+
+
+def reasons() -> Iterable[str]:
+    """Why it may have been."""
+    from ..records import Reason
+
+    return [each.value for each in Reason]
+
+
+def labels() -> Iterable[str]:
+    """What a part may have turned out to be."""
+    from ..store.views import LABELS
+
+    return LABELS
 
 
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
@@ -48,27 +66,27 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         if ago:
             return time.time() - float(ago[1]) * AGO[ago[2]]
         try:
-            when = datetime.fromisoformat(value)
+            moment = datetime.fromisoformat(value)
         except ValueError:
             self.fail(f"expected 30m, 12h, 7d or 2026-03-01T14:30, got {value!r}.", param, ctx)
-        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
 @click.command(epilog=example("dengine history engine.db --last 20 --events"))
 @click.argument("store", metavar="STORE")
 @cell_options()
 @click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
-@click.option("--action", type=click.Choice([each.value for each in Action]), help="Only what was decided so.")
+@click.option("--action", type=Known(actions), help="Only what was decided so.")
 @click.option(
     "--model",
     "predicted",
-    type=click.Choice([each.value for each in Action]),
+    type=Known(actions),
     help="Only what the model alone would have done so, as in an audit or in the shadow mode.",
 )
-@click.option("--reason", type=click.Choice([each.value for each in Reason]), metavar="REASON", help=(
-    f"Only for this reason: {', '.join(each.value for each in Reason)}."
-))  # fmt: skip
-@click.option("--label", type=click.Choice(LABELS), help="Only what turned out so, or was never reported.")
+@click.option(
+    "--reason", type=Known(reasons), cls=Naming, names=reasons, metavar="REASON", help="Only for this one: {names}."
+)
+@click.option("--label", type=Known(labels), help="Only what turned out so, or was never reported.")
 @click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
 @click.option("--until", type=Moment(), help="Only before then, likewise.")
 @click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
@@ -93,24 +111,21 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
         opened.close()
     if as_json:
         listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
-        write_json({"verb": "history", "store": store, "decisions": [_record(past) for past in found]} | listed)
+        decisions = [asdict(past) | {"label": past.label} for past in found]
+        write_json({"verb": "history", "store": store, "decisions": decisions} | listed)
         return
     happened: Iterator[Happened] = iter(found) if others is None else interleaved(found, others)
     for line in lines(list(happened)):
         click.echo(line)
 
 
-def _record(past: PastDecision) -> dict[str, Any]:
-    return asdict(past) | {"label": past.label}
-
-
 def lines(happened: Sequence[Happened]) -> list[str]:
     """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
     from ..store.views import PastDecision
 
-    rows = [_cells(each) for each in happened if isinstance(each, PastDecision)]
     if not happened:
         return ["No decision of that kind."]
+    rows = [_cells(each) for each in happened if isinstance(each, PastDecision)]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
     too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
@@ -132,7 +147,7 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
 def _cells(past: PastDecision) -> list[str]:
     source = "" if past.source is None else f" {TOLD.get(past.source.value, past.source.value)}"
     return [
-        _time(past.time),
+        when(past.time, SHORT),
         past.id,
         past.part or "-",
         past.action.value,
@@ -150,14 +165,10 @@ def _told(each: PastRetrain | Event) -> str:
     from ..store.records import Event
 
     if isinstance(each, Event):
-        return f"{_time(each.time)}  * {each.kind}: {' '.join(each.text.split())}"
+        return f"{when(each.time, SHORT)}  * {each.kind}: {' '.join(each.text.split())}"
     report = each.report
     what = f"retrain to version {report.version}" if report.accepted else f"retrain {each.number}"
-    return f"{_time(each.time)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
-
-
-def _time(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%y-%m-%d %H:%M:%S")
+    return f"{when(each.time, SHORT)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
 
 
 MOST = 5  # excesses that are named
@@ -210,17 +221,11 @@ def _drawn(found: Explanation, out: Path, force: bool) -> Path:
 
 
 def _tables(found: Explanation) -> Iterator[Any]:
-    from rich.table import Table
-
     past = found.decision
-    table = Table(title=f"{past.id}: {past.action.value}, {past.reason.value}", show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for row in _rows(found):
-        table.add_row(*row)
-    yield table
+    yield facts(f"{past.id}: {past.action.value}, {past.reason.value}", _rows(found))
     if found.neighbours:
-        yield _neighbour_table(found)
+        title = f"Nearest references of version {found.neighbours_version}; the ball's radius is {found.radius:.3g}"
+        yield facts(title, map(_neighbour, found.neighbours), ("decision", "part", "label", "distance", "fold", "ball"))
 
 
 def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
@@ -239,8 +244,8 @@ def _envelope_rows(band: Envelope | None, found: Explanation) -> Iterator[tuple[
     if band is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
-    usual = f"of 95 % of them fewer than {100 * band.usual:.0f} % do"
-    yield "envelope", f"{100 * band.outside:.0f} % of its samples leave the band of {band.n:,} successes; {usual}"
+    usual = f"of 95 % of them fewer than {percent(band.usual, '.0f')} do"
+    yield "envelope", f"{percent(band.outside, '.0f')} of its samples leave the band of {band.n:,} successes; {usual}"
     if band.not_finite:
         yield "", f"{band.not_finite} samples are NaN or infinite"
     farthest = sorted(band.excesses, key=lambda each: -each.widths)
@@ -261,31 +266,7 @@ def _excess(each: Excess, found: Explanation) -> str:
     return f"{where}{times} {side}, by up to {each.widths:.1f} band widths"
 
 
-def _neighbour_table(found: Explanation) -> Any:
-    from rich.table import Table
-
-    title = f"Nearest references of version {found.neighbours_version}; the ball's radius is {found.radius:.3g}"
-    table = Table(title=title, title_justify="left")
-    cells = [_neighbour_cells(each) for each in found.neighbours]
-    for name in cells[0]:
-        table.add_column(
-            name,
-            justify="right" if name in ("distance", "fold") else "left",
-            overflow="fold",
-            min_width=18 if name == "decision" else None,
-        )
-    for row in cells:
-        table.add_row(*row.values())
-    return table
-
-
-def _neighbour_cells(each: Neighbour) -> dict[str, str]:
-    source = "" if each.source is None else f", {each.source.value}"
-    return {
-        "decision": each.decision_id or "not known any more",
-        "part": each.part or "-",
-        "label": f"{'good' if each.success else 'bad'}{source}",
-        "distance": f"{each.distance:.3f}",
-        "fold": str(each.space),
-        "ball": "inside" if each.inside else "outside",
-    }
+def _neighbour(each: Neighbour) -> tuple[str, ...]:
+    label = f"{'good' if each.success else 'bad'}{'' if each.source is None else f', {each.source.value}'}"
+    ball = "inside" if each.inside else "outside"
+    return each.decision_id or "not known", each.part or "-", label, f"{each.distance:.3f}", str(each.space), ball

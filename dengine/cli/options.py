@@ -1,27 +1,95 @@
-"""Options that several verbs share.
-
-Options that take several values, with commas between.
-
-Which cell of a store a verb means, and what that cell makes.
-"""
+"""Options that several verbs share, and the records that verbs get of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
 from ..errors import SettingError
-from ..records import FITS
 
 if TYPE_CHECKING:
     from ..datasets import Dataset
     from ..recipe import Recipe
+
+Command = Callable[..., Any]
+Names = Callable[[], Iterable[str]]
+FILE = click.Path(dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+def guarantees() -> Iterable[str]:
+    """Names of rules."""
+    from ..decision.policy import RULES
+
+    return RULES
+
+
+def stops() -> Iterable[str]:
+    """What may be known of stops."""
+    from ..decision.policy import Stops
+
+    return get_args(Stops)
+
+
+def intervals() -> Iterable[str]:
+    """Names of confidence intervals."""
+    from ..decision.intervals import INTERVALS
+
+    return INTERVALS
+
+
+def reducers() -> Iterable[str]:
+    """Names of reducers."""
+    from ..reducers import REDUCERS
+
+    return REDUCERS
+
+
+def fits() -> Iterable[str]:
+    """What may become of traces of another length."""
+    from ..records import FITS
+
+    return FITS
+
+
+class Known(click.ParamType[Any]):
+    """A name in a table of the package, which is read when it is needed; or `module:Class`, where `own` may be given."""
+
+    name = "name"
+
+    def __init__(self, names: Names, own: bool = False) -> None:
+        self.names = names
+        self.own = own
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        """[local|pooled|module:Class]."""
+        return f"[{'|'.join([*self.names(), *(['module:Class'] if self.own else [])])}]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The name; what is in no table is a usage error."""
+        if value not in self.names() and not (self.own and ":" in value):
+            own = ", or module:Class of your own" if self.own else ""
+            self.fail(f"{value!r} is not one of {', '.join(map(repr, self.names()))}{own}.", param, ctx)
+        return str(value)
+
+
+class Naming(click.Option):
+    """An option whose help says, in the place of {names}, what can be named."""
+
+    def __init__(self, *words: Any, names: Names, **how: Any) -> None:
+        super().__init__(*words, **how)
+        self.names = names
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """Its words and its help."""
+        self.help = (self.help or "").replace("{names}", ", ".join(self.names()))
+        return super().get_help_record(ctx)
 
 
 class Listed(click.ParamType[Any]):
@@ -42,7 +110,21 @@ class Listed(click.ParamType[Any]):
         return tuple(self.of.convert(part, param, ctx) for part in parts)
 
 
-Command = Callable[..., Any]
+def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Callable[[Command], Command]]) -> Any:
+    """Options, by the names of their values, which `make` takes; what it makes is handed on as `into`."""
+
+    def decorate(command: Command) -> Command:
+        @wraps(command)
+        def with_one(**given: Any) -> Any:
+            mine = {name: given.pop(name) for name in options}
+            return command(**{into: make(**mine)}, **given)
+
+        decorated: Command = with_one
+        for option in reversed(options.values()):
+            decorated = option(decorated)
+        return decorated
+
+    return decorate
 
 
 def cell_options(*names: str, product: bool = False) -> Callable[[Command], Command]:
@@ -60,10 +142,15 @@ def cell_options(*names: str, product: bool = False) -> Callable[[Command], Comm
         if product:
             about = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
             named = click.option("--product", metavar="NAME", help=about)(named)
-        whose = "Whose rows of the store, where it holds several cells; see `dengine cells`.  [default: cell]"
+        whose = "Whose rows of the store, where it holds several cells; `dengine status` lists them.  [default: cell]"
         return click.option(*(names or ("--cell", "--cell-id")), "cell_id", metavar="NAME", help=whose)(named)
 
     return with_options
+
+
+def short_name(name: str) -> str:
+    """What to call a recipe in tables and file names: `folder/often.toml` is often, `module:Class` is Class."""
+    return Path(name.rpartition(":")[2]).stem
 
 
 @dataclass(frozen=True)
@@ -101,6 +188,77 @@ class RecipeChoice:
         return recipe
 
 
+ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
+LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
+POLICY = {  # what it is by default is the recipe's affair, or the store's
+    "alpha": click.option(
+        "--alpha",
+        type=ALPHA,
+        help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
+    ),
+    "lower_bound": click.option(
+        "--lower-bound",
+        type=LOWER_BOUND,
+        help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
+    ),
+    "guarantee": click.option(
+        "--guarantee",
+        type=Known(guarantees, own=True),
+        help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled); "
+        "or a rule of your own.",
+    ),
+    "stops": click.option(
+        "--stops",
+        type=Known(stops),
+        help="Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good.",
+    ),
+    "audit_rate": click.option(
+        "--audit-rate",
+        type=click.FloatRange(0.0, 1.0, max_open=True),
+        metavar="SHARE",
+        help="Share of what the model is certain of that is verified all the same; rejects are known by it alone.",
+    ),
+}
+SETTINGS = POLICY | {
+    "novelty": click.option(
+        "--novelty",
+        type=click.FloatRange(0.0),
+        metavar="FACTOR",
+        help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
+    ),
+}
+interval_option = click.option("--interval", type=Known(intervals), help="The confidence interval.")
+
+
+def given(**options: Any) -> dict[str, Any]:
+    """Those that were given."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _choice(reducer: str | None, recipe: str | None, **settings: Any) -> RecipeChoice:
+    if reducer and recipe:
+        raise click.UsageError("--reducer and --recipe exclude each other; a recipe names its reducer.")
+    return RecipeChoice(reducer, recipe, given(**settings))
+
+
+policy_options = gathered("settings", given, SETTINGS)
+recipe_options = gathered(
+    "choice",
+    _choice,
+    {
+        "reducer": click.option(
+            "--reducer",
+            cls=Naming,
+            names=reducers,
+            metavar="NAME",
+            help="{names}, or module:Class of your own, looked for in this folder too.  [default: conv]",
+        ),
+        "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
+        **SETTINGS,
+    },
+)
+
+
 @dataclass(frozen=True)
 class DataChoice:
     """Which data set was asked for, and how: as `load_dataset` takes it."""
@@ -123,90 +281,19 @@ class DataChoice:
         how = {name: getattr(self, name) for name in ("channel", "label", "labels", "fit", "rate_hz", "trigger", "topic")}
         data = load_dataset(self.data, self.samples, self.part, **how)
         if data.faults and not quiet:
-            click.echo(left_out(data), err=True)
+            for line in left_out(data, 3):
+                click.echo(line, err=True)
         return data
 
 
-def left_out(data: Dataset, most: int = 3) -> str:
-    """What could not be read, a line each for the first few."""
-    n, faults = len(data.faults), data.faults[:most]
-    of = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
-    return "\n".join([of, *(f"  {fault}" for fault in faults), *([f"  and {n - most} more"] if n > most else [])])
-
-
-def short_name(name: str) -> str:
-    """What to call a recipe in tables and file names: `folder/often.toml` is often, `module:Class` is Class."""
-    return Path(name.rpartition(":")[2]).stem
-
-
-ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
-LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
-GUARANTEE = click.Choice(["local", "pooled"])
-SETTINGS = {  # of a policy, and of a recipe: what they are by default is the recipe's affair
-    "alpha": click.option(
-        "--alpha",
-        type=ALPHA,
-        help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
-    ),
-    "lower_bound": click.option(
-        "--lower-bound",
-        type=LOWER_BOUND,
-        help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
-    ),
-    "guarantee": click.option(
-        "--guarantee",
-        type=GUARANTEE,
-        help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled).",
-    ),
-    "stops": click.option(
-        "--stops",
-        type=click.Choice(["some", "all"]),
-        help="Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good.",
-    ),
-    "audit_rate": click.option(
-        "--audit-rate",
-        type=click.FloatRange(0.0, 1.0, max_open=True),
-        metavar="SHARE",
-        help="Share of what the model is certain of that is verified all the same; rejects are known by it alone.",
-    ),
-    "novelty": click.option(
-        "--novelty",
-        type=click.FloatRange(0.0),
-        metavar="FACTOR",
-        help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
-    ),
-}
-
-
-def policy_options(command: Command) -> Command:
-    """The options of SETTINGS, handed on as `settings`, one dict of those that were given."""
-
-    @wraps(command)
-    def gathered(**given: Any) -> Any:
-        asked = {name: given.pop(name) for name in SETTINGS}
-        return command(settings={name: value for name, value in asked.items() if value is not None}, **given)
-
-    for option in reversed(SETTINGS.values()):
-        gathered = option(gathered)
-    return gathered
-
-
-def recipe_options(command: Command) -> Command:
-    """`--reducer` or `--recipe`, and what is set beside them, handed on as one `RecipeChoice`, `choice`."""
-
-    @wraps(command)
-    def chosen(reducer: str | None, recipe: str | None, settings: Mapping[str, Any], **others: Any) -> Any:
-        if reducer and recipe:
-            raise click.UsageError("--reducer and --recipe exclude each other; a recipe names its reducer.")
-        return command(choice=RecipeChoice(reducer, recipe, settings), **others)
-
-    with_recipe = click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file.")
-    with_reducer = click.option(
-        "--reducer",
-        metavar="NAME",
-        help="conv, umap, pca, rocket, or module:Class of your own, looked for in this folder too.  [default: conv]",
-    )
-    return with_reducer(with_recipe(policy_options(chosen)))
+def left_out(data: Dataset, most: int) -> list[str]:
+    """What could not be read, a line each for the first few; none where all could."""
+    n = len(data.faults)
+    if not n:
+        return []
+    rest = [f"- and {n - most} more"] if n > most else []
+    title = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
+    return [title, *(f"- {fault}" for fault in data.faults[:most]), *rest]
 
 
 DATA = {  # how a data set is read: what `load_dataset` calls them
@@ -227,7 +314,7 @@ DATA = {  # how a data set is read: what `load_dataset` calls them
     "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
     "fit": click.option(
         "--fit",
-        type=click.Choice(FITS),
+        type=Known(fits),
         help="What becomes of traces of another length.  [default: strict where all are alike, else pad]",
     ),
     "rate_hz": click.option(
@@ -252,19 +339,7 @@ DATA = {  # how a data set is read: what `load_dataset` calls them
         help="The array or column of parts' numbers, if any: a part that comes again has one vote.",
     ),
 }
-
-
-def reading_options(command: Command) -> Command:
-    """The options of DATA and `data`, given before, handed on as one `DataChoice`, `source`."""
-
-    @wraps(command)
-    def sourced(data: str, **others: Any) -> Any:
-        how = {name: others.pop(name) for name in DATA}
-        return command(source=DataChoice(data, **how), **others)
-
-    for option in reversed(DATA.values()):
-        sourced = option(sourced)
-    return sourced
+data_argument = gathered("source", DataChoice, {"data": click.argument("data", metavar="NAME|FILE|FOLDER")} | DATA)
 
 
 def data_options(default: str | None = "insertion") -> Callable[[Command], Command]:
@@ -277,7 +352,7 @@ def data_options(default: str | None = "insertion") -> Callable[[Command], Comma
         "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db.",
         **shown,
     )
-    return lambda command: option(reading_options(command))
+    return gathered("source", DataChoice, {"data": option} | DATA)  # type: ignore[no-any-return]
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
@@ -297,10 +372,6 @@ def must_have_mujoco() -> None:
         raise SettingError('Expected MuJoCo for the simulated cell, it is not installed: pip install "dengine[sim]".')
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
-force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
-
-
 @dataclass(frozen=True)
 class OutFolder:
     """Where a verb's CSV and pictures go. force : whether they replace the files that are there."""
@@ -315,20 +386,22 @@ class OutFolder:
         return [*files, write_manifest(self.path, files, self.force)]
 
 
-def out_option(command: Command) -> Command:
-    """`--out` and `--force`, handed on as one `OutFolder`, `out`; None where no folder was named."""
-
-    @wraps(command)
-    def placed(out: Path | None, force: bool, **others: Any) -> Any:
-        return command(out=None if out is None else OutFolder(out, force), **others)
-
-    folder = click.Path(file_okay=False, path_type=Path)
-    option = click.option("--out", type=folder, help="Folder for the CSV and the pictures; made if need be.")
-    return option(force_option(placed))
-
-
-out_file_option = click.option(
-    "--out", type=click.Path(dir_okay=False, path_type=Path), help="A picture, .png, .pdf or .svg, drawn into this file."
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
+force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
+out_option = gathered(
+    "out",
+    lambda out, force: None if out is None else OutFolder(out, force),
+    {
+        "out": click.option("--out", type=FOLDER, help="Folder for the CSV and the pictures; made if need be."),
+        "force": force_option,
+    },
+)
+out_file_option = click.option("--out", type=FILE, help="A picture, .png, .pdf or .svg, drawn into this file.")
+keep_option = click.option(
+    "--keep",
+    type=FOLDER,
+    metavar="FOLDER",
+    help="Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once.",
 )
 seed_option = click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="An integer; the same seed, the same run."

@@ -1,7 +1,4 @@
-"""Ctrl-C: what was done so far is kept, and the verb says what that is.
-
-What a verb shows: one JSON document, or tables on stdout and a progress bar on stderr.
-"""
+"""What a verb shows: one JSON document, or lines and tables on stdout, a progress bar on stderr; and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -21,24 +18,26 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from ..errors import DengineError, without_password
-from ..records import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from ..datasets.importing import ImportReport
     from ..decision.certificate import Certificate
 
 WIDE = 80  # columns where no terminal says otherwise; every table fits them
+INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
+Asked = Callable[[], bool]
 
 
 def show(*parts: Any) -> None:
     """Print tables and lines to stdout; lines are broken between words, a long path never, and passwords are masked."""
     out = console()
     for part in parts:
-        text = without_password(part) if isinstance(part, str) else ""
-        lines = fill(text, out.width, break_long_words=False, break_on_hyphens=False) if isinstance(part, str) else part
-        out.print(lines, highlight=False, markup=False, soft_wrap=isinstance(part, str))
+        if isinstance(part, str):
+            part = fill(without_password(part), out.width, break_long_words=False, break_on_hyphens=False)
+        out.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
 def console() -> Console:
@@ -48,8 +47,45 @@ def console() -> Console:
     return Console() if sys.stdout.isatty() else Console(width=WIDE)
 
 
+def facts(title: str, rows: Iterable[tuple[str, ...]], columns: Sequence[str] = ("", "")) -> Table:
+    """A table of named facts, a row each: its name, and its values under `columns`; passwords are masked."""
+    from rich.table import Table
+
+    table = Table(title=without_password(title), show_header=any(columns), title_justify="left")
+    for i, name in enumerate(columns):
+        table.add_column(name, style="" if i else "bold", no_wrap=not i, overflow="fold")
+    for row in rows:
+        table.add_row(*map(without_password, row))
+    return table
+
+
+def figures(
+    title: str, rows: Sequence[Mapping[str, str]], caption: str = "", words: Sequence[str] = (), total: bool = False
+) -> Table:
+    """A table of numbers, to the right, under the rows' names; words : columns that hold words, and give way.
+
+    total : whether a line sets the last row apart.
+    """
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
+    look |= {"caption": f"\n{caption}\n"} if caption else {}
+    table = Table(title=f"\n{without_password(title)}\n", pad_edge=False, show_edge=False, **look)
+    for name in rows[0]:
+        text = name in words
+        table.add_column(name, justify="left" if text else "right", no_wrap=not text, overflow="fold")
+    for i, row in enumerate(rows):
+        if total and i == len(rows) - 1:
+            table.add_section()
+        table.add_row(*row.values())
+    return table
+
+
 def write_json(result: Mapping[str, Any]) -> None:
     """Print one JSON document; NaN, which JSON has not, becomes null."""
+    from ..records import plain
+
     click.echo(json.dumps(plain(result), indent=2, allow_nan=False))
 
 
@@ -62,9 +98,9 @@ def duration(seconds: float) -> str:
     return f"{seconds:.1f} s" if seconds < 99.95 else f"{seconds:.0f} s"
 
 
-def when(seconds: float | None) -> str:
+def when(seconds: float | None, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
     """A moment, in UTC; seconds since 1970."""
-    return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime(form)
 
 
 def size(n_bytes: float) -> str:
@@ -111,48 +147,18 @@ def certificate_record(certificate: Certificate) -> dict[str, Any]:
 
 
 @contextmanager
-def progress(label: str, total: int, quiet: bool, left: Callable[[], str] | None = None) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that goes when done; the function it gives advances it by so many.
-
-    left : what it says of the time to come, where its own guess, by its speed so far, would be wrong.
-    """
+def progress(label: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr that goes when done; the function it gives advances it by so many."""
     if quiet:
         yield lambda step: None
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    class Said(ProgressColumn):
-        """What `left` says."""
-
-        def render(self, task: Task) -> Text:
-            return Text("" if left is None else left())
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn() if left is None else Said(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda step: bar.advance(task, step)
-
-
-INTERRUPTED = 130  # as shells have it: 128 + SIGINT
-
-Asked = Callable[[], bool]
 
 
 class EndAskedError(Exception):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import click
 
-from ..errors import CellError
+from ..errors import CellError, SettingError, percent
 from .options import (
     DataChoice,
     OutFolder,
@@ -29,6 +30,7 @@ from .output import (
     EndAskedError,
     certificate_record,
     end_interrupted,
+    figures,
     interruptible,
     progress,
     refusals_last,
@@ -102,46 +104,30 @@ def run(
         cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes, failure = _drive(engine, cell, cycles, name, as_json)
-        told = Told(changes, engine.safe_mode, engine.certificate())
+        said = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
+        certificate = engine.certificate()
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
-        _report(log, told, cell, kind, title, cycles, out, as_json)
+        said |= {"title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
+        _report(log, said, certificate, cell, out, as_json)
+    left = cycles - len(log)
+    kept = f"Everything up to cycle {len(log)} is in {store}; the same command with --cycles {left} goes on there."
+    if store is None:
+        kept = "Nothing was stored: --store FILE keeps a run, and goes on with it."
     if failure is not None:
-        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {_kept(len(log), cycles, store)}") from failure
-    if len(log) < cycles:
-        _say_interrupted(len(log), cycles, store)
-
-
-@dataclass(frozen=True)
-class ModeChange:
-    """The safe mode began after this cycle, counted from 1, for a reason; or ended, for none."""
-
-    cycle: int
-    reason: str
-
-    @property
-    def line(self) -> str:
-        """For people."""
-        what = f"safe mode, every part is verified: {self.reason}" if self.reason else "safe mode ended"
-        return f"After cycle {self.cycle}: {what}."
-
-
-@dataclass(frozen=True)
-class Told:
-    """What the engine said of itself: the safe mode's changes, why it is on in the end, and the certificate."""
-
-    changes: list[ModeChange]
-    safe_mode: str
-    certificate: Certificate
+        raise CellError(f"{failure} {len(log)} of {cycles} cycles were done. {kept}") from failure
+    if left:
+        shown = "the table shows those" if len(log) else "there is nothing to show"
+        end_interrupted(f"Interrupted: {len(log)} of {cycles} cycles were done; {shown}.", kept)
 
 
 def _drive(
     engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
-) -> tuple[Replay, list[ModeChange], CellError | None]:
-    """What was done, and what ended it, where the cell failed: what was done before that is shown first."""
+) -> tuple[Replay, list[dict[str, Any]], CellError | None]:
+    """What was done, when the safe mode began or ended, and what ended the run, where the cell failed."""
     from ..experiments.replay import RunRecorder
 
-    recorder, changes, mode = RunRecorder(cell), list[ModeChange](), engine.safe_mode
+    recorder, changes, mode = RunRecorder(cell), list[dict[str, Any]](), engine.safe_mode
     with interruptible() as asked, progress(name, cycles, quiet) as advance:
 
         def count(cycle: Cycle) -> None:
@@ -149,9 +135,9 @@ def _drive(
             advance(1)
             if cycle.safe_mode != mode:
                 mode = cycle.safe_mode
-                changes.append(ModeChange(cycle.index + 1, mode))
+                changes.append({"cycle": cycle.index + 1, "reason": mode})
                 if not quiet:
-                    click.echo(changes[-1].line, err=True)
+                    click.echo(_mode_line(changes[-1]), err=True)
             if asked():  # between two cycles: no part is left half dealt with
                 raise EndAskedError
 
@@ -164,15 +150,10 @@ def _drive(
     return recorder.log(), changes, None
 
 
-def _say_interrupted(done: int, cycles: int, store: str | None) -> None:
-    shown = "the table shows those" if done else "there is nothing to show"
-    end_interrupted(f"Interrupted: {done} of {cycles} cycles were done; {shown}.", _kept(done, cycles, store))
-
-
-def _kept(done: int, cycles: int, store: str | None) -> str:
-    if store is None:
-        return "Nothing was stored: --store FILE keeps a run, and goes on with it."
-    return f"Everything up to cycle {done} is in {store}; the same command with --cycles {cycles - done} goes on there."
+def _mode_line(change: Mapping[str, Any]) -> str:
+    """After which cycle the safe mode began, for a reason; or ended, for none."""
+    what = f"safe mode, every part is verified: {change['reason']}" if change["reason"] else "safe mode ended"
+    return f"After cycle {change['cycle']}: {what}."
 
 
 def _simulated(
@@ -183,7 +164,7 @@ def _simulated(
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]
-    if is_shared(store):  # sisters have one seed, and parts of their own all the same
+    if is_shared(store):  # peers have one seed, and parts of their own all the same
         seed += crc32(store.cell_id.encode())
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
@@ -194,7 +175,6 @@ def _recorded(
     import numpy as np
 
     from ..cells.replay import ReplayCell
-    from ..errors import SettingError
     from ..folds import content_hash
     from ..store.base import is_shared
 
@@ -223,7 +203,7 @@ CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
 
 
 def _report(
-    log: Replay, told: Told, cell: Cell, kind: str, title: str, cycles: int, out: OutFolder | None, as_json: bool
+    log: Replay, said: dict[str, Any], certificate: Certificate, cell: Cell, out: OutFolder | None, as_json: bool
 ) -> None:
     from ..experiments.tables import retrain_line
 
@@ -231,20 +211,18 @@ def _report(
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
     with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: out.listed(_save(log, title, out)))
+        files = [] if out is None else attempt(lambda: out.listed(_save(log, said["title"], out)))
         if as_json:
-            about = {"verb": "run", "title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
-            counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording}
-            said: dict[str, Any] = {"safe_mode": told.safe_mode, "safe_mode_changes": told.changes}
-            said |= {"certificate": certificate_record(told.certificate)}
-            write_json(about | counts | said | {"retrains": log.retrains, "retrain_max_s": worst, "files": files})
+            counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording, "files": files}
+            retrains = {"retrains": log.retrains, "retrain_max_s": worst}
+            write_json({"verb": "run"} | said | counts | retrains | {"certificate": certificate_record(certificate)})
             return
-        show(_table([*stretches, total], title, clock is not None))
-        if clock is not None:
-            show(_clock_line(clock))
-        if recording is not None:
-            show(recording_line(recording))
-        show(retrain_line(log.retrains), *(change.line for change in told.changes), told.certificate.sentence)
+        timed = clock is not None
+        rows = [_cells(row, timed) for row in (*stretches, total)]
+        caption = CAPTION + (" good/h: good parts passed on an hour." if timed else "")
+        show(figures(said["title"], rows, caption, total=True))
+        show(*([] if clock is None else [_clock_line(clock)]), *([] if recording is None else [recording_line(recording)]))
+        show(retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), certificate.sentence)
         show(*(f"Wrote {path}" for path in files))
 
 
@@ -260,38 +238,19 @@ def _clock_line(clock: dict[str, Any]) -> str:
 
 
 CAPTION = (
-    "\nFP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
+    "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
     "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
     "cycles of safe mode."
 )
 
 
-def _table(rows: list[dict[str, Any]], title: str, timed: bool) -> Any:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
-    caption = CAPTION + (" good/h: good parts passed on an hour.\n" if timed else "\n")
-    table = Table(title=f"\n{title}\n", caption=caption, pad_edge=False, show_edge=False, **look)
-    names = ("cycles", "verified", "accepted", "FP", "stops", "rejected", "FN", "novel", "safe")
-    for name in (*names, *(["good/h"] if timed else [])):
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in rows[:-1]:
-        table.add_row(*_cells(row, timed))
-    table.add_section()
-    table.add_row(*_cells(rows[-1], timed))
-    return table
-
-
-def _cells(row: dict[str, Any], timed: bool) -> list[str]:
-    names = ("accepted", "false_positive", "stops", "rejected", "false_negative", "novel", "safe_mode")
+def _cells(row: dict[str, Any], timed: bool) -> dict[str, str]:
+    names = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
+    names |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
+    cells = {"cycles": f"{row['first_cycle']} to {row['last_cycle']}", "verified": percent(row["verified_share"], ".0f")}
+    cells |= {title: str(row[name]) for title, name in names.items()}
     rate = row["parts_per_hour"]
-    return [
-        f"{row['first_cycle']} to {row['last_cycle']}",
-        f"{100 * row['verified_share']:.0f} %",
-        *(str(row[name]) for name in names),
-        *(["-" if rate is None else f"{rate:.1f}"] if timed else []),
-    ]
+    return cells | ({"good/h": "-" if rate is None else f"{rate:.1f}"} if timed else {})
 
 
 def _save(log: Replay, title: str, out: OutFolder) -> list[Path]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import SettingError
-from .options import RecipeChoice, cell_options, example, recipe_options
+from .options import FILE, RecipeChoice, cell_options, example, recipe_options
 from .robot import host_and_port
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
-FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 @click.command(epilog=example("dengine serve --store cell.db --port 8000"))

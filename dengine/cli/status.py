@@ -1,205 +1,27 @@
-"""`dengine status`: what a store holds, and what can be said of the parts that went on without a check.
-
-How an engine is doing, as `dengine status` shows it: a table of two spans, JSON, a picture.
-
-The same screen again and again, until Ctrl-C.
-
-`dengine cells`: who shares a database.
-"""
+"""`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
-from datetime import UTC, datetime
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import without_password
+from ..errors import percent
 from .options import cell_options, example, force_option, json_option, out_file_option
-from .output import Asked, certificate_record, console, duration, interruptible, show, when, write_json
+from .output import certificate_record, duration, facts, interruptible, show, when, write_json
 
 if TYPE_CHECKING:
-    from ..decision.certificate import Certificate
     from ..history.status import Judged, Span, Status
     from ..recipe import Recipe
-    from ..records import RetrainReport
-    from ..store.base import Event, Evidence, Store
     from ..store.peers import CellSummary
 
-WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-
-
-def doing_record(doing: Status) -> dict[str, Any]:
-    """As JSON has it."""
-    spans = {"newest": asdict(doing.newest), "ever": asdict(doing.ever)}
-    detectors = None if doing.watch is None else asdict(doing.watch)
-    return {
-        "doing": spans | {"last": doing.last, "alpha": doing.recipe.policy.alpha, "watch": detectors},
-        "waiting": {
-            "new_labels": doing.new_labels,
-            "retrain_every": doing.recipe.retrain_every,
-            "verified": doing.ever.unlabelled,
-            "accepted": doing.unreported,
-        },
-    }
-
-
-def doing_table(doing: Status, store: str) -> Any:
-    """A column each for the newest decisions and for all, and what is on its way."""
-    from rich.table import Table
-
-    newest, ever, alpha = doing.newest, doing.ever, doing.recipe.policy.alpha
-    table = Table(title=f"{without_password(store)}: how it is doing", title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(f"last {newest.decisions:,}", overflow="fold")
-    table.add_column("since birth", overflow="fold")
-    for row in zip(_rows(newest, alpha), _rows(ever, alpha), strict=True):
-        (name, new), (_, old) = row
-        table.add_row(name, new, old)
-    table.add_section()
-    for name, text in _whole(doing):
-        table.add_row(name, text, "")
-    return table
-
-
-def _rows(span: Span, alpha: float) -> Iterator[tuple[str, str]]:
-    yield "from", when(span.first)
-    yield "verified", _of(span.verified, span)
-    yield "accepted", _of(span.accepted, span)
-    yield "of them bad", _bad(span, alpha) if span.accepted else "none was accepted"
-    yield "rejected", _of(span.rejected, span)
-    yield "audits", _of(span.audits, span)
-    yield "would accept", _would(span.would_accept, "bad")
-    yield "would reject", _would(span.would_reject, "good")
-    yield "novel", _of(span.novel, span)
-    yield "safe mode", _of(span.safe_mode, span)
-    yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
-    dropped = sum(span.dropped.values())
-    yield "retrains", f"{span.retrains:,}, {dropped:,} dropped"
-    yield "dropped for", "\n".join(f"{n}: {reason.removeprefix('dropped: ')}" for reason, n in span.dropped.items()) or "-"
-
-
-def _of(some: int, span: Span) -> str:
-    return f"{some:,}" + (f" ({100 * some / span.decisions:.1f} %)" if span.decisions else "")
-
-
-def _bad(span: Span, alpha: float) -> str:
-    """Known bad accepts, with what they say of all."""
-    bad = span.bad_accepts
-    if not bad.by:
-        return f"{span.stops:,} known; of the others nothing is"
-    lead = f"{bad.wrong:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
-    stops = f", beside {span.stops:,} stops" if bad.by == "audits" and span.stops else ""
-    between = f"{100 * bad.lower:.1f} to {100 * bad.upper:.1f} % at alpha {alpha:g}"
-    return f"{lead}{stops}: {between}, {WORDS[bad.verdict]} {100 * bad.tolerance:g} %"
-
-
-def _would(said: Judged, wrong: str) -> str:
-    """What checks said of parts that the model was certain of."""
-    if not said.n:
-        return "none was checked"
-    between = f"{100 * said.lower:.1f} to {100 * said.upper:.1f} % at 95 %"
-    held = f"{WORDS[said.verdict]} {100 * said.tolerance:g} %"
-    return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {between}, {held}"
-
-
-def _whole(doing: Status) -> Iterator[tuple[str, str]]:
-    """What is of now, and of no span."""
-    yield "labels waiting", f"{doing.new_labels:,} new, a retrain is due at {doing.recipe.retrain_every:,}"
-    yield "never reported", f"{doing.ever.unlabelled:,} verified, {doing.unreported:,} accepted"
-    if doing.watch is not None:
-        of = (("accepts", doing.watch.accepts), ("rejects", doing.watch.rejects), ("novelty", doing.watch.novelty))
-        yield "way to an alarm", ", ".join(f"{name} {100 * share:.0f} %" for name, share in of)
-
-
-def drawn(store: Store, recipe: Recipe, last: int, out: Path) -> Path:
-    """Draw the picture of a store into a file."""
-    from ..experiments.figures import save
-    from ..experiments.pictures import status_picture
-    from ..history.status import course
-
-    return save(status_picture(course(store, recipe, last), f"{store.cell_id}: {recipe.name}"), out, force=True)
-
-
 STEP = 0.05  # seconds between two looks for Ctrl-C
-
-
-def redraw(read: Callable[[], Sequence[Any]], seconds: float) -> None:
-    """Show what `read` gives, and again every so many seconds; Ctrl-C is how it ends, so that is no failure.
-
-    On a terminal the screen is drawn anew; elsewhere each look follows the one before.
-    """
-    with interruptible() as asked:
-        if not sys.stdout.isatty():
-            while not asked():
-                show(*read())
-                _wait(seconds, asked)
-            return
-        from rich.console import Group
-        from rich.live import Live
-
-        with Live(Group(*read()), console=console(), screen=True, auto_refresh=False) as live:
-            while not asked():
-                live.update(Group(*read()), refresh=True)
-                _wait(seconds, asked)
-    show(*read())  # the last look stays when the screen is given back
-
-
-def _wait(seconds: float, asked: Asked) -> None:
-    end = time.monotonic() + seconds
-    while not asked() and (left := end - time.monotonic()) > 0:
-        time.sleep(min(STEP, left))
-
-
-@click.command(epilog=example("dengine cells engine.db"))
-@click.argument("store", metavar="STORE")
-@json_option
-def cells(store: str, as_json: bool) -> None:
-    """List the cells of a store, and what each has done.
-
-    STORE is a file or URL, as given to `dengine train` or `dengine run`. Cells of one product share labels and versions;
-    a cell without a product shares nothing. Other verbs name one of them by --cell.
-    """
-    from ..store.base import must_be_there
-    from ..store.peers import list_cells
-
-    must_be_there(store)
-    found, name = list_cells(store), without_password(store)
-    if as_json:
-        write_json({"verb": "cells", "store": name, "cells": found})
-        return
-    show(_table(name, found))
-
-
-def _table(store: str, found: list[CellSummary]) -> Any:
-    from rich.table import Table
-
-    table = Table(title=store, title_justify="left")
-    for name in ("cell", "product"):
-        table.add_column(name, overflow="fold")
-    for name in ("decisions", "labels", "version"):
-        table.add_column(name, justify="right")
-    table.add_column("last seen (UTC)", no_wrap=True)
-    owned = any(cell.owner for cell in found)
-    if owned:
-        table.add_column("owner", overflow="fold")
-    for cell in found:
-        counts = (f"{cell.decisions:,}", f"{cell.labels:,}", "-" if cell.version is None else str(cell.version))
-        owner = [cell.owner or "-"] if owned else []
-        table.add_row(cell.cell_id, cell.product or "-", *counts, _when(cell.last_seen), *owner)
-    return table
-
-
-def _when(seconds: float | None) -> str:
-    return "-" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
-
-
-RECENT = 200  # labels
+Rows = Iterator[tuple[str, str]]
+WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 GUARANTEES = {
     "local": "local: of the ball around each part, at one look",
     "pooled": "pooled: of all accepted parts together, however often one looks",
@@ -231,7 +53,8 @@ SHADOW = "all of what it is certain of: the shadow mode, in which it only says w
 def status(store: str, last: int, watch: float | None, out: Path | None, force: bool, as_json: bool) -> None:
     """Say how an engine is doing, and what its store holds.
 
-    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. The interval of bad
+    STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. Where it holds
+    several cells and none is named, they are listed; cells of one product share labels and versions. The interval of bad
     accepted parts is of one look; what is certified holds however often one looks.
     """
     if watch is not None and as_json:
@@ -240,171 +63,161 @@ def status(store: str, last: int, watch: float | None, out: Path | None, force: 
         from ..files import check_output
 
         check_output(out, force)
-    if watch is not None:
-        redraw(lambda: _screen(store, last, out), watch)
+    if cells := _several(store):
+        if as_json:
+            write_json({"verb": "status", "store": store, "cells": cells})
+            return
+        show(_cells_table(store, cells), "Name one of them, --cell NAME, and how it is doing is shown.")
         return
-    held = _read(store, last, out)
+    found = _read(store, last, out)
     if as_json:
         files = [] if out is None else [out]
-        write_json({"verb": "status", "store": store} | _record(held) | doing_record(held.doing) | {"files": files})
+        from ..records import plain
+
+        said = plain(found) | {"certificate": certificate_record(found.certificate)}
+        write_json({"verb": "status", "store": store} | said | {"files": files})
         return
-    show(*_tables(store, held), *([] if out is None else [f"Wrote {out}"]))
+    show(*_tables(store, found), *([] if out is None else [f"Wrote {out}"]))
+    if watch is not None:
+        _watch(store, last, out, watch)
 
 
-def _screen(store: str, last: int, out: Path | None) -> list[Any]:
-    return _tables(store, _read(store, last, out))
+def _watch(store: str, last: int, out: Path | None, seconds: float) -> None:
+    """Show it again and again; Ctrl-C is how it ends, so that is no failure."""
+    with interruptible() as asked:
+        while True:
+            end = time.monotonic() + seconds
+            while (left := end - time.monotonic()) > 0:
+                if asked():
+                    return
+                time.sleep(min(STEP, left))
+            tables = _tables(store, _read(store, last, out))
+            if sys.stdout.isatty():
+                click.clear()
+            show(*tables)
 
 
-def _tables(store: str, held: Held) -> list[Any]:
-    groups = (_settings_rows(held), _count_rows(held), _promise_rows(held), _retrain_rows(held.retrains), _event_rows(held))
-    return [doing_table(held.doing, store), _table_of_status("What it is", [row for rows in groups for row in rows])]
-
-
-@dataclass(frozen=True)
-class Held:
-    """What was read of a store.
-
-    counts : `Store.status`.  novel, recent : traces that were novel among those that the newest labels tell of, and how
-        many they tell of: verified, audited and accepted parts.  mode : the newest event of the safe mode, if any.
-    doing : over the newest decisions, and since its birth.
-    """
-
-    settings: dict[str, str]
-    recipe: Recipe
-    counts: dict[str, Any]
-    retrains: list[RetrainReport]
-    certificate: Certificate
-    novel: int
-    recent: int
-    mode: Event | None
-    doing: Status
-
-    @property
-    def shadow(self) -> bool:
-        """Whether every part is verified, by the user's will."""
-        return self.recipe.policy.audit_rate == 1.0
-
-    @property
-    def safe_mode(self) -> str:
-        """Why everything is verified; "" where it is not."""
-        return self.doing.safe_mode
-
-
-def _read(store: str, last: int, out: Path | None) -> Held:
-    from ..errors import StoreError
+def _read(store: str, last: int, out: Path | None) -> Status:
+    """The status, and its picture where one is asked for."""
+    from ..history.status import course
+    from ..history.status import status as status_of
     from ..store.base import open_store
 
     opened = open_store(store, must_exist=True)
     try:
-        settings = opened.settings()
-        if "recipe" not in settings:
-            raise StoreError(f"Expected a store that an engine has used, {store} is empty.")
-        held = _held(opened, settings, last)
+        found = status_of(opened, last, watching=True)
         if out is not None:
-            drawn(opened, held.recipe, last, out)
-        return held
+            from ..experiments.figures import save
+            from ..experiments.pictures import status_picture
+
+            title = f"{found.cell}: {found.recipe.name}"
+            save(status_picture(course(opened, found.recipe, last), title), out, force=True)
+        return found
     finally:
         opened.close()
 
 
-def _held(store: Store, settings: dict[str, str], last: int) -> Held:
-    from ..history.status import safe_mode_event
-    from ..history.status import status as status_of
-    from ..recipe import Recipe
+def _several(store: str) -> list[CellSummary]:
+    """The cells of a database that holds others than the one that is meant where none is named; else none."""
+    from ..store.base import must_be_there
+    from ..store.peers import CellAddress, list_cells
 
-    recipe, counts = Recipe.from_toml(settings["recipe"]), store.status()
-    newest = _newest(store, counts["labels"])
-    return Held(
-        settings=settings,
-        recipe=recipe,
-        counts=counts,
-        retrains=store.retrains(),
-        certificate=recipe.policy.certificate(store.outcomes(int(settings.get("policy_since", 0)))),
-        novel=int(newest.novel.sum()),
-        recent=len(newest.seq) + int(newest.silent.sum()),
-        mode=safe_mode_event(store),
-        doing=status_of(store, last, watching=True),
-    )
+    if isinstance(store, CellAddress):
+        return []
+    must_be_there(store)
+    found = list_cells(store)
+    return found if len(found) > 1 or found[0].cell_id != "cell" else []
 
 
-def _newest(store: Store, labels: int) -> Evidence:
-    """What became of the decisions with the newest labels, RECENT at most."""
-    from ..store.base import is_shared
-    from ..store.records import Evidence
-
-    known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
-    return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
-
-
-def _record(held: Held) -> dict[str, Any]:
-    """As JSON has it."""
-    counts, policy = held.counts, held.recipe.policy
-    novel = {"decisions": counts["reasons"]["novel"], "share": _share(counts["reasons"]["novel"], counts["decisions"])}
-    novel |= {"recent": held.novel, "recent_decisions": held.recent, "recent_share": _share(held.novel, held.recent)}
-    mode = {"on": held.safe_mode != "", "reason": held.safe_mode, "since": held.mode.time if held.mode else None}
-    worst = max((r.seconds for r in held.retrains), default=None)
-    return counts | {
-        "guarantee": policy.guarantee,
-        "stops": policy.stops,
-        "certificate": certificate_record(held.certificate),
-        "novel": novel,
-        "safe_mode": mode,
-        "shadow": held.shadow,
-        "settings": held.settings,
-        "worst_retrain_s": worst,
-        "all": [asdict(r) for r in held.retrains],
-    }
+def _cells_table(store: str, found: list[CellSummary]) -> Any:
+    owned = any(cell.owner for cell in found)
+    columns = ("cell", "product", "decisions", "labels", "version", "last seen (UTC)", *(["owner"] if owned else []))
+    rows = []
+    for cell in found:
+        counts = (f"{cell.decisions:,}", f"{cell.labels:,}", "-" if cell.version is None else str(cell.version))
+        seen = when(cell.last_seen, "%Y-%m-%d %H:%M:%S")
+        rows.append((cell.cell_id, cell.product or "-", *counts, seen, *([cell.owner or "-"] if owned else [])))
+    return facts(store, rows, columns)
 
 
-def _share(some: int, of: int) -> float | None:
-    return some / of if of else None
+def _tables(store: str, found: Status) -> list[Any]:
+    """A column each for the newest decisions and for all; and what is of now."""
+    alpha = found.recipe.policy.alpha
+    spans = zip(_span_rows(found.newest, alpha), _span_rows(found.ever, alpha), strict=True)
+    columns = ("", f"last {found.newest.decisions:,}", "since birth")
+    doing = facts(f"{store}: how it is doing", [(name, new, old) for (name, new), (_, old) in spans], columns)
+    now = [*_settings_rows(found), *_count_rows(found), *_promise_rows(found), *_retrain_rows(found)]
+    now += [("newest events", f"{when(each.time)} {each.kind}: {each.text}") for each in reversed(found.events)]
+    return [doing, facts("What it is", now)]
 
 
-def _table_of_status(store: str, rows: list[tuple[str, str]]) -> Any:
-    from rich.table import Table
-
-    table = Table(title=without_password(store), show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for row in rows:
-        table.add_row(*map(without_password, row))
-    return table
-
-
-def _settings_rows(held: Held) -> Iterator[tuple[str, str]]:
-    settings, recipe, seed = held.settings, held.recipe, held.settings.get("seed", "0")
-    # Of a model that was handed in, reducer and numbers of the recipe have no effect: to show them would be a lie.
-    handed_in = settings.get("model")
-    yield from _own_rows(recipe, seed) if handed_in is None else [("model", f"{handed_in}, decides by its own rule")]
-    yield "stops known", STOPS[recipe.policy.stops]
-    yield "audits", SHADOW if held.shadow else f"{100 * recipe.policy.audit_rate:g} % of what it is certain of"
-    yield (
-        "retrain",
-        (f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}, on the newest {recipe.window:,}"),
-    )
-    yield "trace", _contract(settings)
+def _span_rows(span: Span, alpha: float) -> Rows:
+    yield "from", when(span.first)
+    yield "verified", _of(span.verified, span.decisions)
+    yield "accepted", _of(span.accepted, span.decisions)
+    yield "of them bad", _bad(span, alpha) if span.accepted else "none was accepted"
+    yield "rejected", _of(span.rejected, span.decisions)
+    yield "audits", _of(span.audits, span.decisions)
+    yield "would accept", _would(span.would_accept, "bad")
+    yield "would reject", _would(span.would_reject, "good")
+    yield "novel", _of(span.novel, span.decisions)
+    yield "safe mode", _of(span.safe_mode, span.decisions)
+    yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
+    yield "retrains", f"{span.retrains:,}, {sum(span.dropped.values()):,} dropped"
+    yield "dropped for", "\n".join(f"{n}: {reason.removeprefix('dropped: ')}" for reason, n in span.dropped.items()) or "-"
 
 
-def _own_rows(recipe: Recipe, seed: str) -> Iterator[tuple[str, str]]:
-    policy = recipe.policy
-    yield "reducer", f"{recipe.name}, seed {seed}"
-    yield "policy", f"alpha {policy.alpha:g}, LB {100 * policy.lower_bound:g} %, {policy.interval} interval"
-    yield "guarantee", GUARANTEES.get(policy.guarantee, policy.guarantee)
-    yield "neighbours", _neighbours(recipe)
-    yield "novelty", "off" if not recipe.novelty else f"verified beyond {recipe.novelty:g} times the usual distance"
+def _of(some: int, of: int) -> str:
+    return f"{some:,}" + (f" ({percent(some / of)})" if of else "")
+
+
+def _bad(span: Span, alpha: float) -> str:
+    """Known bad accepts, with what they say of all."""
+    bad = span.bad_accepts
+    if not bad.by:
+        return f"{span.stops:,} known; of the others nothing is"
+    lead = f"{bad.wrong:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
+    stops = f", beside {span.stops:,} stops" if bad.by == "audits" and span.stops else ""
+    return f"{lead}{stops}: {_held(bad, f'alpha {alpha:g}')}"
+
+
+def _would(said: Judged, wrong: str) -> str:
+    """What checks said of parts that the model was certain of."""
+    return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {_held(said, '95 %')}" if said.n else "none was checked"
+
+
+def _held(said: Judged, level: str) -> str:
+    """An interval, held against what is tolerated."""
+    between = f"{100 * said.lower:.1f} to {percent(said.upper)} at {level}"
+    return f"{between}, {WORDS[said.verdict]} {percent(said.tolerance, 'g')}"
+
+
+def _settings_rows(found: Status) -> Rows:
+    recipe, policy = found.recipe, found.recipe.policy
+    if found.model is not None:  # reducer and numbers of the recipe have no effect: to show them would be a lie
+        yield "model", f"{found.model}, decides by its own rule"
+    else:
+        yield "reducer", f"{recipe.name}, seed {found.settings.get('seed', '0')}"
+        yield "policy", f"alpha {policy.alpha:g}, LB {percent(policy.lower_bound, 'g')}, {policy.interval} interval"
+        yield "guarantee", GUARANTEES.get(policy.guarantee, policy.guarantee)
+        yield "neighbours", _neighbours(recipe)
+        yield "novelty", f"verified beyond {recipe.novelty:g} times the usual distance" if recipe.novelty else "off"
+    yield "stops known", STOPS[policy.stops]
+    yield "audits", SHADOW if found.shadow else f"{percent(policy.audit_rate, 'g')} of what it is certain of"
+    schedule = f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}"
+    yield "retrain", f"{schedule}, on the newest {recipe.window:,}"
+    yield "trace", _contract(found)
 
 
 def _neighbours(recipe: Recipe) -> str:
     if recipe.fraction is None:
         return f"within a radius of {recipe.radius:g}, in the unit of the scaled embedding"
-    judged = "" if recipe.reject_fraction is None else f"; a rejection is judged by {100 * recipe.reject_fraction:g} %"
-    return f"the nearest {100 * recipe.fraction:g} % of the references{judged}"
+    judged = "" if recipe.reject_fraction is None else f"; a rejection is judged by {percent(recipe.reject_fraction, 'g')}"
+    return f"the nearest {percent(recipe.fraction, 'g')} of the references{judged}"
 
 
-def _contract(settings: dict[str, str]) -> str:
-    from ..records import trace_in
-
-    spec = trace_in(settings)
+def _contract(found: Status) -> str:
+    spec = found.trace
     if spec is None:
         return "none yet: the first trace sets it"
     channels = "" if spec.channels == 1 else f"{spec.channels} channels of "
@@ -413,59 +226,50 @@ def _contract(settings: dict[str, str]) -> str:
     return f"{channels}{spec.samples} samples at {spec.rate_hz:g} Hz ({seconds}), in {spec.unit}{limit}"
 
 
-def _count_rows(held: Held) -> Iterator[tuple[str, str]]:
-    counts = held.counts
-    yield "cell", counts["cell_id"]
-    if "product" in counts:
-        yield "product", f"{counts['product']}: labels and versions are shared with its other cells"
-    yield "decisions", f"{counts['decisions']}: {_listed(counts['actions'])}"
-    yield "reasons", _listed(counts["reasons"])
-    yield "quarantined", str(counts["quarantined"])
-    yield "labels", f"{counts['labels']}: {_listed(counts['sources'])}"
-    if counts["corrected"] or counts["forgotten"]:
-        yield "put right", f"{counts['corrected']} labels corrected, {counts['forgotten']} more forgotten"
-    yield "first, last", " to ".join(when(counts[key]) for key in ("first_time", "last_time"))
-    if counts["write_failures"]:
-        yield "write failures", str(counts["write_failures"])
+def _count_rows(found: Status) -> Rows:
+    yield "cell", found.cell
+    if found.product is not None:
+        yield "product", f"{found.product}: labels and versions are shared with its other cells"
+    yield "decisions", f"{found.ever.decisions}: {_listed(found.actions)}"
+    yield "reasons", _listed(found.reasons)
+    yield "quarantined", str(found.ever.quarantined)
+    yield "labels", f"{found.labels}: {_listed(found.sources)}"
+    yield "labels waiting", f"{found.new_labels:,} new, a retrain is due at {found.recipe.retrain_every:,}"
+    yield "never reported", f"{found.ever.unlabelled:,} verified, {found.unreported:,} accepted"
+    if found.corrected or found.forgotten:
+        yield "put right", f"{found.corrected} labels corrected, {found.forgotten} more forgotten"
+    yield "first, last", f"{when(found.ever.first)} to {when(found.ever.last)}"
+    if found.write_failures:
+        yield "write failures", str(found.write_failures)
 
 
-def _promise_rows(held: Held) -> Iterator[tuple[str, str]]:
-    novel, decisions = held.counts["reasons"]["novel"], held.counts["decisions"]
-    recent = f"; of the newest {held.recent:,} that labels tell of, {held.novel:,}{_percent(held.novel, held.recent)}"
-    yield "novel", f"{novel:,} of {decisions:,} decisions{_percent(novel, decisions)}{recent}"
-    yield "safe mode", _mode(held)
-    yield "accepted", f"{held.certificate.sentence} {held.certificate.advice}"
-    yield "rejected", held.certificate.sentence_on_rejects
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{n} {name}" for name, n in counts.items() if n) or "none"
 
 
-def _percent(some: int, of: int) -> str:
-    return f" ({100 * some / of:.1f} %)" if of else ""
+def _promise_rows(found: Status) -> Rows:
+    novel, decisions = found.ever.novel, found.ever.decisions
+    recent = f"of the newest {found.recent:,} that labels tell of, {_of(found.recent_novel, found.recent)}"
+    share = f" ({percent(novel / decisions)})" if decisions else ""
+    yield "novel", f"{novel:,} of {decisions:,} decisions{share}; {recent}"
+    since = when(found.safe_mode_time)
+    mode = f"on since {since}, every part is verified: {found.safe_mode}" if found.safe_mode else f"off, ended {since}"
+    yield "safe mode", "off" if found.safe_mode_time is None else mode
+    if (watch := found.watch) is not None:
+        way = (("accepts", watch.accepts), ("rejects", watch.rejects), ("novelty", watch.novelty))
+        yield "way to an alarm", ", ".join(f"{name} {percent(share, '.0f')}" for name, share in way)
+    yield "accepted", f"{found.certificate.sentence} {found.certificate.advice}"
+    yield "rejected", found.certificate.sentence_on_rejects
 
 
-def _mode(held: Held) -> str:
-    if held.mode is None:
-        return "off"
-    since = when(held.mode.time)
-    return f"on since {since}, every part is verified: {held.safe_mode}" if held.safe_mode else f"off, ended {since}"
-
-
-def _event_rows(held: Held) -> Iterator[tuple[str, str]]:
-    for i, event in enumerate(reversed(held.counts["events"])):
-        yield "newest events" if i == 0 else "", f"{when(event['time'])} {event['kind']}: {event['text']}"
-
-
-def _retrain_rows(retrains: list[RetrainReport]) -> Iterator[tuple[str, str]]:
-    dropped = [r for r in retrains if not r.accepted]
-    answering = max((r.version for r in retrains if r.accepted), default=None)
-    yield "version", "none yet: every part is verified" if answering is None else str(answering)
-    yield "retrains", f"{len(retrains)}, {len(dropped)} dropped"
+def _retrain_rows(found: Status) -> Rows:
+    reports = [each.report for each in found.retrains]
+    dropped = [each for each in reports if not each.accepted]
+    yield "version", str(found.version) if found.version else "none yet: every part is verified"
+    yield "retrains", f"{len(reports)}, {len(dropped)} dropped"
     if dropped:
         yield "last drop", dropped[-1].reason
-    if retrains:
-        last, worst = retrains[-1], max(retrains, key=lambda r: r.seconds)
+    if reports:
+        last, worst = reports[-1], max(reports, key=lambda each: each.seconds)
         yield "last retrain", f"{duration(last.seconds)} on {last.n_traces} traces, {last.n_steps} steps"
         yield "worst retrain", f"{duration(worst.seconds)}, to version {worst.version}"
-
-
-def _listed(counts: dict[str, int]) -> str:
-    return ", ".join(f"{n} {name}" for name, n in counts.items() if n) or "none"

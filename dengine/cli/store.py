@@ -1,25 +1,25 @@
-"""`dengine verify` and `dengine dump`: a store's history checked, and taken out for analysis."""
+"""`dengine verify` and `dengine import-labels`: a store's history checked, and a cell program's labels taken into it."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from .options import example, json_option
-from .output import progress, show, write_json
+from .options import cell_options, example, json_option
+from .output import imported_line, progress, show, write_json
 
 if TYPE_CHECKING:
     from ..store.verification import HistoryReport
 
 SHOWN = 20  # faults that a screen shows
-cell_option = click.option("--cell", metavar="ID", help="Of this cell alone.  [default: of all cells]")
 
 
 @click.command(epilog=example("dengine verify engine.db"))
 @click.argument("store", metavar="STORE")
-@cell_option
+@click.option("--cell", metavar="ID", help="Of this cell alone.  [default: of all cells]")
 @click.option(
     "--expect",
     metavar="DIGEST",
@@ -30,24 +30,19 @@ cell_option = click.option("--cell", metavar="ID", help="Of this cell alone.  [d
 def verify(context: click.Context, store: str, cell: str | None, expect: str | None, as_json: bool) -> None:
     """Check that a store's history is what was written.
 
-    Every row is held against its sum, and every entry of the ledger against
-    its rows; what was changed, is missing or was never chained is named, with
-    exit code 1. Nothing is written, and engines may go on meanwhile.
+    Every row is held against its sum, and every entry of the ledger against its rows; what was changed, is missing or was
+    never chained is named, with exit code 1. Nothing is written, and engines may go on meanwhile.
     """
     from ..store.verification import count_rows, verify_history
 
     with progress("rows", count_rows(store, cell), quiet=as_json) as advance:
         report = verify_history(store, cell, expect, advance)
     if as_json:
-        write_json({"verb": "verify", "store": store, "ok": report.ok} | _record(report))
+        write_json({"verb": "verify", "store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults})
     else:
         show(*_lines(report))
     if not report.ok:
         context.exit(1)
-
-
-def _record(report: HistoryReport) -> dict[str, Any]:
-    return {"cells": list(report.cells), "faults": list(report.faults)}
 
 
 def _lines(report: HistoryReport) -> list[str]:
@@ -65,29 +60,21 @@ def _lines(report: HistoryReport) -> list[str]:
     return [*lines, f"Faults: {len(report.faults)}. This history is not as it was written."]
 
 
-@click.command(epilog=example("dengine dump engine.db --out tables"))
-@click.argument("store", metavar="STORE")
-@cell_option
-@click.option(
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="The folder to write, new or of an earlier dump: a folder a cell, a Parquet file a table.",
-)
+@click.command("import-labels", epilog=example("dengine import-labels cell.csv --store engine.db"))
+@click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
+@click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
+@click.option("--any-model", is_flag=True, help="Take a journal of a model that the store does not know as its export.")
+@cell_options()
 @json_option
-def dump(store: str, cell: str | None, out: Path, as_json: bool) -> None:
-    """Write all that a store holds to Parquet files.
+def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> None:
+    """Take a cell program's labels back into the store.
 
-    Decisions come with their traces; labels, versions without their states,
-    events, settings and the ledger as they are. Nothing changes in the store,
-    and engines may go on meanwhile.
+    JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is imported.
     """
-    from ..store.dump import dump_store
-    from ..store.verification import count_rows
+    from ..export.cell_journal import import_journal
 
-    with progress("rows", count_rows(store, cell), quiet=as_json) as advance:
-        made = dump_store(store, out, cell, advance)
+    report = import_journal(store, journal, any_model=any_model)
     if as_json:
-        write_json({"verb": "dump", "store": store, "out": str(out), "rows": made.rows})
+        write_json({"verb": "import-labels", "store": store, "journal": journal} | asdict(report))
         return
-    show(f"Wrote {sum(made.rows.values()):,} rows to {out}, in {len(made.rows)} Parquet files.")
+    show(imported_line(report, store))

@@ -27,7 +27,7 @@ Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures ov
 import math
 from dataclasses import dataclass, replace
 
-from ..errors import SettingError
+from ..errors import SettingError, percent
 
 CONFIRMED_SHARE = 0.1  # of alpha, where audits and confirmations both speak: the former see less and need more
 RARE = 0.02  # the audit rate that is assumed where none is set
@@ -193,10 +193,10 @@ class Certificate:
         target = self.tolerance / 2.0 if self.kept else self.tolerance
         good, same = self.audits_needed(target), self.audits_needed(target, self.accepted.bad_rate)
         if self.accepted.upper <= target:
-            return f"Even {_percent(target)} is shown."
+            return f"Even {percent(target, '.6g')} is shown."
         if good is None:
-            return f"No number of {what} would show {_percent(target)}."
-        asked = f"To show {_percent(target)} takes about {good:,} more {what} if all are good"
+            return f"No number of {what} would show {percent(target, '.6g')}."
+        asked = f"To show {percent(target, '.6g')} takes about {good:,} more {what} if all are good"
         if self.accepted.n_bad == 0:
             return f"{asked}."
         return f"{asked}; at the present rate {'no number would do' if same is None else f'about {same:,}'}."
@@ -221,8 +221,8 @@ class Certificate:
         digits = 1 if bounded.upper >= 0.01 else 2 if bounded.upper >= 0.001 else 4
         upper = f"{math.ceil(bounded.upper * 10.0 ** (digits + 2)) / 10.0**digits:g} %"
         return (
-            f"Of {parts} {which}, at most {upper} were {wrong} on average, with {_percent(1.0 - self.alpha)} confidence, "
-            f"however often one looks; the tolerance is {_percent(self.tolerance)}."
+            f"Of {parts} {which}, at most {upper} were {wrong} on average, with {percent(1.0 - self.alpha, '.6g')} confidence, "
+            f"however often one looks; the tolerance is {percent(self.tolerance, '.6g')}."
         )
 
 
@@ -271,5 +271,278 @@ def _bounded(n: int, n_looked_at: int, n_bad: int, propensity: float, alpha: flo
     return Bounded(n, n_looked_at, n_bad, propensity, alpha, failure_bound(n, n_bad, alpha, propensity))
 
 
-def _percent(share: float) -> str:
+"What became of the parts that went on without a check: an upper bound on how many were bad, however often one looks.
+
+    >>> failure_bound(1203, 24, alpha=0.05)     # 1,203 parts, 24 of them bad: 2 % were seen, 3.5 % is the bound
+    0.0349...
+
+With probability 1 - alpha the bound is, at all moments together (anytime-valid), at or above the mean of the failure
+probabilities that the parts so far really had. These may differ and drift; the model may be retrained, and its rule may
+learn from every outcome. Assumed: an audit's coin falls with the stated probability whatever the part is, and every audit's
+outcome is reported (a lost one must count as bad). It speaks of parts past, not of those to come.
+
+The evidence is an e-process, the capital of a bettor. He starts with 1 and bets the same b on every part, that it will be
+good. With x = 1 for a bad part that was looked at, else 0,
+
+    capital(theta) = product of (1 - b)^x / (1 - b q theta),   q the propensity, theta the tolerance.
+
+In place of theta put each part's own failure probability p_i, whatever it is and however it depends on the past: x has the
+mean q p_i, so the product M is a martingale that begins at 1, and by Ville's inequality M ever reaches 1 / alpha with
+probability alpha at most. The logarithm is concave, so capital(mean of p_1 ... p_n) <= M, at every n at once: no
+stationarity, one may look after every part, and the running mean may move. For that b must not depend on theta; as a stake
+it is l = b q / (1 - b q theta) on 1 + l (theta - x / q), inverse probability weighting. The capital grows with theta, so
+what is not refuted is an interval. Nobody knows the best b beforehand (1 - odds(q p) / odds(q theta), where all parts have
+one p), so the capital is a mixture, weighted by the bets: large ones matter while n is small.
+
+Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures over bets: Robbins (1970), AMS 41(5).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from ..errors import SettingError, percent
+
+CONFIRMED_SHARE = 0.1  # of alpha, where audits and confirmations both speak: the former see less and need more
+RARE = 0.02  # the audit rate that is assumed where none is set
+ENDLESS = 10**8  # more audits than that are none
+
+
+def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0, bets: list[float] | None = None) -> float:
+    """Log capital of a mixture of constant bets that the mean failure probability of n parts is below `tolerance`.
+
+    n : parts, looked at or not.  n_bad : those of them that were looked at and were bad.  tolerance : in [0, 1].
+    propensity : in (0, 1], the probability with which each part was looked at; a bad one that was looked at then stands for
+        1 / propensity. Where it changed, the smallest: that is on the safe side.
+    bets : in (0, 1), fixed beforehand; None: a grid for any rate. Few are sharper where the rate is about known.
+    It grows with `tolerance` and falls with `n_bad`. Compiles to TorchScript.
+    """
+    if bets is None:
+        bets = [0.05, 0.1, 0.2, 0.4, 0.7, 0.98]  # never 1: one bad part would lose all for ever
+    rate = propensity * tolerance
+    logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in bets]
+    top = max(logs)
+    capital = 0.0
+    weights = 0.0  # summed in the same order, so that no parts are no evidence, exactly
+    for bet, log in zip(bets, logs):  # noqa: B905  strict is not TorchScript
+        capital += bet * math.exp(log - top)
+        weights += bet
+    return top + math.log(capital / weights)
+
+
+def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
+    """Upper bound on the mean failure probability of n parts, valid at all moments together with probability 1 - alpha.
+
+    n : parts the claim is about.  n_bad : those of them that were looked at and were bad.
+    propensity : probability with which each was looked at: 1 where every outcome is known, the audit rate where only audits
+        are, 0 where nobody looks. Where it changed, the smallest.
+    Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection;
+    never less than n_bad / (n propensity). 1 where nothing is known.
+    """
+    if not 0.0 < alpha < 1.0:
+        raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for 95 % confidence.")
+    if not 0.0 <= propensity <= 1.0:
+        raise SettingError(f"Expected 0 <= propensity <= 1, got {propensity!r}; 0.02 looks at one part in fifty.")
+    if not 0 <= n_bad <= n:
+        raise ValueError(f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once.")
+    enough = math.log(1.0 / alpha)
+    if propensity == 0.0 or log_evidence(n, n_bad, 1.0, propensity) < enough:
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if log_evidence(n, n_bad, middle, propensity) >= enough else (middle, high)
+    return high  # the refuted end: rounding widens
+
+
+@dataclass(frozen=True, slots=True)
+class Outcomes:
+    """How many parts the model was certain of since the policy's settings last changed, and what became of them.
+
+    accepted, rejected : let go without a check.  stops, confirmed : of the accepted, known to be bad, and to be good.
+    audited_accepts, audited_accepts_bad : checked though the model would have accepted, and the bad ones of them.
+    audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
+    forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
+        none of the counts of labels above.
+    """
+
+    accepted: int = 0
+    stops: int = 0
+    confirmed: int = 0
+    audited_accepts: int = 0
+    audited_accepts_bad: int = 0
+    rejected: int = 0
+    audited_rejects: int = 0
+    audited_rejects_good: int = 0
+    forgotten_accepts: int = 0
+    forgotten_audited_accepts: int = 0
+    forgotten_audited_rejects: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """A group of parts and the bound on how many of them were decided wrongly, on average.
+
+    n : parts the claim is about.  n_looked_at : those whose outcome is known.  n_bad : those known to be decided wrongly.
+    propensity : probability with which each was looked at; 0 where nobody looked, so that nothing is known.
+    alpha : what this bound may spend, the certificate's or a share of it.  upper : the bound, 1 where nothing is known.
+    shadowed : none of them was decided without a check, each was audited: the shadow mode.
+    """
+
+    n: int
+    n_looked_at: int
+    n_bad: int
+    propensity: float
+    alpha: float
+    upper: float
+    shadowed: bool = False
+
+    @property
+    def bad_rate(self) -> float:
+        """Share of those looked at that were decided wrongly; 0 where none was looked at."""
+        return self.n_bad / max(1, self.n_looked_at)
+
+    def audits_needed(self, target: float, bad_rate: float = 0.0) -> int | None:
+        """About how many more outcomes, of which `bad_rate` are bad, would bring the bound to `target`; None: no number.
+
+        At a propensity below 1 each of them stands for 1 / propensity parts. Where nobody looks it counts from now on, as
+        if one part in fifty were audited.
+        """
+        if not 0.0 < target < 1.0:
+            raise SettingError(f"Expected 0 < target < 1, got {target!r}; 0.05 asks for at most 5 % bad.")
+        n, propensity = (self.n, self.propensity) if self.propensity > 0.0 else (0, RARE)
+
+        def reached(more: int) -> bool:
+            n_bad = self.n_bad + math.ceil(bad_rate * more - 1e-9)
+            return log_evidence(n + int(more / propensity), n_bad, target, propensity) >= math.log(1.0 / self.alpha)
+
+        if reached(0):
+            return 0
+        high = 1
+        while not reached(high):
+            high *= 2
+            if high > ENDLESS:
+                return None
+        low = high // 2
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if reached(middle) else (middle, high)
+        return high
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """What can be said, at level 1 - alpha and at any moment, of the parts that the model decided alone.
+
+    accepted : the bound on the mean probability that an accepted part was bad.  rejected : that a rejected one was good.
+    tolerance : what the user allows of either, 1 - lower_bound. Each bound holds at 1 - alpha by itself.
+    """
+
+    alpha: float
+    tolerance: float
+    accepted: Bounded
+    rejected: Bounded
+
+    @property
+    def kept(self) -> bool:
+        """Whether the bound on the accepted parts lies within the tolerance."""
+        return self.accepted.upper <= self.tolerance
+
+    @property
+    def sentence(self) -> str:
+        """What a plant manager may rely on about accepted parts, in one sentence."""
+        unknown = "silence is no success: set audit_rate, or stops='all' where every bad part stops the system"
+        return self._sentence(self.accepted, "that went on without a check", "accept", "bad", unknown)
+
+    @property
+    def sentence_on_rejects(self) -> str:
+        """The same about rejected parts."""
+        unknown = "nobody looks at what is rejected: set audit_rate"
+        return self._sentence(self.rejected, "rejected without a check", "reject", "good", unknown)
+
+    @property
+    def advice(self) -> str:
+        """How many more audits the tolerance takes, or where it is kept, half of it; the parts being accepted ones."""
+        what = "parts" if self.accepted.propensity == 1.0 else "audits"
+        target = self.tolerance / 2.0 if self.kept else self.tolerance
+        good, same = self.audits_needed(target), self.audits_needed(target, self.accepted.bad_rate)
+        if self.accepted.upper <= target:
+            return f"Even {percent(target, '.6g')} is shown."
+        if good is None:
+            return f"No number of {what} would show {percent(target, '.6g')}."
+        asked = f"To show {percent(target, '.6g')} takes about {good:,} more {what} if all are good"
+        if self.accepted.n_bad == 0:
+            return f"{asked}."
+        return f"{asked}; at the present rate {'no number would do' if same is None else f'about {same:,}'}."
+
+    def audits_needed(self, target: float | None = None, bad_rate: float = 0.0) -> int | None:
+        """`Bounded.audits_needed` of the accepted parts; `target` is by default the tolerance."""
+        return self.accepted.audits_needed(self.tolerance if target is None else target, bad_rate)
+
+    def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
+        parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
+        if bounded.n == 0:
+            return f"Nothing can be said yet: no part was one {which}."
+        if bounded.propensity == 0.0:
+            return f"Of {parts} {which} nothing can be said, for {unknown}."
+        if bounded.propensity < 1.0:
+            which = f"that the model would {verb}, of which {bounded.n_looked_at:,} were audited"
+        if bounded.shadowed:
+            which = f"that the model would {verb}, each of which was checked"
+        if bounded.upper >= 1.0:
+            return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
+        # A sentence must not promise more than the bound: rounded up.
+        digits = 1 if bounded.upper >= 0.01 else 2 if bounded.upper >= 0.001 else 4
+        upper = f"{math.ceil(bounded.upper * 10.0 ** (digits + 2)) / 10.0**digits:g} %"
+        return (
+            f"Of {parts} {which}, at most {upper} were {wrong} on average, with {percent(1.0 - self.alpha, '.6g')} confidence, "
+            f"however often one looks; the tolerance is {percent(self.tolerance, '.6g')}."
+        )
+
+
+def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float) -> Certificate:
+    """The certificate of what became of all certain decisions so far; `Policy.certificate` is the engine's way to it.
+
+    stops : "all" where every bad accepted part stops the system and is reported, so that the outcome of each accepted part
+        is known (leave the newest out while its outcome is open). "some" where silence is no success.
+    audit_rate : probability with which a certain decision is verified all the same. Where it changed since the first of
+        these parts, the smallest.
+
+    Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited: the
+    coin does not know the outcome. It never lies below the share known to be bad. A cell that confirmed or stopped every
+    accepted part knows as much as under "all". Where both are possible they share alpha, so that whoever sees now the one
+    and now the other is still wrong with probability alpha at most. Rejected parts are known by audits alone. A label that
+    was forgotten counts as a wrong decision, like an audit whose outcome was lost: forgetting earns nothing.
+    """
+    if stops not in ("all", "some"):
+        raise SettingError(f"Expected stops among all, some, got {stops!r}.")
+    if not 0.0 < tolerance < 1.0:
+        raise SettingError(f"Expected 0 < tolerance < 1, got {tolerance!r}; 0.05 tolerates 5 % of errors.")
+    o = replace(
+        outcomes,
+        stops=outcomes.stops + outcomes.forgotten_accepts,
+        audited_accepts=outcomes.audited_accepts + outcomes.forgotten_audited_accepts,
+        audited_accepts_bad=outcomes.audited_accepts_bad + outcomes.forgotten_audited_accepts,
+        audited_rejects=outcomes.audited_rejects + outcomes.forgotten_audited_rejects,
+        audited_rejects_good=outcomes.audited_rejects_good + outcomes.forgotten_audited_rejects,
+    )
+    share = 1.0 if stops == "all" or audit_rate == 0.0 else CONFIRMED_SHARE
+    if stops == "all" or 0 < o.accepted == o.stops + o.confirmed:
+        accepted = _bounded(o.accepted, o.accepted, o.stops, 1.0, share * alpha)
+    elif audit_rate == 0.0:
+        accepted = _bounded(o.accepted, 0, 0, 0.0, alpha)
+    else:
+        n, n_bad = o.accepted + o.audited_accepts, o.audited_accepts_bad
+        accepted = _bounded(n, o.audited_accepts, n_bad, audit_rate, (1.0 - share) * alpha)
+        upper = max(accepted.upper, (n_bad + o.stops) / max(1, n))
+        accepted = replace(accepted, upper=upper, shadowed=audit_rate == 1.0 and o.accepted == 0)
+    rejected = _bounded(o.rejected + o.audited_rejects, o.audited_rejects, o.audited_rejects_good, audit_rate, alpha)
+    rejected = replace(rejected, shadowed=audit_rate == 1.0 and o.rejected == 0)
+    return Certificate(alpha, tolerance, accepted, rejected)
+
+
+def _bounded(n: int, n_looked_at: int, n_bad: int, propensity: float, alpha: float) -> Bounded:
+    return Bounded(n, n_looked_at, n_bad, propensity, alpha, failure_bound(n, n_bad, alpha, propensity))
+
+
+def percent(share: float, '.6g') -> str:
     return f"{100.0 * share:.6g} %"

@@ -27,7 +27,6 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -35,39 +34,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..decision.policy import Policy
-from ..errors import SettingError
+from ..errors import SettingError, percent
 from .grid import Folder, OnDone, Task, grid_tasks, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
 from .replay import Replay
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-class Forecast:
-    """An estimate of the time that is left, from what replays of each kind took so far.
-
-    kinds : of every replay to be played, which share a cost: the recipe.  workers : how many are played at a time.
-    """
-
-    def __init__(self, kinds: Sequence[str], workers: int) -> None:
-        self.waiting = Counter(kinds)
-        self.workers = max(1, workers)
-        self.took: dict[str, list[float]] = {}
-
-    def done(self, kind: str, seconds: float) -> None:
-        """One replay of this kind has ended, after so many seconds."""
-        self.waiting[kind] -= 1
-        self.took.setdefault(kind, []).append(seconds)
-
-    def left(self) -> tuple[float, bool] | None:
-        """Seconds that are left, and whether kinds of unknown cost come on top; None where nothing is known yet."""
-        known = {kind: sum(took) / len(took) for kind, took in self.took.items()}
-        if not known:
-            return None
-        seconds = sum(n * known[kind] for kind, n in self.waiting.items() if kind in known)
-        unknown = any(n > 0 for kind, n in self.waiting.items() if kind not in known)
-        return seconds / min(self.workers, max(1, self.waiting.total())), unknown
 
 
 def makespan(costs: Iterable[float], workers: int) -> float:
@@ -173,7 +146,7 @@ class CostCurve:
         if self.policy is None:
             seen = f"is expected to cost {row.chosen_by:.3g} and cost {row.cost:.3g} in other shuffles, {between}"
             return f"Nothing pays: {every}; the cheapest policy, {who}, {seen}. Go on verifying, or record more."
-        may = MAY.format(bad=_percent(row.bad.upper), worst=_percent(self.costs.worst_accept))
+        may = MAY.format(bad=percent(row.bad.upper, ".3g"), worst=percent(self.costs.worst_accept, ".3g"))
         return f"{who} {self.verdict}: {row.cost:.3g} a part, {between}; {every}.{may if self.verdict == 'may pay' else ''}"
 
     def to_frame(self) -> pd.DataFrame:
@@ -198,10 +171,6 @@ def _record(row: PolicyCost) -> dict[str, Any]:
         for each in fields(rate)
     }
     return told | {name: getattr(row, name) for name in PLAIN} | wrong
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
 
 
 def cost_curve(

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import percent
 from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
@@ -129,8 +130,8 @@ def promise_line(row: Mapping[str, Any], telling: Sequence[str] = ()) -> str:
     verdict = {True: "kept", False: "broken", None: f"fewer than {ENOUGH} accepted parts, too few to say"}[
         promise_kept(row)
     ]
-    good, bound = _percent(row["precision"]), 100 * row["lower_bound"]
-    bad = f"; bad: {100 * row['error_lower']:.1f} to {_percent(row['error_upper'])} at 95 %"
+    good, bound = percent(row["precision"]), 100 * row["lower_bound"]
+    bad = f"; bad: {100 * row['error_lower']:.1f} to {percent(row['error_upper'])} at 95 %"
     bad = "" if math.isnan(row["error_lower"]) else bad
     return f"{who}: {good} of {row['total_accepted']} accepted parts were good{bad}, LB {bound:g} %: {verdict}."
 
@@ -163,10 +164,6 @@ def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> T
     return table
 
 
-def _percent(value: float) -> str:
-    return "-" if math.isnan(value) else f"{100 * value:.1f} %"
-
-
 def _number(value: float, digits: int) -> str:
     return "-" if math.isnan(value) else f"{value:.{digits}f}"
 
@@ -178,10 +175,10 @@ def _with_sd(row: Mapping[str, Any], name: str) -> str:
 
 _CELLS_OF: dict[str, Any] = {
     "alpha\nLB": lambda r: f"{r['alpha']:g}\n{100 * r['lower_bound']:g} %",
-    "certain\nshare": lambda r: f"{_with_sd(r, 'certain')}\n{_percent(r['total_certain'] / r['cycles'])}",
+    "certain\nshare": lambda r: f"{_with_sd(r, 'certain')}\n{percent(r['total_certain'] / r['cycles'])}",
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
-    "precision\nNPV": lambda r: f"{_percent(r['precision'])}\n{_percent(r['npv'])}",
+    "precision\nNPV": lambda r: f"{percent(r['precision'])}\n{percent(r['npv'])}",
     "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
     "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
     "saved\nnet, s": lambda r: f"{r['saved_s']:.0f}\n{r['net_s']:.0f}",

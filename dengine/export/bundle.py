@@ -5,7 +5,7 @@ signature, by `key`.
 
 Signatures: whether a file comes from who has the key, found out before a byte of it is run.
 
-    dengine make-key cell.key
+    dengine export --make-key cell.key
     dengine export engine.db --out model.ts --key cell.key          # model.ts.sig beside it
     load_exported("model.ts", key="cell.key")
 
@@ -79,11 +79,11 @@ def read_key(path: KeyFile) -> bytes:
         key = Path(path).read_bytes().rstrip(b"\r\n")
     except OSError as error:
         raise ExportError(
-            f"The key's file {path} cannot be read: {error.strerror}; dengine make-key writes one."
+            f"The key's file {path} cannot be read: {error.strerror}; dengine export --make-key writes one."
         ) from error
     if len(key) < SHORTEST_KEY:
         raise ExportError(
-            f"Expected a key of {SHORTEST_KEY} bytes or more in {path}, got {len(key)}; use dengine make-key."
+            f"Expected a key of {SHORTEST_KEY} bytes or more in {path}, got {len(key)}; use dengine export --make-key."
         )
     return key
 

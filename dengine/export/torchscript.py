@@ -8,7 +8,7 @@ made, or what was signed with a key of yours.
 
 The C and C++ sources that run an exported file: a library with a C interface, and a program.
 
-    dengine export-cpp --out cell_cpp
+    dengine export --cpp cell_cpp
     cmake -S cell_cpp -B build/cpp -DCMAKE_PREFIX_PATH="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
 
 They depend on no model, so they come by a verb of their own and not with each export.

@@ -12,7 +12,6 @@ import sys
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import get_args
 
 import click
 import joblib
@@ -25,7 +24,6 @@ from dengine.cli import main
 from dengine.cli.options import SETTINGS
 from dengine.cli.output import INTERRUPTED, WIDE, duration, size
 from dengine.datasets.importing import import_labelled
-from dengine.decision.policy import RULES, Stops
 from dengine.store import MemoryStore
 
 POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
@@ -559,12 +557,6 @@ def test_status_says_what_the_engine_decides_by(trained: Path) -> None:
 KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
 
 
-def test_the_choices_are_those_of_a_policy() -> None:
-    options = {option.name: option for option in main.commands["run"].params}
-    assert set(options["guarantee"].type.choices) == set(RULES)
-    assert set(options["stops"].type.choices) == set(get_args(Stops))
-
-
 @pytest.mark.parametrize("verb", ["replay", "compare", "run", "train"])
 def test_every_verb_that_makes_an_engine_takes_the_same_settings(verb: str) -> None:
     options = {option.name: option for option in main.commands[verb].params}
@@ -600,7 +592,7 @@ def test_compare_shows_the_guarantee_of_every_recipe(data: Path, tmp_path: Path)
     ("words", "code", "said"),
     [
         (["--guarantee", "global"], 2, "'global' is not one of 'local', 'pooled'"),
-        (["--stops", "most"], 2, "'most' is not one of 'some', 'all'"),
+        (["--stops", "most"], 2, "'most' is not one of 'all', 'some'"),
         (["--audit-rate", "1"], 2, "1.0 is not in the range 0.0<=x<1.0"),
         (["--novelty", "-1"], 2, "-1.0 is not in the range x>=0.0"),
         (["--novelty", "inf"], 1, "0 turns it off"),

@@ -1,4 +1,4 @@
-"""The verbs that put things right: correct, forget, rollback, set-policy, retrain. Real commands on a small store."""
+"""The verbs that put things right: correct, forget, rollback, policy, retrain. Real commands on a small store."""
 
 import getpass
 import json
@@ -9,10 +9,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from dengine import DataEngine, Dataset, Policy
-from dengine.cli import correct as correcting
 from dengine.cli import main
 from dengine.datasets.importing import import_labelled
-from dengine.decision.intervals import INTERVALS as EVERY_INTERVAL
 
 
 def dengine(*words: object) -> Result:
@@ -103,22 +101,21 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
 
 
 def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path) -> None:
-    found = document("set-policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
-    assert found["policy"] == document("set-policy", store, "--alpha", 0.2)["policy"]
+    found = document("policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
+    assert found["policy"] == document("policy", store, "--alpha", 0.2)["policy"]
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, LB 80 %" in said("status", store)
-    line = said("set-policy", store, "--interval", "jeffreys")
+    line = said("policy", store, "--interval", "jeffreys")
     assert line.startswith("The policy's interval wilson -> jeffreys. Event 2, by")
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ("set-policy", "STORE"),
-        ("set-policy", "STORE", "--alpha", 2),
-        ("set-policy", "STORE", "--interval", "none"),
+        ("policy", "STORE", "--alpha", 2),
+        ("policy", "STORE", "--interval", "none"),
         ("correct", "STORE", "x", "maybe"),
         ("forget", "STORE"),
         ("rollback", "STORE", "two"),
@@ -129,10 +126,6 @@ def test_a_wrong_call_ends_with_2_and_changes_nothing(words: tuple, store: Path)
     assert dengine(*(store if word == "STORE" else word for word in words)).exit_code == 2
     assert labels(store) == before
     assert document("status", store)["events"] == []
-
-
-def test_every_interval_can_be_chosen() -> None:
-    assert sorted(correcting.INTERVALS) == sorted(EVERY_INTERVAL)
 
 
 def test_a_retrain_by_hand_learns_what_was_corrected(store: Path) -> None:
@@ -161,8 +154,8 @@ def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path:
         ("correct", "x", "good"),
         ("forget", "x"),
         ("rollback", 1),
-        ("set-policy", "--alpha", 0.1),
-        ("shadow", "on"),
+        ("policy", "--alpha", 0.1),
+        ("policy", "--shadow", "on"),
         ("retrain",),
     ],
 )

@@ -50,7 +50,7 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
         "duplicates none",
         "good by tenths",
         "FX_Base by tenths",
-        "Left out, 3:",
+        "Left out 3 of 80 recordings of cell_3:",
         "Expected a header and rows, it is empty",
         "Expected 13 columns, got 12",
         "Expected a column FZ_Base",
@@ -123,7 +123,7 @@ def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Da
     (tmp_path / "wide.csv").write_text("\n".join(lines))
     said = succeed("data", tmp_path / "wide.csv").stdout
     assert said.count("- wide.csv, line ") == 10
-    assert "and 3 more." in said
+    assert "- and 3 more" in said
 
 
 # ------------------------------------------------------------------------------------------------------- the survey

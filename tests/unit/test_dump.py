@@ -1,6 +1,5 @@
 """A dump: every table of a cell as Parquet, as the store holds it, and no folder of anything else touched."""
 
-import json
 import os
 import sqlite3
 import uuid
@@ -8,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dengine.cli import main
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import SqlStore, dump_store, verify_history
@@ -167,12 +164,3 @@ def test_a_dump_that_fails_leaves_the_earlier_one(tmp_path: Path) -> None:
         dump_store(url, out, "nobody")
     assert {path: path.read_bytes() for path in out.rglob("*.parquet")} == before
     assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith(".")) == []
-
-
-def test_the_verb_writes_and_tells(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store:
-        write(store, 5)
-    done = CliRunner().invoke(main, ["dump", str(tmp_path / "a.db"), "--out", str(tmp_path / "out"), "--json"])
-    assert (done.exit_code, json.loads(done.output)["rows"]["cell/decision.parquet"]) == (0, 6)
-    done = CliRunner().invoke(main, ["dump", str(tmp_path / "a.db"), "--out", str(tmp_path)])
-    assert (done.exit_code, "holds something else" in " ".join(done.output.split())) == (1, True)

@@ -559,9 +559,9 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
     assert (status["cell_id"], status["decisions"], status["product"]) == (sister, 60, product)
     assert cell in run("status", fleet.url, "--cell-id", cell)
     run("export", fleet.url, "--cell", sister, "--out", str(tmp_path / "model.ts"))
-    listed = json.loads(run("cells", fleet.url, "--json"))["cells"]
+    listed = json.loads(run("status", fleet.url, "--json"))["cells"]
     assert [row["product"] for row in listed if row["cell_id"] in (cell, sister)] == [product, product]
-    assert cell[:10] in run("cells", fleet.url)
+    assert cell[:10] in run("status", fleet.url)
     with SqlStore(fleet.url, sister) as store:
         assert len(store.labelled().seq) > len(store.own_labelled().seq) > 0
 
@@ -581,6 +581,6 @@ def test_a_cell_that_is_not_there_is_refused_and_not_made(verb: str, tmp_path: P
 def test_cells_of_what_is_no_store_is_an_error(tmp_path: Path) -> None:
     for name, text in (("empty.db", b""), ("other.db", b"no database")):
         (tmp_path / name).write_bytes(text)
-        assert CliRunner().invoke(main, ["cells", str(tmp_path / name)]).exit_code == 1
-    assert CliRunner().invoke(main, ["cells", str(tmp_path / "none.db")]).exit_code == 1
+        assert CliRunner().invoke(main, ["status", str(tmp_path / name)]).exit_code == 1
+    assert CliRunner().invoke(main, ["status", str(tmp_path / "none.db")]).exit_code == 1
     assert not (tmp_path / "none.db").exists()

@@ -22,7 +22,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
 from dengine.cli import main
 from dengine.errors import SettingError
-from dengine.experiments.costs import Forecast, makespan
+from dengine.experiments.costs import makespan
 from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays, run_replays
 from dengine.experiments.replay import Contender
 from dengine.experiments.rivals import RIVALS
@@ -337,18 +337,3 @@ def test_a_makespan_by_hand() -> None:
     assert makespan([3, 3, 2, 2, 2], 2) == 7  # the best is 6: the longest first is not always the best
     assert makespan([5, 1, 1, 1], 1000) == 5
     assert makespan([1, 2, 3], 1) == 6
-
-
-def test_the_forecast_is_by_kind_and_says_when_a_kind_is_unknown() -> None:
-    forecast = Forecast(["fast"] * 4 + ["slow"] * 4, workers=2)
-    assert forecast.left() is None
-    forecast.done("fast", 1.0)
-    assert forecast.left() == (pytest.approx(3 * 1.0 / 2), True)
-    forecast.done("slow", 60.0)
-    assert forecast.left() == (pytest.approx((3 * 1.0 + 3 * 60.0) / 2), False)
-
-
-def test_the_last_replay_alone_is_not_shared_among_workers() -> None:
-    forecast = Forecast(["a"] * 2, workers=8)
-    forecast.done("a", 10.0)
-    assert forecast.left() == (10.0, False)

@@ -11,7 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from dengine import Dataset, Policy, Recipe, TraceSpec, load_exported
-from dengine.cli.export import export, import_labels
+from dengine.cli.export import export
+from dengine.cli.store import import_labels
 from dengine.engine.engine import DataEngine
 from dengine.errors import DataError
 from dengine.export.cell_journal import import_journal, read_journal

@@ -72,8 +72,8 @@ VERBS = {  # every verb that takes a store
     **{
         words[0]: [words[0], NOBODY, *words[1:]]
         for words in (
-            *(["cells"], ["history"], ["explain", "last"], ["verify"], ["dump", "--out", "{out}"], ["correct", "a", "bad"]),
-            *(["forget", "a"], ["rollback", "1"], ["set-policy", "--alpha", "0.1"], ["shadow", "on"], ["retrain"]),
+            *(["history"], ["explain", "last"], ["verify"], ["correct", "a", "bad"], ["forget", "a"], ["rollback", "1"]),
+            *(["policy", "--alpha", "0.1", "--shadow", "on"], ["retrain"]),
         )
     },
     "an unknown verb": [NOBODY],

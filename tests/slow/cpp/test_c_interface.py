@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import dengine
 from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript, load_exported
-from dengine.cli.export import export_cpp, make_key
+from dengine.cli import main
 from dengine.engine.engine import DataEngine
 from dengine.errors import ExportError
 from dengine.export import export_sources
@@ -47,7 +47,7 @@ def test_a_controller_in_c_decides_as_python_does_and_its_labels_come_back(
     consumer: Path, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
     data, store, key = make_data(400, SAMPLES), str(tmp_path / "engine.db"), tmp_path / "cell.key"
-    assert CliRunner().invoke(make_key, [str(key)]).exit_code == 0
+    assert CliRunner().invoke(main, ["export", "--make-key", str(key)]).exit_code == 0
     recipe = Recipe(
         reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.3, reject_fraction=0.08
     )
@@ -84,7 +84,7 @@ def test_the_installed_programs_run(installed: Path, make_data: Callable[..., Da
 
 
 def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:
-    done = CliRunner().invoke(export_cpp, ["--out", str(tmp_path / "cell")], catch_exceptions=False)
+    done = CliRunner().invoke(main, ["export", "--cpp", str(tmp_path / "cell")], catch_exceptions=False)
     assert done.exit_code == 0
     assert (tmp_path / "cell" / "VERSION").read_text() == f"{dengine.__version__}\n"
     assert (tmp_path / "cell" / "include" / "dengine.h").is_file()

@@ -3,7 +3,7 @@
     python -m tests.slow.faults --trials 3 --kills 20
     . .ci/postgres.sh && python -m tests.slow.faults --kills 200 --others 100 --postgres "$DENGINE_TEST_POSTGRES"
 
---program names a built dengine-cell, whose journal is then tried too (`dengine export-cpp`). A trial of a fault plays a
+--program names a built dengine-cell, whose journal is then tried too (`dengine export --cpp`). A trial of a fault plays a
 cell before, in and after it, opens the store again, and compares labels with what was acknowledged and decisions with those
 of the engine before. Exit code 1 if anything was lost, decided otherwise, or raised.
 """

@@ -40,9 +40,9 @@ inline std::vector<std::string> listed(const std::string& text, const std::strin
 
 // The secret that a file was signed with: what the key's file holds, without the line end.
 inline std::string read_key(const std::string& path) {
-    std::string key = read_file(path, "; it is the key's file, as dengine make-key writes it");
+    std::string key = read_file(path, "; it is the key's file, as dengine export --make-key writes it");
     while (!key.empty() && (key.back() == '\n' || key.back() == '\r')) key.pop_back();
-    if (key.size() < SHORTEST_KEY) throw Fault(DENGINE_BAD_MODEL, path + " is too short for a key; make one with dengine make-key");
+    if (key.size() < SHORTEST_KEY) throw Fault(DENGINE_BAD_MODEL, path + " is too short for a key; make one with dengine export --make-key");
     return key;
 }
 
