@@ -110,7 +110,9 @@ class Listed(click.ParamType[Any]):
         return tuple(self.of.convert(part, param, ctx) for part in parts)
 
 
-def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Callable[[Command], Command]]) -> Any:
+def gathered(
+    into: str, make: Callable[..., Any], options: Mapping[str, Callable[[Command], Command]]
+) -> Callable[[Command], Command]:
     """Options, by the names of their values, which `make` takes; what it makes is handed on as `into`."""
 
     def decorate(command: Command) -> Command:
@@ -120,7 +122,7 @@ def gathered(into: str, make: Callable[..., Any], options: Mapping[str, Callable
             return command(**{into: make(**mine)}, **given)
 
         decorated: Command = with_one
-        for option in reversed(options.values()):
+        for option in reversed(list(options.values())):
             decorated = option(decorated)
         return decorated
 
@@ -352,7 +354,7 @@ def data_options(default: str | None = "insertion") -> Callable[[Command], Comma
         "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db.",
         **shown,
     )
-    return gathered("source", DataChoice, {"data": option} | DATA)  # type: ignore[no-any-return]
+    return gathered("source", DataChoice, {"data": option} | DATA)
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:

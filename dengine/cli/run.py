@@ -104,7 +104,7 @@ def run(
         cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes, failure = _drive(engine, cell, cycles, name, as_json)
-        said = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
+        said: dict[str, Any] = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
         certificate = engine.certificate()
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):

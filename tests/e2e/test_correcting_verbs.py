@@ -94,7 +94,7 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
     assert (
         said("rollback", store, 1, "--author", "kim") == "Version 1 answers again, as version 3 after 2. Event 1, by kim."
     )
-    assert document("status", store)["last_version"] == 3
+    assert document("status", store)["version"] == 3
     failed = dengine("rollback", store, 9)
     assert failed.exit_code == 1
     assert "load one of these: 1, 2, 3" in " ".join(failed.stderr.split())

@@ -556,7 +556,7 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
     run("run", "--cell", "replay", "--data", data, "--cycles", "60", "--store", fleet.url, "--cell-id", sister,
         "--product", product)  # fmt: skip
     status = json.loads(run("status", fleet.url, "--cell", sister, "--json"))
-    assert (status["cell_id"], status["decisions"], status["product"]) == (sister, 60, product)
+    assert (status["cell"], status["ever"]["decisions"], status["product"]) == (sister, 60, product)
     assert cell in run("status", fleet.url, "--cell-id", cell)
     run("export", fleet.url, "--cell", sister, "--out", str(tmp_path / "model.ts"))
     listed = json.loads(run("status", fleet.url, "--json"))["cells"]

@@ -28,7 +28,7 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     }
     bad, good = said[Action.ACCEPT].count(False), said[Action.REJECT].count(True)
     told = json.loads(CliRunner().invoke(main, ["status", store, "--json"]).stdout)
-    accept, reject = told["doing"]["ever"]["would_accept"], told["doing"]["ever"]["would_reject"]
+    accept, reject = told["ever"]["would_accept"], told["ever"]["would_reject"]
     assert told["shadow"] is True
     assert (accept["n"], accept["wrong"]) == (len(said[Action.ACCEPT]), bad)
     assert (reject["n"], reject["wrong"]) == (len(said[Action.REJECT]), good)
