@@ -142,14 +142,14 @@ Part = tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.int64], list[str]
 
 def _chunks(traces: NDArray[np.float32], data: Dataset) -> Iterator[Part]:
     hashes = content_hash(traces)
-    ids = import_ids(hashes)
+    ids = _ids(hashes)
     for start in range(0, len(data), CHUNK):
         part = slice(start, start + CHUNK)
         numbers = [None] * len(ids[part]) if data.part is None else data.part[part].tolist()
         yield traces[part], data.y[part], hashes[part], ids[part], numbers
 
 
-def import_ids(hashes: NDArray[np.int64]) -> list[str]:
+def _ids(hashes: NDArray[np.int64]) -> list[str]:
     """The ids of traces with these content hashes, (n,), in the order of their file."""
     ids, times = [], Counter[int]()
     for hash_ in hashes.tolist():  # equal traces within one file are events of their own

@@ -127,9 +127,8 @@ def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
         raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
 
 
-SCHEMA = 2  # 1, until 0.2: no parts, no stops, no rule that learns
+SCHEMA = 2
 METADATA = "dengine.json"
-SCRIPTABLE = "conv, pca or rocket"
 SHA256 = re.compile(r"[0-9a-f]{64}")
 SUM_BYTES = 2**16
 TRIES = 3
@@ -151,7 +150,7 @@ def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
 
 def decision_module(source: Exportable) -> DecisionModule:
     """The decision of a fitted model as one eager module; ExportError where a part of it does not compile."""
-    model = source.model
+    model, index = source.model, source.model.index
     if not model.rule.scriptable:
         raise ExportError(
             f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not compile to TorchScript; "
@@ -159,11 +158,10 @@ def decision_module(source: Exportable) -> DecisionModule:
         )
     if model.untold:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
-    predictor = model.predictor
     if model.spaces.module() is None:
-        raise ExportError(f"{model.name} cannot be scripted: it has no module; use {SCRIPTABLE} instead.")
-    size = model.n_spaces, model.index.dim
-    return DecisionModule(source.trace, predictor, *size, source.audit_rate, source.seed, source.stops_all)
+        raise ExportError(f"{model.name} cannot be scripted: it has no module; use conv, pca or rocket instead.")
+    size = model.n_spaces, index.dim
+    return DecisionModule(source.trace, model.predictor, *size, source.audit_rate, source.seed, source.stops_all)
 
 
 def describe(source: Exportable) -> dict[str, Any]:
@@ -306,11 +304,11 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
 
 
 def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:
-    """A description that this version can read; ExportError for a newer one."""
-    schema = metadata.get("schema") if isinstance(metadata, dict) else None
-    if not isinstance(schema, int) or schema > SCHEMA:
-        made_by = metadata.get("dengine", "an unknown version") if isinstance(metadata, dict) else "something else"
+    """A description of the present schema; ExportError for another."""
+    known = metadata if isinstance(metadata, dict) else {}
+    if known.get("schema") != SCHEMA:
         raise ExportError(
-            f"{path} has schema {schema}, written by dengine {made_by}; this one reads up to {SCHEMA}: upgrade it."
+            f"{path} has schema {known.get('schema')}, written by dengine {known.get('dengine', 'of an unknown version')}; "
+            f"this one reads schema {SCHEMA}: export it anew, or load it with the dengine that wrote it."
         )
-    return dict(metadata)
+    return known

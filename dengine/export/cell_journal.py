@@ -1,9 +1,10 @@
-"""What a cell program wrote down of its parts: the lines of its journal, checked, and imported into a store.
+"""What a cell program wrote down of its parts: each line is checked before it is believed, and goes into the store once.
 
     journal = read_journal("cell.csv", TraceSpec(1000))
-    journal.lines                                          # parts and labels, in the order in which they became known
-    report = import_journal("engine.db", "cell.csv")       # what a cell program learned on its own
+    report = import_journal("engine.db", "cell.csv")
 
+A journal begins with `# dengine 3 SUM`, of the export that it belongs to. A line is `part,ID,LABEL,PART,ACTION,PREDICTED,
+REASON,LOWER,UPPER,N_SUCCESS,N_FAILURE,SAMPLE,...,CRC` or `label,ID,LABEL,CRC`; several channels stand one after the other.
 A last line without its end was being written when the program was killed: it is left out, and `cut` says so. Anything else
 that does not fit is a DataError that names the line.
 """
@@ -21,22 +22,21 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets.importing import CHUNK, ImportReport, import_ids
+from ..datasets.importing import CHUNK, ImportReport
 from ..decision.policy import Policy
 from ..engine.decide import source_of
-from ..engine.settings import trace_in
 from ..errors import DataError, StoreError
 from ..folds import own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, TraceSpec
+from ..records import REASONS, Action, Decision, Reason, TraceSpec, trace_in
 from ..store.base import NewLabel, Store, opening
 from ..store.outbox import OwnedStore
 from ..traces import TraceGate, as_trace
 
-HEAD = "# dengine "
+FORM = 3
 LABELS = {"1": True, "0": False}
 LARGEST_COUNT = 2**62
-EXPORTED = "export"  # the kind of the events that note a model's sum
+EXPORTED = "export"  # the kind of the events that record a model's sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,22 +44,20 @@ class JournalLine:
     """A part in a cell program's journal: its trace (C, T), its label, and what was decided on it, as in `Decision`.
 
     label : None where nothing was heard of an accepted part.
-    id : of the decision; "" in journals of earlier programs.
-    late : whether the label came after the next part was decided on; the part has a line of its own before it then, where
-        it was accepted.
+    late : whether the label came after the next part was decided on; an accepted part has a line of its own before it then.
     """
 
+    id: str
     trace: NDArray[np.float32]
     label: bool | None
-    part: str | None = None
-    action: Action = Action.VERIFY
-    predicted: Action = Action.VERIFY
-    reason: Reason = Reason.NO_MODEL
-    lower: float = 0.0
-    upper: float = 1.0
-    n_success: int = 0
-    n_failure: int = 0
-    id: str = ""
+    part: str | None
+    action: Action
+    predicted: Action
+    reason: Reason
+    lower: float
+    upper: float
+    n_success: int
+    n_failure: int
     late: bool = False
 
 
@@ -68,63 +66,38 @@ class Journal:
     """A journal that was read.
 
     lines : in the order in which they became known.  waits : whether the last part was accepted and nothing came after it.
-    version : of its form, 1 to 3.  sum : the SHA-256 of the export that it belongs to; "" where it does not say.
-    cut : bytes of a last line that was cut while it was written.
+    sum : the SHA-256 of the export that it belongs to.  cut : bytes of a last line that was cut while it was written.
     """
 
     lines: list[JournalLine]
     waits: bool
-    version: int
     sum: str
     cut: int
 
 
 def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
-    """The lines of a cell program's journal.
-
-    Where the first line begins with `# dengine 3`, a line is `part,ID,LABEL,PART,ACTION,PREDICTED,REASON,LOWER,UPPER,
-    N_SUCCESS,N_FAILURE,SAMPLE,...,CRC` or `label,ID,LABEL,CRC`. With `# dengine 2` it may be
-    `LABEL,PART,ACTION,...,SAMPLE,...` as well, and else it is `LABEL,SAMPLE,...`, of verified parts. Several channels stand
-    one after the other. Lines that begin with # are comments.
-    """
+    """The lines of a cell program's journal."""
     *whole, tail = Path(path).read_bytes().split(b"\n")
-    version, total = _head(whole[0] if whole else b"")
-    reader = _Reader(spec, version)
-    for number, raw in enumerate(whole, start=1):
-        where = f"line {number} of {path}"
-        text = _text(raw, where)
-        if text.strip() and not text.startswith("#"):
-            reader.take(text.rstrip("\r"), where)
+    head = whole[0].decode("utf-8", errors="replace").split() if whole else []
+    if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
+        raise DataError(
+            f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import it with the dengine whose "
+            "program wrote it."
+        )
+    reader = _Reader(spec)
+    for number, raw in enumerate(whole[1:], start=2):
+        reader.take(raw, f"line {number} of {path}")
     waits, lines = reader.waits, reader.labelled()
     if not lines:
         raise DataError(f"{path} holds no labels yet.")
-    return Journal(lines, waits, version, total, len(tail))
-
-
-def _head(line: bytes) -> tuple[int, str]:
-    words = line.decode("utf-8", errors="replace").removeprefix(HEAD).split() if line.startswith(HEAD.encode()) else []
-    if len(words) == 2 and words[0] in ("2", "3"):
-        return int(words[0]), words[1]
-    if len(words) == 2 and words[0].isdigit():
-        raise DataError(f"The journal has form {words[0]}, of a newer program; this dengine reads up to 3: upgrade it.")
-    return 1, words[0] if len(words) == 1 else ""
-
-
-def _text(raw: bytes, where: str) -> str:
-    try:
-        text = raw.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
-    if "\0" in text:
-        raise DataError(f"Expected text in {where}, got a NUL byte: it is damaged, or no journal.")
-    return text
+    return Journal(lines, waits, head[3], len(tail))
 
 
 class _Reader:
     """Takes lines in, one after the other."""
 
-    def __init__(self, spec: TraceSpec, version: int) -> None:
-        self.spec, self.version = spec, version
+    def __init__(self, spec: TraceSpec) -> None:
+        self.spec = spec
         self.lines: list[JournalLine] = []
         self._parts: dict[str, JournalLine] = {}  # by id, as known by now
         self._open: JournalLine | None = None  # the part that was decided on last, while nothing was heard of it
@@ -139,23 +112,24 @@ class _Reader:
         self._settle()
         return [line for line in self.lines if line.label is not None or line.action is Action.ACCEPT]
 
-    def take(self, text: str, where: str) -> None:
+    def take(self, raw: bytes, where: str) -> None:
         """One line."""
-        if self.version > 1 and text.startswith(("part,", "label,")):
-            kind, *words = _checked(text, where).split(",")
-            if kind == "part":
-                self._take_part(self._part(words[1:], words[0], where), where)
-            else:
-                self._take_label(words, where)
-        elif self.version == 2:
-            self._take_part(self._part(text.split(","), "", where), where)
-        elif self.version == 1:
-            self._take_part(self._first_form(text.split(","), where), where)
+        said, _, crc = raw.rpartition(b",")
+        if f"{zlib.crc32(said):08x}".encode() != crc:
+            raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
+        try:
+            kind, *words = said.decode("utf-8").split(",")
+        except UnicodeDecodeError as error:
+            raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
+        if kind == "part":
+            self._take_part(self._part(words, where), where)
+        elif kind == "label":
+            self._take_label(words, where)
         else:
-            raise DataError(f"Expected a line that begins with part or label in {where}, got {text[:20]!r}.")
+            raise DataError(f"Expected a line that begins with part or label in {where}, got {kind[:20]!r}.")
 
     def _take_part(self, line: JournalLine, where: str) -> None:
-        if line.id and line.id in self._parts:
+        if line.id in self._parts:
             raise DataError(
                 f"Expected one line of the part {line.id}, {where} is another; the journal was pasted together."
             )
@@ -173,7 +147,7 @@ class _Reader:
         self._open = None
 
     def _take_label(self, words: list[str], where: str) -> None:
-        if len(words) != 2 or not words[0] or words[0] not in self._parts or words[1] not in LABELS:
+        if len(words) != 2 or words[0] not in self._parts or words[1] not in LABELS:
             raise DataError(
                 f"Expected an earlier part's id and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}."
             )
@@ -186,58 +160,31 @@ class _Reader:
         if not late:
             self._open = None
 
-    def _part(self, words: list[str], id_: str, where: str) -> JournalLine:
-        label, part, *decided = (*words[:9], *[""] * (9 - len(words)))
+    def _part(self, words: list[str], where: str) -> JournalLine:
+        id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
         try:
-            action, predicted = Action(decided[0]), Action(decided[1])
+            action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
             bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
-            reason = Reason(decided[2])
-        except (ValueError, IndexError) as error:
+        except ValueError as error:
             raise DataError(f"The decision in {where} cannot be read: {error}.") from error
         if not (0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT):
             raise DataError(f"Expected bounds between 0 and 1 and counts in {where}, got {','.join(decided[3:7])[:60]!r}.")
-        rejected = action is Action.REJECT and bool(id_) and label == ""
-        unheard = label == "" and (action is Action.ACCEPT or bool(id_))
-        if (action is Action.REJECT and not rejected) or not (unheard or label in LABELS):
-            raise DataError(
-                f"Expected a verified part with a label of 1 or 0, or an accepted one, in {where}, got {label!r}."
-            )
-        trace = np.zeros((1, 0), dtype=np.float32) if rejected else _trace(words[9:], self.spec, where)
-        return JournalLine(trace, LABELS.get(label), part or None, action, predicted, reason, *bound, id_)
+        rejected = action is Action.REJECT
+        if not id_ or (label not in LABELS and label != "") or (rejected and label != ""):
+            raise DataError(f"Expected an id, and a label of 1, 0 or nothing in {where}, got {id_[:20]!r}, {label[:20]!r}.")
+        trace = np.zeros((1, 0), dtype=np.float32) if rejected else self._trace(words[10:], where)
+        return JournalLine(id_, trace, LABELS.get(label), part or None, action, predicted, reason, *bound)
 
-    def _first_form(self, words: list[str], where: str) -> JournalLine:
-        trace = _trace(words[1:], self.spec, where)
-        if words[0] not in LABELS:
-            raise DataError(f"Expected a label of 1 or 0 in {where}, got {words[0][:20]!r}.")
-        return JournalLine(trace, LABELS[words[0]])
-
-
-def _checked(text: str, where: str) -> str:
-    """A line without its CRC, which fits."""
-    said, _, crc = text.rpartition(",")
-    if f"{zlib.crc32(said.encode()):08x}" != crc:
-        raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
-    return said
-
-
-def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
-    expected = spec.channels * spec.samples
-    if len(words) != expected and (spec.fit == "strict" or not words or len(words) % spec.channels):
-        raise DataError(f"Expected {expected} samples in {where}, got {len(words)}; it is damaged, or of another cell.")
-    try:
-        with np.errstate(over="ignore"):
-            values = np.array([_number(word) for word in words]).astype(np.float32)
-    except ValueError as error:
-        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
-    return as_trace(values.reshape(spec.channels, -1), spec)
-
-
-def _number(word: str) -> float:
-    if "_" in word:
-        raise ValueError(
-            f"could not convert string to float: {word!r}"
-        )  # Python's own numbers have them, a cell's have not
-    return float(word)
+    def _trace(self, words: list[str], where: str) -> NDArray[np.float32]:
+        expected = self.spec.channels * self.spec.samples
+        if len(words) != expected and (self.spec.fit == "strict" or not words or len(words) % self.spec.channels):
+            raise DataError(f"Expected {expected} samples in {where}, got {len(words)}; it is damaged, or of another cell.")
+        try:
+            with np.errstate(over="ignore"):
+                values = np.array([float(word) for word in words]).astype(np.float32)
+        except ValueError as error:
+            raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
+        return as_trace(values.reshape(self.spec.channels, -1), self.spec)
 
 
 def import_journal(
@@ -274,9 +221,9 @@ def import_journal(
 
 
 def _must_be_of(store: Store, journal: Journal, path: str | os.PathLike[str]) -> None:
-    """DataError where a journal's model was not exported from the store. Earlier forms are of exports not noted always."""
+    """DataError where a journal's model was not exported from the store."""
     exports = {event.text.split()[0] for event in store.events() if event.kind == EXPORTED}
-    if journal.version > 2 and exports and journal.sum not in exports:
+    if exports and journal.sum not in exports:
         raise DataError(
             f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
             "which is none of its exports; name the store that it came from, or say --any-model if it is right."
@@ -295,7 +242,7 @@ def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
     return [
         replace(line, label=True) if line.label is None else line
         for line in journal.lines
-        if not any(line is each for each in waits) and not _is_elsewhere(line, late.get(line.id) if line.id else None)
+        if not any(line is each for each in waits) and not _is_elsewhere(line, late.get(line.id))
     ]
 
 
@@ -309,17 +256,16 @@ def _import_lines(
 ) -> ImportReport:
     gate, counts = TraceGate(spec), Counter[str]()
     looks = [gate(torch.from_numpy(line.trace)) for line in lines]
-    made = import_ids(np.array([hash_ for _, hash_ in looks], dtype=np.int64))
-    ids = [line.id or id_ for line, id_ in zip(lines, made, strict=True)]
     counts_silence = policy.stops == "some"
     since = int(store.settings().get("policy_since", 0))
     silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
     for start in range(0, len(lines), CHUNK):
         labels: list[NewLabel] = []
         for i in range(start, min(start + CHUNK, len(lines))):
-            line, (fault, hash_), held = lines[i], looks[i], store.get_decision(ids[i])
+            line, (fault, hash_) = lines[i], looks[i]
+            held = store.get_decision(line.id)
             if held is None:
-                decision = _decided(ids[i], line, fault, policy.audit_rate)
+                decision = _decided(line, fault, policy.audit_rate)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
             elif held.source is not None:  # a forgotten one has a label too
                 if line.label is not None:
@@ -328,8 +274,8 @@ def _import_lines(
             if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
                 silent += (line.label is None) - (held is not None)
             if line.label is not None:
-                source = source_of(ids[i], line.action, line.reason is Reason.AUDIT, line.label)
-                labels.append(NewLabel(ids[i], line.label, source, 0, None, 0 if fault else silent))
+                source = source_of(line.id, line.action, line.reason is Reason.AUDIT, line.label)
+                labels.append(NewLabel(line.id, line.label, source, 0, None, 0 if fault else silent))
                 silent = silent if fault else 0
                 counts["quarantined" if fault else "imported"] += 1
         if labels:
@@ -342,8 +288,8 @@ def _import_lines(
     )
 
 
-def _decided(id_: str, line: JournalLine, fault: int, audit_rate: float) -> Decision:
+def _decided(line: JournalLine, fault: int, audit_rate: float) -> Decision:
     audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
     counted = line.lower, line.upper, line.n_success, line.n_failure
     propensity = 1.0 if line.predicted is Action.VERIFY else audit_rate
-    return Decision(id_, line.action, line.predicted, *counted, None, 0, reason, audit, propensity, line.part)
+    return Decision(line.id, line.action, line.predicted, *counted, None, 0, reason, audit, propensity, line.part)

@@ -140,8 +140,6 @@ class ExportedModel:
         self.module = module
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
-        self._asked = module if metadata["schema"] > 1 else FirstSchema(module, metadata["references"])
-        self._decide = self._asked.decide
 
     def decide(self, trace: ArrayLike, part: str | int | None = None) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), of the part with this number; TraceError for a wrong shape.
@@ -150,7 +148,7 @@ class ExportedModel:
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
-            action, reason, lower, upper, n_success, n_failure, z = self._decide(x, _hash_of(part))
+            action, reason, lower, upper, n_success, n_failure, z = self.module.decide(x, _hash_of(part))
         return ExportedDecision(ACTIONS[action], REASONS[reason], lower, upper, n_success, n_failure, z.numpy())
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
@@ -162,11 +160,11 @@ class ExportedModel:
 
         The trace becomes a reference, and the rule is told. A faulty trace is not learned from.
         """
-        return self._tell(self._asked.learn, trace, as_success(success), _hash_of(part))
+        return self._tell(self.module.learn, trace, as_success(success), _hash_of(part))
 
     def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
         """Tell that an accepted part was bad and stopped the system; as `learn`."""
-        return self._tell(self._asked.stop, trace, _hash_of(part))
+        return self._tell(self.module.stop, trace, _hash_of(part))
 
     def _tell(self, method: Any, trace: ArrayLike, *what: Any) -> int:
         with torch.inference_mode():
@@ -177,43 +175,15 @@ class ExportedModel:
     @property
     def safe_mode(self) -> str:
         """Why everything is verified at present, in words; "" where it is not."""
-        return SAFE_MODE[self._asked.safe_mode()]
+        return SAFE_MODE[self.module.safe_mode()]
 
     def save(self, path: str | os.PathLike[str], *, key: KeyFile | None = None, force: bool = False) -> Path:
         """Write all that was learned, and what waits for its label, to a file of the same kind, with its checksum.
 
         key, force : as of `export_torchscript`.
         """
-        now = {"references": self._asked.n_references(), "references_sha256": None}  # the sum is that of the first export
+        now = {"references": self.module.n_references(), "references_sha256": None}  # the sum is that of the first export
         return write_export(path, _content(self.module, self.metadata | now), force, key)
-
-
-class FirstSchema:
-    """A module of schema 1 under the methods of today's: it knows no parts, and a stop is a failure as any other."""
-
-    def __init__(self, module: Any, held: int) -> None:
-        self.module, self.held = module, held
-
-    def decide(self, x: Tensor, part: int = 0) -> Any:
-        """`DecisionModule.decide`."""
-        return self.module.decide(x)
-
-    def learn(self, x: Tensor, success: bool, part: int = 0) -> int:
-        """`DecisionModule.learn`."""
-        self.held = int(self.module.learn(x, success))
-        return self.held
-
-    def stop(self, x: Tensor, part: int = 0) -> int:
-        """`DecisionModule.stop`."""
-        return self.learn(x, False)
-
-    def safe_mode(self) -> int:
-        """There is none."""
-        return 0
-
-    def n_references(self) -> int:
-        """References held."""
-        return self.held
 
 
 def _hash_of(part: Any) -> int:

@@ -15,8 +15,7 @@ from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript, load
 from dengine.cli import main
 from dengine.engine.engine import DataEngine
 from dengine.errors import ExportError
-from dengine.export import export_sources
-from dengine.export.cell_journal import import_journal
+from dengine.export import export_sources, import_journal
 from dengine.records import ACTIONS, Action
 
 SAMPLES = 80

@@ -16,8 +16,8 @@ import pytest
 from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript
 from dengine.engine.engine import DataEngine
 from dengine.errors import DataError
-from dengine.export import load_exported, make_key
-from dengine.export.cell_journal import import_journal, read_journal
+from dengine.export import import_journal, load_exported, make_key
+from dengine.export.cell_journal import read_journal
 from dengine.records import Action
 
 SAMPLES = 100

@@ -22,7 +22,7 @@ import numpy as np
 from dengine import Action, DataEngine, export_torchscript, load_exported
 from dengine.datasets.importing import import_labelled
 from dengine.errors import DengineError
-from dengine.export.cell_journal import import_journal
+from dengine.export import import_journal
 
 from .harness import PROBE, RECIPE, Outcome, Place, missing, stream
 

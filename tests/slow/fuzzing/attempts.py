@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import random
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from click.testing import CliRunner
 from dengine import Action, DataEngine, DengineError, Recipe, TraceSpec, load_dataset, open_store
 from dengine.cli import main as command_line
 from dengine.datasets.importing import import_labelled
-from dengine.export.cell_journal import import_journal
+from dengine.export import import_journal
 from dengine.testing import toy_traces
 
 from .oddities import ODD, SAMPLES, TOML, WORDS, odd_trace, spoilt
@@ -51,9 +52,9 @@ class Fuzz:
     def _small_store(self, name: str) -> bytes:
         with DataEngine("pca", retrain_every=10**9, store=self.folder / name) as engine:
             self._teach(engine)
-        self.journal = "\n".join(f"{good},{','.join(map(str, x))}" for x, good in zip(self.X[:3] + 1, self.y, strict=False))
-        decided = "7,verify,verify,uncertain,0.2,1.0,3,0"
-        self.journal2 = "# dengine 2 abc\n" + "\n".join(f"1,{decided},{','.join(map(str, x))}" for x in self.X[:3] + 2)
+        lines = [f"part,a-{i},{y},7,verify,verify,uncertain,0.2,1.0,3,0" for i, y in enumerate(self.y[:3])]
+        lines = [f"{line},{','.join(map(str, x))}" for line, x in zip(lines, self.X[:3] + 1, strict=True)]
+        self.journal = "\n".join(["# dengine 3 abc", *(f"{line},{zlib.crc32(line.encode()):08x}" for line in lines), ""])
         return (self.folder / name).read_bytes()
 
     def _saved(self, write: Callable[[Any], None]) -> bytes:
@@ -69,7 +70,7 @@ class Fuzz:
             for line in (
                 "status store.db --json",
                 "export store.db --out model.ts --format torchscript",
-                "import-labels cell.csv --store store.db",
+                "import-labels cell.csv --store store.db --any-model",
                 "data small.npz --samples 20 --fit cut --rate 500 --part part",
                 "replay --data small.npz --reducer pca --alpha 0.1 --lower-bound 0.9 --repeats 1 --cycles 4 --seed 0",
                 "compare --data small.npz --reducers pca --alphas 0.1 --intervals wilson --repeats 1 --cycles 4",
@@ -161,9 +162,9 @@ class Fuzz:
         return "taken"
 
     def journals(self, rng: random.Random) -> str:
-        """Damaged journals of both forms into a store."""
+        """Damaged journals into a store."""
         path = self.folder / "journal.csv"
-        path.write_bytes(spoilt(rng, rng.choice((self.journal, self.journal2)).encode()))
+        path.write_bytes(spoilt(rng, self.journal.encode()))
         place = self.folder / "journals.db"
         if not place.exists() or rng.random() < 0.02:
             place.write_bytes(self.store)

@@ -13,9 +13,6 @@
 // A label is on the disk (fdatasync) when it is acknowledged; a decision is handed to the operating system, and reaches
 // the disk with the next label. A last line without its end was being written when the process was killed: it was never
 // acknowledged, and is cut off. Anything else that does not fit is damage, and is refused with its number.
-//
-// A journal of the earlier program begins with `# dengine 2 SUM`; its lines, `LABEL,PART,ACTION,...` without a CRC, are read
-// as well, and it is gone on with.
 #pragma once
 
 #include <fcntl.h>
@@ -87,18 +84,15 @@ class Journal {
 
   private:
     void reread(const OnPart& on_part, const OnLabel& on_label) {
-        const std::string head = "# dengine 3 " + model_.sum, earlier = "# dengine 2 " + model_.sum;
+        const std::string head = "# dengine 3 " + model_.sum;
         std::ifstream in(path_, std::ios::binary);
         std::string line;
         for (number_ = 1; std::getline(in, line); ++number_) {
             const bool cut = in.eof();  // the file ends before the line does
-            if (number_ == 1) {
-                earlier_ = line == earlier;
-                // Labels that a newer export already holds must not be counted twice.
-                if (line != head && !earlier_ && !(cut && (head.starts_with(line) || earlier.starts_with(line)))) {
-                    fail("belongs to another export, or to an older program; take it in with dengine import-labels, and name "
-                         "a new journal");
-                }
+            // Labels that a newer export already holds must not be counted twice.
+            if (number_ == 1 && line != head && !(cut && head.starts_with(line))) {
+                fail("belongs to another export, or to another program; take it in with dengine import-labels, and name a new "
+                     "journal");
             }
             if (cut) break;
             if (number_ > 1 && !take(line, on_part, on_label)) {
@@ -119,11 +113,11 @@ class Journal {
 
     bool take(std::string_view line, const OnPart& on_part, const OnLabel& on_label) {
         const bool is_part = line.starts_with("part,");
-        if (!is_part && !line.starts_with("label,")) return earlier_ && take_part(line, false, on_part);
+        if (!is_part && !line.starts_with("label,")) return false;
         const auto comma = line.rfind(',');
         if (crc32::hex(line.substr(0, comma)) != line.substr(comma + 1)) return false;
         line = line.substr(line.find(',') + 1, comma - line.find(',') - 1);
-        if (is_part) return take_part(line, true, on_part);
+        if (is_part) return take_part(line, on_part);
         bool more = true;
         const std::string id(take_word(line, more)), label(take_word(line, more));
         if (more || (label != "1" && label != "0")) return false;
@@ -132,11 +126,11 @@ class Journal {
     }
 
     // The decision with its own numbers, of its own time, and its label.
-    bool take_part(std::string_view line, bool has_id, const OnPart& on_part) {
+    bool take_part(std::string_view line, const OnPart& on_part) {
         bool more = true;
         const auto word = [&] { return more ? take_word(line, more) : std::string_view(); };
         Record record;
-        record.id = has_id ? std::string(word()) : "line-" + std::to_string(number_);
+        record.id = word();
         const auto label = word();
         record.part = word();
         const auto action = position(model_.actions, word()), predicted = position(model_.actions, word());
@@ -148,7 +142,7 @@ class Journal {
         record.decision.action = action;
         record.predicted = predicted;
         if (label != "") record.label = label == "1";
-        if (action == REJECT && has_id && label == "" && !more) {
+        if (action == REJECT && label == "" && !more) {
             on_part(std::move(record));
             return true;
         }
@@ -189,5 +183,5 @@ class Journal {
     int file_ = -1;
     off_t size_ = 0;
     long long number_ = 0;
-    bool earlier_ = false, broken_ = false;
+    bool broken_ = false;
 };
