@@ -81,8 +81,8 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
     head = whole[0].decode("utf-8", errors="replace").split() if whole else []
     if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
         raise DataError(
-            f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import it with the dengine whose "
-            "program wrote it."
+            f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import it with the "
+            "dengine whose program wrote it."
         )
     reader = _Reader(spec)
     for number, raw in enumerate(whole[1:], start=2):
