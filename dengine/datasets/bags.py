@@ -1,23 +1,18 @@
-"""The insertions of a bag: one long wrench topic cut by a trigger, and their labels.
+"""The insertions of a bag: one long wrench topic in MCAP files, cut by a trigger, and their labels.
 
-Labels are a topic of their own, of which the first message after an insertion has begun counts; or a file of labels that
-names the insertions by their numbers, from 1.
-
-MCAP files, and rosbag2 folders of them: their topics, and the messages of a wrench and of what goes with it.
-
-The force is a topic of geometry_msgs/WrenchStamped or Wrench. Its times are the stamps in its headers, or where it has none
-those of the log.
+The force is a topic of geometry_msgs/WrenchStamped or Wrench; its times are the stamps in its headers, or else those of
+the log. Labels are a topic, of which the first message after an insertion has begun counts, or a file of them by number.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +25,7 @@ from .dataset import Asked, Dataset, Fault, UnreadableError
 from .folders import natural
 from .labels import Listed, label_of, listed
 from .lengths import Collected, as_dataset
-from .triggers import Active, Trigger, as_trigger
+from .triggers import Trigger, as_trigger
 
 if TYPE_CHECKING:
     from mcap.reader import McapReader
@@ -41,6 +36,7 @@ WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 AXES = ("FX", "FY", "FZ", "MX", "MY", "MZ")  # in the frame that the topic is in
 ALIASES = dict(zip(("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base"), AXES, strict=True))
 SIZE = 8 * (len(AXES) + 4)  # bytes of one message, read
+SECONDS = 2.0  # of an insertion, where no number of samples was asked for
 
 
 @dataclass
@@ -81,11 +77,9 @@ def is_stream(source: Any) -> bool:
     if not isinstance(source, str | os.PathLike):
         return False
     path = Path(source)
-    return (path.is_file() and path.suffix.lower() == SUFFIX) or (path.is_dir() and _is_bag(path))
-
-
-def _is_bag(folder: Path) -> bool:
-    return any(folder.glob(f"*{SUFFIX}")) or ((folder / "metadata.yaml").is_file() and any(folder.glob("*.db3")))
+    if not path.is_dir():
+        return path.is_file() and path.suffix.lower() == SUFFIX
+    return any(path.glob(f"*{SUFFIX}")) or ((path / "metadata.yaml").is_file() and any(path.glob("*.db3")))
 
 
 def axis_of(name: str) -> int | None:
@@ -94,48 +88,30 @@ def axis_of(name: str) -> int | None:
     return AXES.index(known) if known in AXES else None
 
 
-def files_of(path: Path) -> list[Path]:
-    """The MCAP files of a bag, in order, or the one that it is."""
-    if not path.is_dir():
-        return [path]
-    files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name))
-    if not files:
-        raise DataError(
-            f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of another storage (.db3)."
-        )
-    return files
-
-
-def _open(file: IO[bytes]) -> McapReader:
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    return make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-
-
 @contextmanager
-def _readable(path: Path) -> Iterator[McapReader]:
+def _reader(path: Path) -> Iterator[McapReader]:
     """A file's reader; DataError for whatever its libraries raise on a file that is damaged, or is something else."""
     from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
     from zstandard import ZstdError
 
     damaged = (McapError, ZstdError, *UNREADABLE)
     try:
         with path.open("rb") as file:
-            yield _open(file)
+            yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
     except damaged as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(
-            f"Cannot read {path} as an MCAP file: {' '.join(str(error).split()) or type(error).__name__}."
-        ) from error
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"Cannot read {path} as an MCAP file: {said}.") from error
 
 
-def topics_of(files: Iterable[Path]) -> dict[str, str]:
+def _topics(files: Sequence[Path]) -> dict[str, str]:
     """Topic -> the name of its type."""
     found: dict[str, str] = {}
     for path in files:
-        with _readable(path) as reader:
+        with _reader(path) as reader:
             summary = reader.get_summary()
             if summary is None or summary.statistics is None:
                 raise DataError(f"Expected a summary in {path}, there is none: was it cut off? mcap recover mends it.")
@@ -146,14 +122,7 @@ def topics_of(files: Iterable[Path]) -> dict[str, str]:
     return found
 
 
-def must_have(topics: Sequence[str], have: Mapping[str, str], path: Path) -> None:
-    """DataError for a topic that is not there."""
-    missing = [topic for topic in topics if topic not in have]
-    if missing:
-        raise DataError(f"Expected the topic {missing[0]} in {path}, found {in_words(have) or 'none'}.")
-
-
-def wrench_topic(have: Mapping[str, str], path: Path, asked: str | None) -> str:
+def _wrench(have: dict[str, str], path: Path, asked: str | None) -> str:
     """The topic of the force; DataError where there is none, or several and none was asked for."""
     wrenches = [topic for topic, kind in have.items() if kind in WRENCHES]
     if asked is not None and asked not in wrenches:
@@ -164,28 +133,22 @@ def wrench_topic(have: Mapping[str, str], path: Path, asked: str | None) -> str:
     return asked or wrenches[0]
 
 
-def read_messages(files: Iterable[Path], wrench: str, topics: Sequence[str]) -> Messages:
+def _messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Messages:
     """Every message of the wrench, and of the other topics, in the order of the log."""
     found = Messages(others={topic: [] for topic in topics})
     for path in files:
-        with _readable(path) as reader:
+        with _reader(path) as reader:
             for each in reader.iter_decoded_messages(topics=[wrench, *topics]):
-                message, logged = each.decoded_message, each.message.log_time
-                if each.channel.topic == wrench:
+                topic, message, logged = each.channel.topic, each.decoded_message, each.message.log_time
+                if topic == wrench:
                     found.add(message, logged)
-                if each.channel.topic in found.others:
-                    found.others[each.channel.topic].append((logged, _value(message, each.channel.topic)))
+                if topic in found.others:
+                    if not hasattr(message, "data"):
+                        raise DataError(
+                            f"Expected messages with a field data on {topic}, as those of std_msgs, got others."
+                        )
+                    found.others[topic].append((logged, message.data))
     return found
-
-
-def _value(message: Any, topic: str) -> Any:
-    """What a message of one value says, as std_msgs' do."""
-    if not hasattr(message, "data"):
-        raise DataError(f"Expected messages with a field data on {topic}, as those of std_msgs, got another type.")
-    return message.data
-
-
-SECONDS = 2.0  # of an insertion, where no number of samples was asked for
 
 
 def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
@@ -196,39 +159,34 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
         raise DataError(
             f"Expected a trigger that cuts {path} into insertions, as trigger='contact=5' or 'register@/phase', got none."
         )
-    trigger, channels = as_trigger(asked.trigger), _channels(asked)
-    files = files_of(path)
-    have = topics_of(files)
-    wrench = wrench_topic(have, path, asked.topic)
+    trigger, channels = as_trigger(asked.trigger), asked.channels or ("FZ",)
+    for channel in channels:
+        if axis_of(channel) is None:
+            raise DataError(f"Expected a channel among {', '.join(AXES)} of a wrench, got {channel}.")
+    files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
+    if not files:
+        raise DataError(
+            f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of another storage (.db3)."
+        )
+    have = _topics(files)
+    wrench = _wrench(have, path, asked.topic)
     topics = [signal for signal in trigger.signals if axis_of(signal) is None] + ([asked.label] if asked.label else [])
-    must_have(topics, have, path)
-    messages = read_messages(files, wrench, topics)
+    for topic in topics:
+        if topic not in have:
+            raise DataError(f"Expected the topic {topic} in {path}, found {in_words(have) or 'none'}.")
+    messages = _messages(files, wrench, topics)
     if len(messages.logged) < 2:
         raise DataError(f"Expected messages of {wrench} in {path}, found {len(messages.logged)}.")
     return _dataset(messages, trigger, channels, name, asked)
 
 
-def _channels(asked: Asked) -> tuple[str, ...]:
-    unknown = [name for name in asked.channels if axis_of(name) is None]
-    if unknown:
-        raise DataError(f"Expected a channel among {', '.join(AXES)} of a wrench, got {unknown[0]}.")
-    return asked.channels or ("FZ",)
-
-
-def _active(messages: Messages, trigger: Trigger) -> Active:
-    wrench, signals = np.array(messages.wrench), {}
-    for name in trigger.signals:
-        axis = axis_of(name)
-        signals[name] = messages.held(name) if axis is None else wrench[:, axis]
-    return trigger.active(signals)
-
-
 def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], name: str, asked: Asked) -> Dataset:
-    times, axes = messages.times, [AXES.index(ALIASES.get(channel, channel)) for channel in channels]
-    rate = asked.rate_hz or float(f"{1.0 / usual_step(times):.4g}")
+    axes = [AXES.index(ALIASES.get(channel, channel)) for channel in channels]
+    values, places = np.array(messages.wrench), {signal: axis_of(signal) for signal in trigger.signals}
+    active = trigger.active({n: messages.held(n) if axis is None else values[:, axis] for n, axis in places.items()})
+    rate = asked.rate_hz or float(f"{1.0 / usual_step(messages.times):.4g}")
     samples = asked.samples or round(SECONDS * rate)
-    values, active = np.array(messages.wrench)[:, axes], _active(messages, trigger)
-    cuts = list(cut_stream(times, values, active, samples, trigger.quiet_s, asked.rate_hz))
+    cuts = list(cut_stream(messages.times, values[:, axes], active, samples, trigger.quiet_s, asked.rate_hz))
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]

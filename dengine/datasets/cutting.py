@@ -1,6 +1,4 @@
-"""One long recording of many insertions, cut into them by a trigger: each a trace, or a fault that says why it is none.
-
-One insertion cut out of a stream of samples: where it begins, and each sample at the place that its time gives it.
+"""Insertions, cut out of a stream of samples: where each begins, and each sample at the place that its time gives it.
 
 Nothing is filled in. What a timestamp leaves out is a NaN at its place, so that whoever decides finds it.
 """
@@ -16,6 +14,10 @@ from numpy.typing import NDArray
 from .triggers import Active
 
 NEAR = 1.5  # steps: to the next sample, when none is missing
+AHEAD = 100  # messages: a burst of so many that come late is no gap
+SPAN = 100  # messages that the step is measured over, where single steps do not tell it
+ODD = 0.3  # of a step: so far off what they come to, single steps are of bursts
+Times = NDArray[np.float64]
 Gaps = tuple[tuple[int, int], ...]
 
 
@@ -86,12 +88,6 @@ def gaps_of(there: NDArray[np.bool_]) -> Gaps:
     """(first, length) of each stretch that is not there."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], there, [True]]).astype(np.int8)))
     return tuple((int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True))
-
-
-AHEAD = 100  # messages: a burst of so many that come late is no gap
-SPAN = 100  # messages that the step is measured over, where single steps do not tell it
-ODD = 0.3  # of a step: so far off what they come to, single steps are of bursts
-Times = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

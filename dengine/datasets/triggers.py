@@ -130,29 +130,11 @@ class MotionTrigger:
         return np.asarray(np.linalg.norm(each, axis=0) > self.speed)
 
 
-def _bit(number: str, signal: str) -> Trigger:
-    return BitTrigger(int(number), signal) if signal else BitTrigger(int(number))
-
-
-def _register(number: str, signal: str) -> Trigger:
-    value = float(number) if number else None
-    return RegisterTrigger(signal, value) if signal else RegisterTrigger(value=value)
-
-
-def _contact(number: str, signal: str) -> Trigger:
-    return ContactTrigger(float(number), signal) if signal else ContactTrigger(float(number))
-
-
-def _motion(number: str, signal: str) -> Trigger:
-    default = MotionTrigger()
-    return MotionTrigger(float(number) if number else default.speed, signal or default.signal)
-
-
-KINDS: dict[str, tuple[Callable[[str, str], Trigger], str]] = {
-    "bit": (_bit, r"\d+"),
-    "register": (_register, r"-?\d+|"),
-    "contact": (_contact, r"\d+(\.\d+)?"),
-    "motion": (_motion, r"\d+(\.\d+)?|"),
+KINDS: dict[str, tuple[type, str, Callable[[str], float], str]] = {  # class, field of the number, its type and pattern
+    "bit": (BitTrigger, "bit", int, r"\d+"),
+    "register": (RegisterTrigger, "value", float, r"-?\d+|"),
+    "contact": (ContactTrigger, "newtons", float, r"\d+(\.\d+)?"),
+    "motion": (MotionTrigger, "speed", float, r"\d+(\.\d+)?|"),
 }
 EXAMPLES = "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base, motion=0.002"
 
@@ -167,7 +149,9 @@ def as_trigger(asked: Any) -> Trigger:
     if not isinstance(asked, str):
         raise SettingError(f"Expected a trigger or its text, as {EXAMPLES}; got {type(asked).__name__}.")
     found = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", asked.strip())
-    make, number = KINDS.get(found[1], (None, "")) if found else (None, "")
-    if found is None or make is None or not re.fullmatch(number, found[2] or ""):
+    kind, number, signal = found.groups(default="") if found else ("", "", "")
+    if kind not in KINDS or not re.fullmatch(KINDS[kind][3], number):
         raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {asked!r}.")
-    return make(found[2] or "", found[3] or "")
+    make, name, cast, _ = KINDS[kind]
+    trigger: Trigger = make(**({name: cast(number)} if number else {}), **({"signal": signal} if signal else {}))
+    return trigger

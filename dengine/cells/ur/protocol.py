@@ -148,44 +148,34 @@ def text_of(payload: bytes) -> str:
 
 INDEXED = re.compile(r"(input|output)_(bit|int|double)_register_(\d+)")
 FIELDS: Mapping[str, str] = {  # of the guide, those that a controller gives out; registers with a number: `type_of`
-    **dict.fromkeys(
-        (
-            *("timestamp", "actual_execution_time", "speed_scaling", "target_speed_fraction", "actual_momentum"),
-            *("actual_main_voltage", "actual_robot_voltage", "actual_robot_current", "standard_analog_input0"),
-            *("standard_analog_input1", "standard_analog_output0", "standard_analog_output1", "io_current", "payload"),
-            *("tcp_force_scalar", "speed_slider_fraction", "standard_analog_output_0", "standard_analog_output_1"),
+    name: kind
+    for kind, names in {
+        "DOUBLE": (
+            "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage "
+            "actual_robot_voltage actual_robot_current standard_analog_input0 standard_analog_input1 "
+            "standard_analog_output0 standard_analog_output1 io_current payload tcp_force_scalar speed_slider_fraction "
+            "standard_analog_output_0 standard_analog_output_1"
         ),
-        "DOUBLE",
-    ),
-    **dict.fromkeys(
-        (
-            *("target_q", "target_qd", "target_qdd", "target_current", "target_moment", "actual_q", "actual_qd"),
-            *("actual_current", "joint_control_output", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
-            *("target_TCP_pose", "target_TCP_speed", "joint_temperatures", "actual_joint_voltage", "payload_inertia"),
-            *("ft_raw_wrench", "external_force_torque"),
+        "VECTOR6D": (
+            "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
+            "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
+            "joint_temperatures actual_joint_voltage payload_inertia ft_raw_wrench external_force_torque"
         ),
-        "VECTOR6D",
-    ),
-    **dict.fromkeys(("actual_tool_accelerometer", "payload_cog", "elbow_position", "elbow_velocity"), "VECTOR3D"),
-    **dict.fromkeys(("actual_digital_input_bits", "actual_digital_output_bits"), "UINT64"),
-    **dict.fromkeys(("robot_mode", "safety_mode", "safety_status"), "INT32"),
-    **dict.fromkeys(
-        (
-            *("runtime_state", "robot_status_bits", "safety_status_bits", "output_bit_registers0_to_31"),
-            *("output_bit_registers32_to_63", "input_bit_registers0_to_31", "input_bit_registers32_to_63"),
-            *("speed_slider_mask", "script_control_line"),
+        "VECTOR3D": "actual_tool_accelerometer payload_cog elbow_position elbow_velocity",
+        "UINT64": "actual_digital_input_bits actual_digital_output_bits",
+        "INT32": "robot_mode safety_mode safety_status",
+        "UINT32": (
+            "runtime_state robot_status_bits safety_status_bits output_bit_registers0_to_31 output_bit_registers32_to_63 "
+            "input_bit_registers0_to_31 input_bit_registers32_to_63 speed_slider_mask script_control_line"
         ),
-        "UINT32",
-    ),
-    **dict.fromkeys(
-        (
-            *("standard_digital_output_mask", "standard_digital_output", "configurable_digital_output_mask"),
-            *("tool_digital_output_mask", "tool_digital_output"),
-            *("configurable_digital_output", "standard_analog_output_mask", "standard_analog_output_type"),
+        "UINT8": (
+            "standard_digital_output_mask standard_digital_output configurable_digital_output_mask "
+            "tool_digital_output_mask tool_digital_output configurable_digital_output standard_analog_output_mask "
+            "standard_analog_output_type"
         ),
-        "UINT8",
-    ),
-    "joint_mode": "VECTOR6INT32",
+        "VECTOR6INT32": "joint_mode",
+    }.items()
+    for name in names.split()
 }
 
 
