@@ -61,7 +61,12 @@ def said_of(found: Explanation) -> str:
 # ----------------------------------------------------------------------------------------------- what is found again
 
 
-@pytest.mark.parametrize("name", RECIPES)
+SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) for name in RECIPES if name not in ("local", "pooled")
+]  # ten seconds each
+
+
+@pytest.mark.parametrize("name", ["local", "pooled", *SLOW])
 def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
     name: str, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:

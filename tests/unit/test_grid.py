@@ -176,6 +176,7 @@ def test_a_grid_is_the_same_on_loky(data: Dataset, serial, workers: int) -> None
         assert decisions_of(run_grid(data, [RECIPE, "always"], **GRID, n_jobs=workers)).equals(serial)
 
 
+@pytest.mark.slow
 def test_a_grid_is_the_same_on_a_dask_cluster(
     data: Dataset, serial, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

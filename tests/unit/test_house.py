@@ -74,7 +74,6 @@ def test_no_base_of_ours_has_a_single_subclass() -> None:
     assert not alone, f"{len(alone)} bases have one subclass; make the two one class, or compose them: {told}"
 
 
-@UNTIL_DONE
 def test_no_module_is_imported_by_a_string() -> None:
     # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is found by `find_class`.
     strings = {
