@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import string
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,11 +19,9 @@ from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.records import Action, Reason, Source
 from dengine.serve.auth import Access
 from dengine.serve.http import create_app
-from dengine.serve.page.actions import ACTS
-from dengine.serve.page.charts import Scale, element
+from dengine.serve.page.charts import Scale, element, number, percent
 from dengine.serve.page.looking import Looking, Pulse
-from dengine.serve.page.views import history_query
-from dengine.serve.page.words import CATALOGUES, Words, language
+from dengine.serve.page.views import SOURCE, WORDS, duration, history_query
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
 
@@ -70,43 +67,14 @@ def act(client: TestClient, name: str, **form: str) -> tuple[int, str]:
     return answer.status_code, answer.json()["said"]
 
 
-def test_both_languages_have_the_same_messages_with_the_same_places() -> None:
-    english, german = CATALOGUES["en"], CATALOGUES["de"]
-    assert set(english) == set(german)
-
-    def places(text: str) -> set[str]:
-        return {name for _, name, _, _ in string.Formatter().parse(text) if name}
-
-    assert [key for key in english if places(english[key]) != places(german[key])] == []
+def test_every_reason_action_source_and_act_has_its_words() -> None:
+    assert {f"reason.{each.value}" for each in Reason} | {f"action.{each.value}" for each in Action} <= set(WORDS)
+    assert set(SOURCE) == set(Source)
 
 
-@pytest.mark.parametrize("lang", CATALOGUES)
-def test_every_reason_action_source_and_act_has_its_words(lang: str) -> None:
-    w = Words(lang)
-    for reason in Reason:
-        assert w(f"reason.{reason.value}")
-        assert w(f"why.{reason.value}", predicted=w("action.accept"))
-    for action in Action:
-        assert w(f"action.{action.value}")
-    for source in Source:
-        assert w(f"source.{source.value}")
-    for name in (*ACTS, "export"):
-        assert w(f"act.{name}.done")
-
-
-def test_numbers_are_written_as_each_language_has_them() -> None:
-    english, german = Words("en"), Words("de")
-    assert (english.number(1234.56, 1), german.number(1234.56, 1)) == ("1,234.6", "1.234,6")
-    assert (english.number(-0.04, 1), english.number(-2.0), english.number(None)) == ("0.0", "−2", "–")
-    assert german.percent(0.125, 1) == "12,5\u202f%"
-    assert english.duration(90) == "90 s"
-    assert german.duration(9000) == "2,5 h"
-
-
-def test_the_language_is_the_chosen_one_else_the_browsers_first_known() -> None:
-    assert language("de", "en") == "de"
-    assert language(None, "fr;q=0.9, de-AT;q=0.8, en;q=0.7") == "de"
-    assert language("xx", "en;q=nonsense, *") == "en"
+def test_numbers_are_written_to_be_read() -> None:
+    assert (number(1234.56, 1), number(-0.04, 1), number(-2.0), number(None)) == ("1,234.6", "0.0", "−2", "–")
+    assert (percent(0.125, 1), duration(90), duration(9000)) == ("12.5\u202f%", "90 s", "2.5 h")
 
 
 def test_whatever_goes_into_a_picture_is_escaped() -> None:
@@ -124,19 +92,17 @@ def test_a_scale_stays_in_its_picture_and_has_round_ticks() -> None:
     assert Scale(1.0, 1.0, 0.0, 9.0).ticks() == [1.0]
 
 
-@pytest.mark.parametrize("lang", CATALOGUES)
 @pytest.mark.parametrize("n", [0, 1, 70])
 def test_every_view_is_shown_before_the_first_part_and_after_many(
-    client: TestClient, service: CellService, stream: Dataset, n: int, lang: str
+    client: TestClient, service: CellService, stream: Dataset, n: int
 ) -> None:
     cell_runs(service, stream, n)
     for view in VIEWS:
-        answer = client.get(view, headers={"accept-language": lang})
+        answer = client.get(view)
         assert answer.status_code == 200
-        assert f'<html lang="{lang}"' in answer.text
         assert "script-src 'self'" in answer.headers["content-security-policy"]
-    assert client.get("/static/../words.py").status_code == 404
-    assert client.get("/page/static/%2e%2e/words.py").status_code == 404
+    assert client.get("/static/../views.py").status_code == 404
+    assert client.get("/page/static/%2e%2e/views.py").status_code == 404
 
 
 def test_strange_names_stay_text_wherever_they_are_shown(client: TestClient, service: CellService, stream: Dataset) -> None:
@@ -234,11 +200,11 @@ def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> 
             service.close()
 
 
-def test_a_choice_of_language_and_appearance_goes_into_a_cookie_and_back_to_the_view(client: TestClient) -> None:
-    answer = client.get("/history?label=bad&lang=de", follow_redirects=False)
+def test_a_choice_of_appearance_goes_into_a_cookie_and_back_to_the_view(client: TestClient) -> None:
+    answer = client.get("/history?label=bad&theme=light", follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/history?label=bad")
     assert "samesite=strict" in answer.headers["set-cookie"].lower()
-    assert '<html lang="de" data-theme="dark"' in client.get("/how?theme=dark").text
+    assert 'data-theme="dark"' in client.get("/how?theme=dark").text
     assert client.get("/how?theme=pink").status_code == 200
 
 

@@ -21,21 +21,12 @@ from ...errors import BusyError, DengineError, ReportError, SettingError
 from ..api import Refusal, read_body
 from ..auth import is_own_page, is_same
 from .looking import Looking
-from .words import Words
 
 LARGEST = 8192  # bytes of a form
 LONGEST = 100  # characters of an author
 
 Form = Mapping[str, str]
 Act = Callable[[DataEngine, Form, str], bool]  # done with a form, by its author; whether anything changed
-
-
-def _shadow_on(engine: DataEngine, form: Form, author: str) -> bool:
-    return engine.set_shadow(True, author).event is not None
-
-
-def _shadow_off(engine: DataEngine, form: Form, author: str) -> bool:
-    return engine.set_shadow(False, author).event is not None
 
 
 def _correct(engine: DataEngine, form: Form, author: str) -> bool:
@@ -59,13 +50,22 @@ def _retrain(engine: DataEngine, form: Form, author: str) -> bool:
     return not under_way
 
 
-ACTS: dict[str, Act] = {
-    "shadow-on": _shadow_on,
-    "shadow-off": _shadow_off,
-    "correct": _correct,
-    "rollback": _rollback,
-    "retrain": _retrain,
+ACTS: dict[str, tuple[Act, str]] = {  # what it does, and what is said once it is done
+    "shadow-on": (
+        lambda engine, form, author: engine.set_shadow(True, author).event is not None,
+        "Every part is verified from now on.",
+    ),
+    "shadow-off": (
+        lambda engine, form, author: engine.set_shadow(False, author).event is not None,
+        "The model decides again.",
+    ),
+    "correct": (_correct, "The label is corrected."),
+    "rollback": (_rollback, "The earlier model answers again."),
+    "retrain": (_retrain, "The retrain has begun; its model answers as soon as it is ready."),
 }
+REFUSED = "Expected a request of this page, got another: load the page again."
+NOTHING = "Nothing changed: it was so already."
+NO_AUTHOR = "Expected your name, got none: it goes into the event log."
 
 
 class Acts:
@@ -75,46 +75,46 @@ class Acts:
         self.token = secrets.token_urlsafe(32)
         self._service, self._looking = looking.service, looking
 
-    async def answer(self, name: str, request: Request, w: Words) -> Response:
+    async def answer(self, name: str, request: Request) -> Response:
         """Do what a form asks for, and say what became of it; an unknown act is a 404."""
         try:
-            form = await self._form(request, w)
-            author = _author(form, w)
-            response = await (self._export(author, w) if name == "export" else self._do(name, form, author, w))
+            form = await self._form(request)
+            author = _author(form)
+            response = await (self._export(author) if name == "export" else self._do(name, form, author))
         except Refusal as refusal:
             return _said(refusal.detail, refusal.status, refusal.headers)
         except (DengineError, OSError) as error:
             why = " ".join(str(error).split())
-            return _said(w("act.failed", why=why), 503 if isinstance(error, BusyError) else 409)
+            return _said(f"It was not done: {why}", 503 if isinstance(error, BusyError) else 409)
         self._looking.look_anew()
         return response
 
-    async def _do(self, name: str, form: Form, author: str, w: Words) -> Response:
+    async def _do(self, name: str, form: Form, author: str) -> Response:
         act = ACTS.get(name)
         if act is None:
-            raise Refusal(404, w("act.refused"))
-        changed = await self._service.ask(lambda engine: act(engine, form, author))
-        return _said(w(f"act.{name}.done" if changed else "act.nothing"))
+            raise Refusal(404, REFUSED)
+        changed = await self._service.ask(lambda engine: act[0](engine, form, author))
+        return _said(act[1] if changed else NOTHING)
 
-    async def _export(self, author: str, w: Words) -> Response:
+    async def _export(self, author: str) -> Response:
         content, version = await self._service.ask(lambda engine: _exported(engine, author))
         name = {"content-disposition": f'attachment; filename="model_{version}.zip"'}
         return Response(content, media_type="application/zip", headers=name)
 
-    async def _form(self, request: Request, w: Words) -> Form:
+    async def _form(self, request: Request) -> Form:
         """The form of a request of this page. Refusal for any other."""
         if not _same_origin(request):
-            raise Refusal(403, w("act.refused"))
+            raise Refusal(403, REFUSED)
         body = await read_body(request, LARGEST)
         if body is None:
-            raise Refusal(413, w("act.refused"))
+            raise Refusal(413, REFUSED)
         try:
             fields = parse_qs(body.decode("utf-8", "replace"), max_num_fields=20)
         except ValueError as error:  # more fields than that
-            raise Refusal(413, w("act.refused")) from error
+            raise Refusal(413, REFUSED) from error
         form = {key: values[-1] for key, values in fields.items()}
         if not is_same(self.token, form.get("token", "")):
-            raise Refusal(403, w("act.refused"))
+            raise Refusal(403, REFUSED)
         return form
 
 
@@ -128,10 +128,10 @@ def _same_origin(request: Request) -> bool:
     return origin is not None and fetch_site != "none" and is_own_page(origin, fetch_site, host)
 
 
-def _author(form: Form, w: Words) -> str:
+def _author(form: Form) -> str:
     author = " ".join(form.get("author", "").split())
     if not author or not author.isprintable() or len(author) > LONGEST:
-        raise Refusal(422, w("act.no-author"))
+        raise Refusal(422, NO_AUTHOR)
     return author
 
 

@@ -18,10 +18,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from ..service import CellService
-from . import charts as bound_chart
-from . import charts as course_chart
-from . import charts as map_chart
-from . import charts as trace_chart
+from . import charts, views
 from .actions import Acts
 from .looking import Looking, Pulse
 from .views import (
@@ -35,12 +32,8 @@ from .views import (
     map_view,
     mode_of,
     now_view,
-    part_name,
     part_view,
-    story,
-    why,
 )
-from .words import CATALOGUES, Words, language
 
 HERE = Path(__file__).parent
 STATIC = HERE / "static"
@@ -55,7 +48,11 @@ HEADERS = {  # stricter than what `Guard` gives every answer; the rest is its
 def environment() -> Environment:
     """The templates."""
     loader = FileSystemLoader(HERE / "templates")
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    drawing = (charts.bound_chart, charts.bad_chart, charts.course_chart, charts.map_chart, charts.trace_charts)
+    saying = (charts.number, charts.percent, views.moment, views.clock, views.duration, views.part_name, views.story)
+    made.globals |= {each.__name__: each for each in (*drawing, *saying)} | {"words": views.WORDS}
+    return made
 
 
 def page(template: str, status: int = 200, **values: object) -> HTMLResponse:
@@ -66,18 +63,9 @@ def page(template: str, status: int = 200, **values: object) -> HTMLResponse:
 View = Callable[[Request], Awaitable[Response]]
 FRESH = 0.3  # seconds that what happens now may be old, beside the time that it takes to read
 CHECK = 5.0  # seconds that the expensive verification takes, where nothing else is said: the paper's height check
-CHOICES = {"lang": tuple(CATALOGUES), "theme": ("auto", "light", "dark")}
+THEMES = ("auto", "light", "dark")
+TITLES = {"how": "How it is doing", "failed": "That cannot be shown"}
 YEAR = 365 * 24 * 3600
-DRAWING = {
-    "trace_charts": trace_chart.trace_charts,
-    "bound_chart": bound_chart.bound_chart,
-    "bad_chart": bound_chart.bad_chart,
-    "map_chart": map_chart.map_chart,
-    "course_chart": course_chart.course_chart,
-    "part_name": part_name,
-    "story": story,
-    "why": why,
-}
 
 
 def routes(service: CellService, check_seconds: float = CHECK) -> list[BaseRoute]:
@@ -149,7 +137,7 @@ class LivePage:
 
     async def act(self, request: Request) -> Response:
         """Do something."""
-        return await self._acts.answer(request.path_params["name"], request, _words(request))
+        return await self._acts.answer(request.path_params["name"], request)
 
     async def events(self, request: Request) -> Response:
         """Server-sent events: that something changed, and what lets a page see that it is cut off."""
@@ -165,10 +153,9 @@ class LivePage:
         self._pulse.begin()
         mode, reason = mode_of(self._looking)
         about = {
-            "w": _words(request),
             "view": view,
-            "theme": _choice(request, "theme") or "auto",
-            "languages": CATALOGUES,
+            "title": TITLES.get(view, view.capitalize()),
+            "theme": _theme(request.cookies.get("dengine_theme")) or "auto",
             "root": request.scope.get("root_path", ""),
             "here": urlencode(parse_qsl(request.url.query)),
             "path": request.url.path,
@@ -180,34 +167,24 @@ class LivePage:
             "check_seconds": self._check_seconds,
             "pace_over": PACE,
         }
-        return page(f"{view}.html", status, **about, **DRAWING, **values)
+        return page(f"{view}.html", status, **about, **values)
 
 
 def _chosen(view: View) -> View:
-    """A view that first takes a chosen language or appearance."""
+    """A view that first takes a chosen appearance into a cookie, and then goes back to itself."""
 
     @wraps(view)
     async def shown(request: Request) -> Response:
-        for name, values in CHOICES.items():
-            if request.query_params.get(name) in values:
-                return _remembered(request, name)
-        return await view(request)
+        theme = _theme(request.query_params.get("theme"))
+        if theme is None:
+            return await view(request)
+        left = [(key, value) for key, value in parse_qsl(request.url.query) if key != "theme"]
+        answer = RedirectResponse(f"{request.url.path}{'?' + urlencode(left) if left else ''}", 303)
+        answer.set_cookie("dengine_theme", theme, max_age=YEAR, samesite="strict")
+        return answer
 
     return shown
 
 
-def _remembered(request: Request, name: str) -> Response:
-    """Back to the same view, with the choice in a cookie."""
-    left = [(key, value) for key, value in parse_qsl(request.url.query) if key != name]
-    answer = RedirectResponse(f"{request.url.path}{'?' + urlencode(left) if left else ''}", 303)
-    answer.set_cookie(f"dengine_{name}", request.query_params[name], max_age=YEAR, samesite="strict")
-    return answer
-
-
-def _choice(request: Request, name: str) -> str | None:
-    value = request.cookies.get(f"dengine_{name}")
-    return value if value in CHOICES[name] else None
-
-
-def _words(request: Request) -> Words:
-    return Words(language(_choice(request, "lang"), request.headers.get("accept-language", "")))
+def _theme(name: str | None) -> str | None:
+    return name if name in THEMES else None

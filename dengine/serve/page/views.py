@@ -1,11 +1,4 @@
-"""What the history shows: decisions that fit the filters, a page at a time.
-
-What is shown of one part: the decision, its evidence, its trace among others, and what became of it.
-
-What the map is drawn from: the references of the version that answers, and where the newest parts fell.
-
-What is shown of how the engine is doing: counts, bounds, drift, retrains and events.
-"""
+"""What each view shows, read from the store: the newest part, one part, the map, how it is doing, the history."""
 
 from __future__ import annotations
 
@@ -19,18 +12,51 @@ from urllib.parse import urlencode
 import numpy as np
 from numpy.typing import NDArray
 
-from ...decision.policy import Policy
-from ...decision.rule import SAFE_MODE
 from ...experiments.figures import is_probability
 from ...history.explain import Explanation, Records, as_it_stood, explain
 from ...history.status import Course, Status, Watch, course, status, watch
-from ...records import Action, Reason
+from ...records import Action, Reason, Source
 from ...store.records import Correction, Event
 from ...store.views import LABELS, HistoryFilter, Key, PastDecision, PastRetrain
-from .charts import Mark, PartMap, TraceView
+from .charts import Mark, PartMap, TraceView, number
 from .looking import Looking
-from .words import Words
 
+LABEL = {True: "good", False: "bad", None: "forgotten"}
+SOURCE = {
+    Source.VERIFICATION: "check",
+    Source.AUDIT: "audit",
+    Source.STOP: "system stop",
+    Source.CONFIRMED: "confirmed later",
+}
+WORDS = {
+    **{f"action.{each.value}": each.value.capitalize() for each in Action},
+    **{f"reason.{each.value}": each.value.replace("_", " ") for each in Reason},
+    "reason.not_finite": "samples missing",
+    "reason.constant": "dead sensor",
+    "reason.saturated": "sensor at its limit",
+    "reason.no_model": "no model yet",
+    "reason.no_store": "store away",
+    "reason.late": "too late",
+    "does.accept": "The part goes on without the check.",
+    "does.reject": "The part goes back to the bin.",
+    "does.verify": "The part goes to the check.",
+    "label.good": "good",
+    "label.bad": "bad",
+    "label.none": "not known",
+    "came.good": "It was good.",
+    "came.bad": "It was bad.",
+    "came.none": "Nothing is known of it yet.",
+    "mode.short.decides": "Decides",
+    "mode.short.learns": "Learning",
+    "mode.short.shadow": "Verifying all",
+    "mode.short.safe": "Safe mode",
+    "how.verdict.kept": "Tolerance kept",
+    "how.verdict.open": "Not decided yet",
+    "how.verdict.broken": "Tolerance broken",
+    "how.bad.by.every": "Every outcome is known.",
+    "how.bad.by.audits": "Estimated by audits.",
+    "how.bad.by.none": "Only stops are known so far; audits would bound it.",
+}
 RECENT = 14  # parts in the strip of the newest
 BADS, AMONG = 10, 200  # newest bad parts that are drawn, of so many newest labels
 FRESH = 10  # new labels, after which the bad parts are looked up again
@@ -101,42 +127,33 @@ def part_name(past: PastDecision) -> str:
     return past.part if past.part is not None else past.id[:12]
 
 
-def why(found: Explanation, w: Words) -> Iterator[str]:
-    """Why the decision came out so, in the reader's language."""
-    past, bound = found.decision, found.bound
-    yield w(f"why.{past.reason.value}", predicted=w(f"action.{past.predicted.value}"))
-    if bound is None:
-        return
-    n = bound.n_success + bound.n_failure
-    counted = {"n": w.number(n), "good": w.number(bound.n_success), "bad": w.number(bound.n_failure)}
-    yield w("why.counted", **counted) if n else w("why.nobody")
-    yield w("why.bound", lower=w.percent(bound.lower, 1), upper=w.percent(bound.upper, 1))
-    if past.reason is not Reason.UNCERTAIN:
-        return
-    if bound.accept_at is not None:
-        yield w("why.accept", at=w.percent(bound.accept_at, 1), value=w.percent(bound.lower, 1))
-    if bound.reject_at is not None:
-        yield w("why.reject", at=w.percent(bound.reject_at, 1), value=w.percent(bound.upper, 1))
-    if bound.successes_needed:
-        yield w("why.needed", n=w.number(bound.successes_needed))
+def moment(seconds: float | None) -> str:
+    """Day and time of day, by the server's clock; seconds since 1970."""
+    return "–" if seconds is None else f"{datetime.fromtimestamp(seconds):%Y-%m-%d %H:%M:%S}"
 
 
-def story(view: PartView, w: Words) -> Iterator[tuple[float, str]]:
+def clock(seconds: float | None) -> str:
+    """The time of day."""
+    return "–" if seconds is None else f"{datetime.fromtimestamp(seconds):%H:%M:%S}"
+
+
+def duration(seconds: float) -> str:
+    """90 s, 12 min, 3.4 h."""
+    if abs(seconds) < 120:
+        return f"{number(seconds)} s"
+    return f"{number(seconds / 60)} min" if abs(seconds) < 7200 else f"{number(seconds / 3600, 1)} h"
+
+
+def story(view: PartView) -> Iterator[tuple[float, str]]:
     """What happened to the part: time, and words."""
     past = view.past
-    did = {"action": w(f"action.{past.action.value}"), "reason": w(f"reason.{past.reason.value}")}
-    key = "part.decided" if past.model_version else "part.decided.none"
-    yield past.time, w(key, version=past.model_version, **did)
+    by = f" by model {past.model_version}" if past.model_version else ", before the first model"
+    yield past.time, f"{past.action.value.capitalize()} ({WORDS[f'reason.{past.reason.value}']}){by}"
     first = view.corrections[0].was if view.corrections else past.success
     if past.label_time is not None and past.source is not None:
-        yield past.label_time, w("part.labelled", label=_label(first, w), source=w(f"source.{past.source.value}"))
+        yield past.label_time, f"known to be {LABEL[first]}, by {SOURCE[past.source]}"
     for each in view.corrections:
-        author = each.author or w("part.nobody")
-        yield each.time, w("part.corrected", was=_label(each.was, w), now=_label(each.success, w), author=author)
-
-
-def _label(success: bool | None, w: Words) -> str:
-    return w("part.forgotten") if success is None else w("label.good" if success else "label.bad")
+        yield each.time, f"corrected from {LABEL[each.was]} to {LABEL[each.success]} by {each.author or 'somebody'}"
 
 
 KNOWN = 250  # newest known parts that are drawn
@@ -195,25 +212,19 @@ def _plane(point: np.ndarray) -> tuple[float, float]:
     return float(point[0]), float(point[1]) if len(point) > 1 else 0.0
 
 
-NEWEST_OF_HOW_VIEW = 500  # parts that are looked at apart
+LAST = 500  # parts that are looked at apart
 PACE = 30  # newest parts, by which parts an hour are counted
 EVENTS = 12
 
 
 @dataclass(frozen=True)
 class HowView:
-    """How it is doing.
-
-    course : None before the first decision.  pace : parts an hour, None before the second.
-    retrained : the newest accepted retrain.
-    """
+    """How it is doing.  course : None before the first decision.  pace : parts an hour, None before the second."""
 
     doing: Status
-    policy: Policy
     watch: Watch | None
     course: Course | None
     pace: float | None
-    retrained: PastRetrain | None
     events: tuple[Event, ...]
 
     @property
@@ -221,20 +232,21 @@ class HowView:
         """Checks that were left out."""
         return self.doing.ever.accepted + self.doing.ever.rejected
 
+    @property
+    def retrained(self) -> PastRetrain | None:
+        """The newest accepted retrain."""
+        return next((each for each in reversed(self.doing.retrains) if each.report.accepted), None)
+
 
 def how_view(looking: Looking) -> HowView:
     """Read how it is doing."""
     store, recipe, engine = looking.store, looking.recipe, looking.service.engine
-    doing = status(store, NEWEST_OF_HOW_VIEW)
-    went = course(store, recipe, NEWEST_OF_HOW_VIEW) if doing.ever.decisions else None
-    accepted = [each for each in (went.retrains if went else ()) if each.report.accepted]
+    doing = status(store, LAST)
     return HowView(
         doing=doing,
-        policy=recipe.policy,
         watch=looking.kept("watch", (engine.version, engine.new_labels, recipe), lambda: watch(store, recipe)),
-        course=went,
+        course=course(store, recipe, LAST) if doing.ever.decisions else None,
         pace=_pace(looking),
-        retrained=accepted[-1] if accepted else None,
         events=tuple(store.events(EVENTS)[::-1]),
     )
 
@@ -247,17 +259,17 @@ def _pace(looking: Looking) -> float | None:
 
 
 def mode_of(looking: Looking) -> tuple[str, str]:
-    """How decisions are made now, decides, learns, shadow or safe, and the message of why a safe mode began."""
+    """How decisions are made now, decides, learns, shadow or safe, and why a safe mode began."""
     engine = looking.service.engine
     if why := engine.safe_mode:
-        return "safe", f"safe.{SAFE_MODE.index(why)}"
+        return "safe", why
     if engine.shadow:
         return "shadow", ""
     return ("learns" if engine.version == 0 else "decides"), ""
 
 
 PAGE = 50
-FILTERS = {"action": tuple(Action), "reason": tuple(Reason), "label": tuple(LABELS)}
+FILTERS = (("action", "Decision", tuple(Action)), ("reason", "Reason", tuple(Reason)), ("label", "Label", tuple(LABELS)))
 
 Name = TypeVar("Name", bound=StrEnum)
 
