@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from ..experiments.replay import Contender, Replay
 
 ANSWERS_WITHIN = "5 s"  # what a scheduler has for it, before it counts as not there
-MANY_CORES = 1000
 FEEDBACKS = {"stops": False, "confirmed": True}
 
 
@@ -404,21 +403,14 @@ def _row_name(replay: Replay, frame: pd.DataFrame, *more: str) -> str:
 
 
 def _replay_costs(finished: Finished) -> dict[str, float]:
-    from ..experiments.costs import makespan
-
-    seconds = [each.seconds for each in finished.replays]
-    alone = {f"on_{MANY_CORES}_cores_s": makespan(seconds, MANY_CORES)}
-    return {"seconds": finished.seconds, "core_seconds": sum(seconds)} | alone
+    return {"seconds": finished.seconds, "core_seconds": sum(each.seconds for each in finished.replays)}
 
 
 def _cost_line(finished: Finished) -> str:
-    alone, core, many = (duration(each) for each in _replay_costs(finished).values())
+    seconds, core = (duration(each) for each in _replay_costs(finished).values())
     several = "" if len(finished.replays) == 1 else "s"
     kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
-    return (
-        f"{len(finished.replays)} replay{several}, {core} of one core's time, in {alone}{kept}. "
-        f"{MANY_CORES:,} cores would take {many}, their start left out."
-    )
+    return f"{len(finished.replays)} replay{several}, {core} of one core's time, in {seconds}{kept}."
 
 
 CAPTION = (

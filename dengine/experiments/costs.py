@@ -8,26 +8,16 @@ Costs are in one unit of the user's, and a part's mean cost is check x verified 
 rejected and good, over all parts of a replay, its beginning included, where everything is verified. Verifying everything
 costs `check` a part; it is always among the candidates.
 
-What the choice does to its own figures: the cheapest of many candidates is partly the luckiest. So it is chosen on one half
-of the shuffles, with half an error added to each count of them, and reported on the other. That takes the luck of the order
-out, and not that of the recordings: every shuffle plays the same parts. Their luck is what the interval is for, whose unit
-is a part and not a decision; it holds for a policy that was named before, and is a little too narrow for one that was
-picked among many. Nor does it know that other recordings may let more or less be decided. Parts that were recorded later,
-and played no role in the choice, are the only clean test; what choices were worth on such is among what was measured.
-
-What replays cost: how long the rest will take, and what more cores would do.
-
-forecast = Forecast(["conv", "umap", "conv", "umap"], workers=2)
-forecast.done("conv", 5.1)
-forecast.left()                            # (seconds, whether that is only a lower end)
-makespan(costs, workers=1000)
+The cheapest of many candidates is partly the luckiest. So it is chosen on one half of the shuffles, with half an error
+added to each count of them, and reported on the other. That takes the luck of the order out, and not that of the
+recordings: every shuffle plays the same parts. The interval's unit is a part and not a decision; it is a little too narrow
+for a policy picked among many. Only parts recorded later, which played no role in the choice, are a clean test.
 """
 
 from __future__ import annotations
 
-import heapq
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -41,17 +31,6 @@ from .replay import Replay
 
 if TYPE_CHECKING:
     import pandas as pd
-
-
-def makespan(costs: Iterable[float], workers: int) -> float:
-    """Seconds until all is done, when each worker that is free takes the longest job that is left.
-
-    costs : seconds of each job. Source: Graham (1969), SIAM J. Applied Mathematics 17(2): at most 4/3 of the best there is.
-    """
-    busy_until = [0.0] * max(1, workers)
-    for cost in sorted(costs, reverse=True):
-        heapq.heapreplace(busy_until, busy_until[0] + cost)
-    return max(busy_until)
 
 
 ALPHAS = (0.5, 0.1, 0.05)

@@ -1,4 +1,4 @@
-"""Grids of replays: kept, gone on with, the same on every backend, and what they cost."""
+"""Grids of replays: kept, gone on with, and the same on every backend."""
 
 import json
 import signal
@@ -13,8 +13,6 @@ import joblib
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given
-from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
@@ -22,7 +20,6 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
 from dengine.cli import main
 from dengine.errors import SettingError
-from dengine.experiments.costs import makespan
 from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays, run_replays
 from dengine.experiments.replay import Contender
 from dengine.experiments.rivals import RIVALS
@@ -321,20 +318,3 @@ def test_the_description_changes_with_every_setting_that_decides(data: Dataset, 
 def test_a_function_without_a_name_cannot_be_told_apart() -> None:
     with pytest.raises(SettingError, match="define it in a module"):
         _ = Task(Contender.load(FunctionTransformer(lambda x: x)), 0).description
-
-
-# --------------------------------------------------------------------------------------------------------- costs
-
-
-@given(st.lists(st.floats(0.01, 100.0), min_size=1, max_size=30), st.integers(1, 40))
-def test_a_makespan_is_at_least_the_longest_job_and_the_fair_share_and_at_most_all_in_a_row(costs, workers) -> None:
-    took = makespan(costs, workers)
-    assert took >= max(max(costs), sum(costs) / workers) - 1e-9
-    assert took <= sum(costs) + 1e-9
-    assert took <= max(costs) + sum(costs) / workers + 1e-9
-
-
-def test_a_makespan_by_hand() -> None:
-    assert makespan([3, 3, 2, 2, 2], 2) == 7  # the best is 6: the longest first is not always the best
-    assert makespan([5, 1, 1, 1], 1000) == 5
-    assert makespan([1, 2, 3], 1) == 6

@@ -23,7 +23,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from . import inputs, kills, processes, stores
+from . import kills, processes, stores
 from .harness import Outcome, Place
 
 Fault = Callable[[Outcome, Place], None]
@@ -56,7 +56,7 @@ def killing(of: Callable[..., None], child: Callable[..., None], words: str, tim
 
 def faults(arguments: argparse.Namespace) -> list[tuple[str, Fault, int]]:
     """Where, what, and how many trials."""
-    found = [("SQLite", each, arguments.trials) for each in (*stores.ON_SQLITE, *inputs.ON_SQLITE, *processes.ON_SQLITE)]
+    found = [("SQLite", each, arguments.trials) for each in (*stores.ON_SQLITE, *processes.ON_SQLITE)]
     found += [
         ("SQLite", killing(kills.kill_cells, kills.cell, "SIGKILL of the cell", arguments.kills), 1),
         ("SQLite", killing(kills.kill_cells, kills.often, "SIGKILL, mostly as a version is stored", arguments.others), 1),

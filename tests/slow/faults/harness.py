@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -128,16 +127,3 @@ def missing(store: Store, acknowledged: dict[str, bool]) -> int:
     """How many labels a store does not hold as they were acknowledged."""
     found = {name: store.get_decision(name) for name in acknowledged}
     return sum(known is None or known.success is not acknowledged[name] for name, known in found.items())
-
-
-@contextmanager
-def refused(outcome: Outcome, *errors: type[Exception]) -> Iterator[None]:
-    """What raises one of these errors is as it should be; another one reached the cell raw, and none was not noticed."""
-    try:
-        yield
-    except errors:
-        return
-    except Exception as error:
-        outcome.tell(error)
-        return
-    outcome.must(False, "it was not refused")

@@ -2,9 +2,9 @@
 
     python -m tests.slow.fuzzing.requests --n 20000 --seed 1
 
-Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC, OPC UA and bare TCP. Prints a table by kind: tried;
-refused (a 4xx, a fault, a Bad status, an ERR message); late (half a request: refused once its time was over, by 408 or
-BadTimeout); taken (what was only spoilt can still be good, and a view of the page takes any query); closed (the connection
+Over HTTP (JSON, raw float32, MessagePack, heads, the page), XML-RPC and bare TCP. Prints a table by kind: tried;
+refused (a 4xx, a fault); late (half a request: refused once its time was over, by
+408); taken (what was only spoilt can still be good, and a view of the page takes any query); closed (the connection
 ended without an answer); silent (there was no answer, and no end); failed (a 5xx, a redirect, a traceback). None may be
 closed, silent or failed. Afterwards the decisions from before must be what they were, the same traces must be decided on as
 before, and the memory must be as it was after the first fifth. Exit code 1 if anything is not so.
@@ -23,8 +23,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,6 @@ from dengine import DataEngine, TraceSpec, open_store
 from dengine.store.views import HistoryFilter
 from dengine.testing import toy_traces
 
-from .opc import Conversation
 from .web import MAKERS, SAMPLES, TOKEN
 from .wire import QUIET, WAIT, Call, Halves, exchange, over_http
 
@@ -47,10 +46,9 @@ SHARES = {  # of all attempts
     "head": 0.13,
     "xmlrpc": 0.18,
     "page": 0.05,
-    "bytes": 0.10,
-    "opcua": 0.12,
+    "bytes": 0.22,
 }
-HALF = ("head", "bytes", "opcua")  # kinds of which some are half a request
+HALF = ("head", "bytes")  # kinds of which some are half a request
 OUTCOMES = ("refused", "late", "taken", "closed", "silent", "failed")
 WRONG = {
     "closed": "connections were closed without an answer",
@@ -65,19 +63,11 @@ os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stal
 
 
 def serve(store: str) -> None:
-    """The server's process: HTTP, XML-RPC, OPC UA and the page, at ports of its own."""
-    from dengine.serve.opcua import opcua_server
+    """The server's process: HTTP, XML-RPC and the page, at a port of its own."""
     from dengine.serve.server import Serving
     from dengine.serve.server import serve as serve_cell
-    from dengine.serve.service import CellService
 
-    @asynccontextmanager
-    async def beside(service: CellService) -> AsyncIterator[None]:
-        async with opcua_server(service, port=0) as server:
-            print(f"opcua {server.port}", flush=True)
-            yield
-
-    serving = Serving(port=0, rate=0.0, deadline=WAIT, beside=(beside,))
+    serving = Serving(port=0, rate=0.0, deadline=WAIT)
     serve_cell(
         lambda executor: DataEngine.open(store, executor=executor), store, serving, lambda text: print(text, flush=True)
     )
@@ -85,11 +75,10 @@ def serve(store: str) -> None:
 
 @dataclass
 class Server:
-    """A server's process. web, opc : its ports.  token : what the page's own forms carry."""
+    """A server's process. web : its port.  token : what the page's own forms carry."""
 
     process: subprocess.Popen[str]
     web: int
-    opc: int
     log: Path
     token: bytes = b""
 
@@ -108,20 +97,15 @@ def server(store: Path) -> Iterator[Server]:
         process = subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, stderr=errors, text=True)
         assert process.stdout is not None
         try:
-            ports = dict(_port(process.stdout.readline()) for _ in range(2))
-            yield Server(process, ports["web"], ports["opcua"], log, _page_token(ports["web"]))
+            said = process.stdout.readline()
+            found = re.search(r"http://[^ ]*:(\d+)", said)
+            assert found is not None, f"the server did not say where it listens, but {said!r}"
+            yield Server(process, int(found[1]), log, _page_token(int(found[1])))
             process.send_signal(signal.SIGTERM)
             assert process.wait(60) == 0, f"it ended with exit code {process.returncode}"
         finally:
             process.kill()
             process.wait()
-
-
-def _port(line: str) -> tuple[str, int]:
-    """What listens where, by a line of the server's."""
-    found = re.search(r"^opcua (\d+)|http://[^ ]*:(\d+)", line)
-    assert found is not None, f"the server did not say where it listens, but {line!r}"
-    return ("opcua", int(found[1])) if found[1] else ("web", int(found[2]))
 
 
 def _page_token(web: int) -> bytes:
@@ -176,10 +160,8 @@ def _posted(body: bytes) -> bytes:
     return head.encode() + body
 
 
-def attempt(kind: str, at: Server, conversation: Conversation, rng: random.Random) -> Call:
+def attempt(kind: str, at: Server, rng: random.Random) -> Call:
     """One malformed request."""
-    if kind == "opcua":
-        return conversation.play(rng)
     return over_http(at.web, MAKERS[kind](rng).replace(TOKEN.encode(), at.token))
 
 
@@ -200,12 +182,12 @@ class Tally:
 
 def try_all(order: list[str], seed: int, at: Server) -> tuple[dict[str, Counter[str]], float]:
     """Try requests of these kinds; outcomes by kind, and how the memory has grown, MB, since the first fifth."""
-    conversation, halves, memory = Conversation(at.opc), Halves(), 0.0
+    halves, memory = Halves(), 0.0
     tally = Tally({kind: Counter() for kind in SHARES})
     for i, kind in enumerate(order):
         if i == len(order) // 5:
             memory = at.memory()
-        call, tell = attempt(kind, at, conversation, random.Random(f"{seed} {i}")), partial(tally.count, kind, i)
+        call, tell = attempt(kind, at, random.Random(f"{seed} {i}")), partial(tally.count, kind, i)
         if call.wait(QUIET if kind in HALF else WAIT):
             tell(call)
         else:

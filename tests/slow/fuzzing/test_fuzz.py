@@ -9,13 +9,13 @@ import pytest
 
 from tests.slow.fuzzing import inputs
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette", "asyncua")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette")
 
 
 @pytest.fixture
 def _server_extras() -> None:
     for name in NEEDED:
-        pytest.importorskip(name, reason="the server needs the extras `serve` and `opcua`")
+        pytest.importorskip(name, reason="the server needs the extra `serve`")
 
 
 def test_every_malformed_input_is_an_error_of_ours_or_verified(capsys: pytest.CaptureFixture) -> None:

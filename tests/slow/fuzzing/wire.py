@@ -12,7 +12,7 @@ from dataclasses import dataclass
 WAIT = 30.0  # seconds in which an answer has to come
 PATIENCE = 120.0  # and that to half a request: the server's limit is 10 s, but a busy machine stands still for longer
 QUIET = 0.1  # seconds without an answer, after which the server waits for the rest of half a request
-MOST = 40  # half requests at once; the server takes 50 connections over OPC UA, and 100 over HTTP
+MOST = 40  # half requests at once; the server takes 100 connections
 
 
 @dataclass
