@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..files import is_database
+from ..records import trace_in
 from .arrays import from_pair, read_hdf5, read_npz
 from .bags import is_stream, read_bag
 from .dataset import Asked, Dataset, make_dataset, names_of
@@ -117,7 +118,6 @@ def read_store(path: Path, name: str, asked: Asked) -> Dataset:
     was not certain of, audits, and what became known of accepted ones.
     DataError for a store without a label.
     """
-    from ..engine.settings import trace_in
     from ..store.base import open_store
 
     store = open_store(path, must_exist=True)

@@ -115,10 +115,10 @@ def read_table(path: Path) -> Table:
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", 1)
     table = Table(header, delimiter, [], [], [], len(header))
-    for number, line in below:
-        words = _words(line, delimiter)
+    for number, row in below:
+        words = _words(row, delimiter)
         if len(words) >= len(header) and not any(word.strip() for word in words[len(header) :]):
-            table.rows.append(line)
+            table.rows.append(row)
             table.lines.append(number)
             table.widest = max(table.widest, len(words))
         else:
