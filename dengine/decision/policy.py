@@ -37,7 +37,8 @@ class Policy:
     stops : "all" where every accepted part that is bad stops the system and is reported before the next decision: then
         silence until that decision confirms the part. "some", the default, where silence says nothing.
     audit_rate : share of certain decisions that are verified all the same, in [0, 1]; needed for a guarantee on rejects,
-        since a rejected part gives no feedback of its own. 1 is the shadow mode: everything is verified.
+        since a rejected part gives no feedback of its own.
+    shadow : the shadow mode: everything is verified, and the model only says what it would have done.
     Raises SettingError for a value out of its range.
     """
 
@@ -47,6 +48,7 @@ class Policy:
     audit_rate: float = 0.0
     guarantee: str = "local"
     stops: Stops = "some"
+    shadow: bool = False
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
@@ -68,6 +70,13 @@ class Policy:
 
         if self.stops not in get_args(Stops):
             raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
+        if not isinstance(self.shadow, bool):
+            raise SettingError(f"Expected shadow to be True or False, got {shortened(self.shadow)}.")
+
+    @property
+    def audited_share(self) -> float:
+        """Share of certain decisions that are verified all the same: all of them in the shadow mode."""
+        return 1.0 if self.shadow else self.audit_rate
 
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""

@@ -204,6 +204,7 @@ class RadiusIndex:
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
         self.ring = ReferenceRing(dim, capacity)
+        self._numbers = np.zeros(capacity, dtype=np.int64)
 
     def __len__(self) -> int:
         return self.ring.size()
@@ -238,12 +239,32 @@ class RadiusIndex:
         """(n,) the hash of each point's part, 0 for none, in the order of `points`."""
         return self.ring.parts[: len(self)].numpy()
 
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """(n,) the number of each point's label, 0 for none, in the order of `points`."""
+        return self._numbers[: len(self)]
+
+    def put(self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0) -> None:
+        """Add one point (d,), as `ReferenceRing.put`; number : of its label."""
+        self._numbers[int(self.ring.total) % self.capacity] = number
+        self.ring.put(point, label, space, part)
+
+    def renumber(self, was: int, number: int) -> None:
+        """Give the point of a label another number; one that has left needs none."""
+        self._numbers[self._numbers == was] = number
+
     def add(
-        self, points: ArrayLike, labels: ArrayLike, spaces: ArrayLike | None = None, parts: ArrayLike | None = None
+        self,
+        points: ArrayLike,
+        labels: ArrayLike,
+        spaces: ArrayLike | None = None,
+        parts: ArrayLike | None = None,
+        numbers: ArrayLike | None = None,
     ) -> None:
         """Add points (n, d) with labels (n,), 1 = success, 0 = failure.
 
         spaces : (n,) the space each lives in, 0 if None.  parts : (n,) int64 hashes of their parts; None: of no known part.
+        numbers : (n,) of their labels; None: 0.
         """
         z, y = np.array(points, dtype=np.float32), np.array(labels, dtype=np.float32)  # copies: torch needs writable ones
         k, own = (np.zeros(len(z), np.int64) if v is None else np.array(v, dtype=np.int64) for v in (spaces, parts))
@@ -259,21 +280,23 @@ class RadiusIndex:
         ring.labels[1, slots] = torch.from_numpy(y[keep])
         ring.spaces[slots] = torch.from_numpy(k[keep])
         ring.parts[slots] = torch.from_numpy(own[keep])
+        self._numbers[slots] = 0 if numbers is None else np.asarray(numbers)[keep]
         ring.total.fill_(total + len(z))
         if own.any() or int(ring.repeats) > 0:
             self._gather_parts()
 
-    def relabel(self, newest: int, part: int, label: int | None) -> bool:
-        """Give a point another label, or take it out where `label` is None; the others keep their order of age.
+    def relabel(self, number: int, part: int, label: int | None) -> bool:
+        """Give the point of a label another one, or take it out where `label` is None; the others keep their order of age.
 
-        newest : its place counted from the newest point, which is 1.  part : hash of its part.
+        number : of its label.  part : hash of its part.
         A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
         """
-        ring, n = self.ring, len(self)
-        slot = (int(ring.total) - newest) % ring.capacity
-        if newest > n:
+        ring = self.ring
+        held = np.flatnonzero(self.numbers == number)
+        if not len(held):
             return True
-        if newest < 1 or int(ring.parts[slot]) != part:
+        slot = int(held[0])
+        if int(ring.parts[slot]) != part:
             return False
         if label is None:
             self._take_out(slot)
@@ -287,8 +310,9 @@ class RadiusIndex:
         order = order[order != slot]
         for held in (ring.points, ring.labels, ring.spaces, ring.parts):
             held[..., : n - 1] = held[..., order]
+        self._numbers[: n - 1] = self._numbers[order.numpy()]
         ring.points[:, n - 1 :], ring.labels[1, n - 1 :] = 0.0, 1.0
-        ring.spaces[n - 1 :], ring.parts[n - 1 :] = 0, 0
+        ring.spaces[n - 1 :], ring.parts[n - 1 :], self._numbers[n - 1 :] = 0, 0, 0
         ring.total.fill_(n - 1)
         self._gather_parts()
 
@@ -320,10 +344,10 @@ class RadiusIndex:
         return n_success, n_failure
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Plain arrays, copies: points (d, n), labels (n,), spaces (n,), parts (n,), and total, points ever added."""
+        """Plain arrays, copies: points (d, n), labels, spaces, parts and numbers (n,), and total, points ever added."""
         own: dict[str, NDArray[Any]] = {"points": self.points.T.copy(), "labels": self.labels, "spaces": self.spaces.copy()}
         whole = {"agreement": self.ring.agreement.numpy().copy(), "total": self.ring.total.numpy().copy()}
-        return own | {"parts": self.parts.copy()} | whole
+        return own | {"parts": self.parts.copy(), "numbers": self.numbers.copy()} | whole
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
@@ -336,6 +360,8 @@ class RadiusIndex:
         if "parts" in state:  # 0.2 and before did not keep them
             ring.parts[:n] = torch.from_numpy(np.array(state["parts"]))
             ring.agreement.fill_(float(state["agreement"]))
+        if "numbers" in state:
+            index._numbers[:n] = state["numbers"]
         ring.total.fill_(int(state["total"]))
         index._gather_parts()
         return index

@@ -19,13 +19,10 @@ from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
 from ..errors import ReportError, SettingError
 from ..records import as_success
-from ..store.base import Store
 from ..store.outbox import Keeper
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
-from .decide import DecisionMaker
 from .feedback import Feedback
-from .resume import Telling
-from .settings import EngineSettings
+from .settings import EngineSettings, EvidenceWindow, SettingsInForce
 from .trainer import HUNG
 from .versions import ModelVersions
 
@@ -49,23 +46,12 @@ class Changed:
     version: int
 
 
-def _rate_behind(now: EngineSettings, policy: Policy) -> float:
-    """The audit rate that comes back when the shadow mode ends: of before it, whatever else is changed meanwhile."""
-    if policy.audit_rate < 1.0:
-        return 0.0
-    before = now.recipe.policy.audit_rate
-    return before if before < 1.0 else now.shadowed_rate
-
-
 class Corrections:
-    """The part of `DataEngine` that puts things right."""
+    """Puts things right in a store, and in what an engine has learned."""
 
-    store: Store
-    _settings: EngineSettings
-    _versions: ModelVersions
-    _feedback: Feedback
-    _keeper: Keeper
-    _maker: DecisionMaker
+    def __init__(self, keeper: Keeper, settings: SettingsInForce, versions: ModelVersions, feedback: Feedback) -> None:
+        self._keeper, self._settings, self._versions, self._feedback = keeper, settings, versions, feedback
+        self._store = keeper.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Say that a label was wrong, or that a forgotten one counts again: from the next decision on, it counts as this.
@@ -145,23 +131,23 @@ class Corrections:
         """Verify every part from the next decision on, or end that: the shadow mode, which lasts over restarts.
 
         What the model is certain of is then an audit, each part's: `Decision.predicted` says what it would have done, and
-        its label, `Source.AUDIT`, whether that was right; all is learned from as ever. It is the policy with an audit rate
-        of 1, and its end brings back the rate from before; so the certificate begins anew with each.
+        its label, `Source.AUDIT`, whether that was right; all is learned from as ever. It is a setting of the policy;
+        the certificate begins anew where it begins and where it ends.
         """
         if not isinstance(on, bool):
             raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
-        policy, before = self._settings.recipe.policy, self._settings.shadowed_rate
-        if on == (policy.audit_rate == 1.0):
+        policy = self._settings.policy
+        if on == policy.shadow:
             return self._unchanged("shadow", f"The shadow mode is {'on' if on else 'off'} already; nothing changed.")
-        return self._go_on_under(replace(policy, audit_rate=1.0 if on else before), author)
+        return self._go_on_under(replace(policy, shadow=on), author)
 
     def _go_on_under(self, policy: Policy, author: str) -> Changed:
-        old = self._settings.recipe.policy
+        old = self._settings.policy
         new = {name: value for name, value in asdict(policy).items() if value != getattr(old, name)}
         if not new:
             return self._unchanged("policy", "The policy is in force already; nothing changed.")
-        own = self._settings.model is not None  # a model that was handed in keeps its rule
-        idle = sorted(set(new) - {"audit_rate", "stops"}) if own else []
+        own = self._settings.now.model is not None  # a model that was handed in keeps its rule
+        idle = sorted(set(new) - {"audit_rate", "stops", "shadow"}) if own else []
         if idle:
             raise SettingError(
                 f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
@@ -173,37 +159,34 @@ class Corrections:
         was = {name: getattr(old, name) for name in new}
         text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
         kind = "policy"
-        if list(new) == ["audit_rate"] and 1.0 in (old.audit_rate, policy.audit_rate):
-            kind, text = "shadow", SHADOW[policy.audit_rate == 1.0]
+        if list(new) == ["shadow"]:
+            kind, text = "shadow", SHADOW[policy.shadow]
         data = {"old": asdict(old), "new": asdict(policy)}
         event = Change(kind, text, data, author, settings=settings.to_store())
-        telling = Telling(settings.told_since, settings.began_in)
-        self._versions.set_policy(policy if anew else None, telling, event)
-        self._settings, self._maker.audit_rate = settings, policy.audit_rate
-        self._feedback.begin_policy(policy.stops == "all", settings.policy_since)
+        self._versions.set_policy(policy if anew else None, settings.evidence, event)
+        self._settings.now = settings
+        self._feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
 
     def _under(self, policy: Policy, anew: bool) -> EngineSettings:
         """The settings under another policy; anew : whether its rule begins without evidence."""
-        now = self._settings
+        now = self._settings.now
         since = 0 if self._versions.answering is None else self._versions.next_number
-        shadowed = _rate_behind(now, policy)
-        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, shadowed_rate=shadowed)
-        return replace(settings, told_since=since, began_in=SAFE_MODE.index(self._feedback.safe_mode)) if anew else settings
+        evidence = EvidenceWindow(since, SAFE_MODE.index(self._feedback.safe_mode)) if anew else now.evidence
+        return replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
 
     def _make_ready(self) -> None:
         """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
         self._keeper.check()
         self._versions.collect(HUNG)
         self._feedback.store_all()
-        if self._versions.fleet is not None:
-            self._versions.fleet.complete()
+        self._versions.count.complete()
 
     def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
         self._make_ready()
         found = []
         for each in ids:
-            known = self.store.get_decision(each) if isinstance(each, str) else None
+            known = self._store.get_decision(each) if isinstance(each, str) else None
             if known is None:
                 raise unknown_decision(each)
             if known.source is None:
@@ -212,14 +195,14 @@ class Corrections:
         return found
 
     def _correct(self, change: Change) -> Changed:
-        self.store.record(change)
+        self._store.record(change)
         for name in change.decisions:
             self._keeper.forget(name)
         self._versions.correct()
         return self._done(change)
 
     def _done(self, change: Change, safe_again: str = "what was told anew keeps the tolerance") -> Changed:
-        number = self.store.events(1)[0].number
+        number = self._store.events(1)[0].number
         self._feedback.announce(safe_again)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._versions.version)
 

@@ -18,6 +18,7 @@ from ..model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
 from ..records import LONGEST, REASONS, Action, Decision, Reason, Source, TraceSpec, is_name
 from ..store.records import DecidedTrace, StoredDecision
 from ..traces import TraceGate, as_agreed, first_contract
+from .settings import SettingsInForce
 
 log = logging.getLogger("dengine")
 
@@ -25,12 +26,13 @@ log = logging.getLogger("dengine")
 class DecisionMaker:
     """Makes decisions on traces of one contract, with ids of its own.
 
-    audit_rate, seed : of the audits' coin, a fixed function of the trace.
+    settings : of the audits' coin, a fixed function of the trace, and of the contract where there is one.
     """
 
-    def __init__(self, audit_rate: float, seed: int) -> None:
-        self.audit_rate = audit_rate
-        self.seed = seed
+    def __init__(self, settings: SettingsInForce) -> None:
+        self._settings = settings
+        if settings.now.trace is not None:
+            self.agree_on(settings.now.trace)
         self._run, self._count = uuid.uuid4().hex[:12], 0
 
     def agree_on(self, trace: TraceSpec) -> None:
@@ -82,8 +84,8 @@ class DecisionMaker:
         return DecidedTrace(went_on, x, own_hash(content, part), bool(fault), 0.0, part)
 
     def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
-        certain, rate = predicted.action is not Action.VERIFY, self.audit_rate
-        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self.seed)[0])
+        certain, rate = predicted.action is not Action.VERIFY, self._settings.policy.audited_share
+        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
         self._count += 1
         return Decision(
             id=f"{self._run}-{self._count}",

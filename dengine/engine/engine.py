@@ -3,18 +3,6 @@
 engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95), store="engine.db")
 for cycle in engine.run(cell, cycles=1503):
     ...
-
-Ctrl-C that waits until what is half done is done.
-
-What an engine says of itself: its settings in force, its model, what it can certify, what an exporter takes.
-
-What an engine and its traces agreed on: their contract, set once, by a user, a sister cell or the first sound trace.
-
-Decisions for whoever waits no more: verify, on the disk before it is said, though the engine's thread is busy.
-
-What an engine says of its own past: the history, and the explanation of a decision; and both of a store alone.
-
-The loop over a cell: insert, decide, then verify, go on or reject, report. Source: the paper's section "Data engine".
 """
 
 from __future__ import annotations
@@ -30,7 +18,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -40,26 +28,30 @@ from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import DengineError, StoreError
+from ..history.explain import Explanation, Records, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec, as_id, as_outcome, as_success
-from ..store.base import Store, opening
+from ..store.base import Store, is_shared, opening
 from ..store.outbox import CLOSE, Keeper, OwnedStore
 from ..store.records import DecidedTrace, StoredDecision, stored_decision
 from ..store.views import PastDecision
 from ..traces import as_agreed
-from .corrections import Corrections
+from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_decision, as_part, decided_before, source_of, unasked
 from .feedback import Feedback, unknown_stop
-from .peers import agreed, as_sisters, trace_of_sisters
-from .resume import Telling, resume
-from .settings import EngineSettings, chosen_recipe, object_of, refuse_idle
+from .peers import Fleet, agreed, as_peers, peers_trace
+from .resume import resume
+from .settings import EngineSettings, SettingsInForce, chosen_recipe, object_of, refuse_idle
 from .trainer import Clock, EncoderTime, Limits, Retrainer, Window
 from .versions import ModelVersions
 
-if TYPE_CHECKING:
-    from ..history.explain import Explanation
+log = logging.getLogger("dengine")
+KNOWN = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}  # silence is not a success
+OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
+OnSafeMode = Callable[[str], object] | None
+StoreLike = str | os.PathLike[str] | Store
 
 
 @contextmanager
@@ -80,269 +72,7 @@ def uninterrupted() -> Iterator[None]:
             before(*held[0])
 
 
-class EngineFacts:
-    """How an engine stands; nothing here changes it."""
-
-    seed: int
-    store: Store
-    _settings: EngineSettings
-    _keeper: Keeper
-    _versions: ModelVersions
-    _feedback: Feedback
-
-    def find(self, decision_id: str) -> StoredDecision | None:
-        """A decision with its trace, and with its label where it has one; None for an unknown id."""
-        return self._keeper.find(as_id(decision_id))
-
-    def know_ids(self) -> None:
-        """Learn which ids are taken, so that `decide` looks no new one up in the store: quicker, where callers name them.
-
-        It reads every id once, a second for a million of them.
-        """
-        self.flush()
-        self._keeper.recent.know(self.store.decision_ids())
-
-    def flush(self) -> None:
-        """Return when all that is known so far is on the disk."""
-        self._feedback.store_waiting()
-        self._keeper.flush()
-
-    @property
-    def retraining(self) -> bool:
-        """Whether a retrain is under way in the executor, or waits to be swapped in."""
-        return self._versions.busy
-
-    @property
-    def swapping(self) -> bool:
-        """Whether a version that an executor has trained is on its way in, a step each time that the engine is asked."""
-        return self._versions.swapping
-
-    @property
-    def encoder_time(self) -> EncoderTime:
-        """What the encoder's training took so far."""
-        return self._versions.retrainer.encoder_time
-
-    @property
-    def recipe(self) -> Recipe:
-        """Every setting as it is in force; all but the policy are fixed once the engine is made."""
-        return self._settings.recipe
-
-    @property
-    def policy(self) -> Policy:
-        """The user's numbers as they are in force; `set_policy` changes them."""
-        return self._settings.recipe.policy
-
-    @property
-    def shadow(self) -> bool:
-        """Whether every part is verified, and the model only says what it would have done; `set_shadow` changes it."""
-        return self.policy.audit_rate == 1.0
-
-    @property
-    def trace(self) -> TraceSpec | None:
-        """The traces' contract; None before the first sound trace."""
-        return self._settings.trace
-
-    @property
-    def model(self) -> Any:
-        """The model that answers, a rival as its author knows it; None before the first retrain."""
-        return None if self._versions.answering is None else self._versions.answering.user_model
-
-    @property
-    def version(self) -> int:
-        """Of the model that answers; 0 before the first retrain."""
-        return self._versions.version
-
-    @property
-    def safe_mode(self) -> str:
-        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
-        return self._feedback.safe_mode
-
-    @property
-    def store_fault(self) -> str:
-        """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
-        return self._keeper.fault
-
-    def certificate(self) -> Certificate:
-        """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
-        self.flush()
-        return self.policy.certificate(self.store.outcomes(self._settings.policy_since))
-
-    @property
-    def new_labels(self) -> int:
-        """Labels since the last retrain began."""
-        return self._versions.new_labels
-
-    def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
-        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
-        coin: dict[str, Any] = {"audit_rate": policy.audit_rate, "seed": self.seed, "stops_all": policy.stops == "all"}
-        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
-        return replace(own, note=self._keeper.event, **about, **coin)
-
-
-log = logging.getLogger("dengine")
-
-
-class TraceAgreement(EngineFacts):
-    """The part of `DataEngine` that knows the traces' contract."""
-
-    _maker: DecisionMaker
-    _settings_waiting: bool
-
-    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
-        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
-        if self.trace is None:
-            trace = trace_of_sisters(self._keeper) or trace
-            self._settings = replace(self._settings, trace=trace, inferred=inferred)
-            self._maker.agree_on(trace)
-            self._save_settings()
-        return self._settings.trace or trace
-
-    def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
-        x = as_agreed(trace, self.trace, self._settings.inferred and self.version + self.new_labels == 0)
-        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
-            if self.agree_on(spec, inferred=True) != spec:  # a sister's trace came first
-                return as_agreed(trace, self.trace, False)
-        elif self._settings_waiting:
-            self._save_settings()
-        return x
-
-    def _save_settings(self) -> None:
-        """Store the settings, or do it before the next decision, if the store is away."""
-        try:
-            self._keeper.ask(lambda: self.store.save_settings(self._settings.to_store()))
-            self._settings_waiting = False
-        except StoreError:
-            self._settings_waiting = True
-            log.exception("the settings are stored later")
-
-
-class LateDecisions(TraceAgreement):
-    """The part of `DataEngine` that another thread than its own may call."""
-
-    def decide_late(self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str) -> Decision:
-        """VERIFY, `Reason.LATE`, in any thread: what `decide` in the engine's own would say comes too late.
-
-        It is on the disk when this returns, and `decide` answers the same from then on. An id that has a decision keeps it;
-        where both come to it at once, the first to record one. What is wrong with a trace is said as ever.
-        In memory, which belongs to the engine's thread, and before the first trace has set the contract, `decide` has to
-        record it, with `late`. Errors as of `decide`.
-        """
-        self._keeper.check()
-        id_ = as_id(decision_id)
-        if (known := self._known(id_)) is None:
-            number = as_part(part)
-            if self.trace is None or not isinstance(self.store, OwnedStore):
-                return unasked(id_, number, self.version, Reason.LATE)
-            reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
-            x = as_agreed(trace, self.trace, False)
-            known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
-        self._keeper.secure()
-        return decided_before(known, trace, self.trace)
-
-    def _record(self, item: DecidedTrace) -> StoredDecision:
-        """Record a decision; returns what its id has now: of two threads the first's."""
-        known = stored_decision(item)
-        first = self._keeper.recent.add(known)
-        if first is known:
-            self._keeper.decided(item)
-        return first
-
-    def _known(self, decision_id: str) -> StoredDecision | None:
-        try:
-            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
-        except StoreError as error:  # the store is away: what was decided lately is known all the same
-            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
-            return None
-
-
-class EngineReview:
-    """The part of `DataEngine` that looks back."""
-
-    store: Store
-    _versions: ModelVersions
-
-    def history(
-        self,
-        last: int | None = None,
-        action: Action | str | None = None,
-        reason: Reason | str | None = None,
-        label: str | None = None,
-        since: float | None = None,
-        until: float | None = None,
-        predicted: Action | str | None = None,
-    ) -> Iterator[PastDecision]:
-        """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
-        return history(self.store, last, action, reason, label, since, until, predicted)
-
-    def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
-        """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
-        from ..history.explain import Records, explain
-
-        versions = self._versions
-        return explain(decision_id, Records(self.store, lambda: versions.answering, versions.version), neighbours)
-
-
-def explain_stored(store: Store, decision_id: str, neighbours: int = 10) -> Explanation:
-    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes."""
-    from ..history.explain import Records, explain
-
-    last = store.past_retrains()
-    version = max((each.report.version for each in last if each.report.accepted), default=0)
-    return explain(decision_id, Records(store, lambda: _present(store), version), neighbours)
-
-
-def _present(store: Store) -> EngineModel | None:
-    """The model that answers now, rebuilt; None where it needs an object that the store cannot name."""
-    try:
-        settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
-        telling = Telling(settings.told_since, settings.began_in)
-        return resume(store, template, Window(settings.recipe.window), telling).model
-    except DengineError as error:
-        log.info("the present model cannot be rebuilt from the store alone: %s", error)
-        return None
-
-
-KNOWN = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}  # silence is not a success
-
-
-def drive(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Cycle]:
-    """Let an engine drive a cell; a record a cycle. What is known is written when the loop ends, whatever ends it.
-
-    A cell that knows its parts' numbers tells that of the part it inserted last as `part`.
-    """
-    try:
-        for index in range(cycles):
-            yield _cycle(engine, cell, index)
-    finally:
-        engine.flush()
-
-
-def _cycle(engine: DataEngine, cell: Cell, index: int) -> Cycle:
-    trace = cell.insert()
-    begin = engine.clock()
-    decision = engine.decide(trace, getattr(cell, "part", None))
-    seconds = engine.clock() - begin
-    outcome, success, source = None, None, None
-    if decision.action is Action.VERIFY:
-        success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
-    elif decision.action is Action.ACCEPT:
-        outcome = as_outcome(cell.proceed(), f"decision {decision.id}, by proceed()")
-        success = KNOWN.get(outcome)
-    else:
-        cell.reject()
-    if success is not None:
-        source = source_of(decision.id, decision.action, decision.audit, success)
-        engine.report(decision.id, success)
-    return Cycle(index, decision, outcome, success, source, seconds, engine.settle(), engine.safe_mode)
-
-
-OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
-OnSafeMode = Callable[[str], object] | None
-StoreLike = str | os.PathLike[str] | Store
-
-
-class DataEngine(LateDecisions, EngineReview, Corrections):
+class DataEngine:
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -391,8 +121,9 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
             self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
-                self.store.save_settings(self._settings.to_store())
-                self._versions.join()
+                self.store.save_settings(self._settings.now.to_store())
+                if is_shared(opened):
+                    self._versions.resume()  # on what the others of its product learned
 
     def _start(
         self,
@@ -411,15 +142,14 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
         self._keeper = Keeper(store, owning=not reading, patient=replaying)
         weakref.finalize(self, self._keeper.close)  # of a program that forgot to
-        telling, since = Telling(settings.told_since, settings.began_in), settings.policy_since
-        self._versions = ModelVersions(template, retrainer, self._keeper, clock, telling)
-        stops_all = settings.recipe.policy.stops == "all"
-        self._feedback = Feedback(self._keeper, self._versions, stops_all, on_safe_mode, since)
-        self._maker = DecisionMaker(settings.recipe.policy.audit_rate, settings.seed)
-        self._settings, self.seed, self.store, self.clock, self.resumed = settings, settings.seed, store, clock, False
-        self._settings_waiting = False
-        if settings.trace is not None:
-            self._maker.agree_on(settings.trace)
+        self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
+        self._settings = SettingsInForce(settings, self._keeper)
+        self._versions = ModelVersions(template, retrainer, self._keeper, clock, settings.evidence)
+        if is_shared(store):
+            self._versions.count = Fleet(store, self._versions)
+        self._feedback = Feedback(self._keeper, self._versions, self._settings, on_safe_mode)
+        self._maker = DecisionMaker(self._settings)
+        self._corrections = Corrections(self._keeper, self._settings, self._versions, self._feedback)
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
@@ -470,11 +200,11 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
         """
         with opening(store, wait=wait) as opened:
             if not opened.settings():
-                return cls(store=opened, **as_sisters(settings | {"seed": seed}, opened))
+                return cls(store=opened, **as_peers(settings | {"seed": seed}, opened))
             options = {name: settings.pop(name) for name in OPTIONS if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
             with engine._closed_on_failure():
-                engine._settings.must_agree_with(settings | {"seed": seed})
+                engine._settings.now.must_agree_with(settings | {"seed": seed})
             return engine
 
     def decide(
@@ -519,6 +249,66 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
         self._feedback.decided(known)
         return known
 
+    def decide_late(self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str) -> Decision:
+        """VERIFY, `Reason.LATE`, in any thread: what `decide` in the engine's own would say comes too late.
+
+        It is on the disk when this returns, and `decide` answers the same from then on. An id that has a decision keeps it;
+        where both come to it at once, the first to record one. What is wrong with a trace is said as ever.
+        In memory, which belongs to the engine's thread, and before the first trace has set the contract, `decide` has to
+        record it, with `late`. Errors as of `decide`.
+        """
+        self._keeper.check()
+        id_ = as_id(decision_id)
+        if (known := self._known(id_)) is None:
+            number = as_part(part)
+            if self.trace is None or not isinstance(self.store, OwnedStore):
+                return unasked(id_, number, self.version, Reason.LATE)
+            reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
+            x = as_agreed(trace, self.trace, False)
+            known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
+        self._keeper.secure()
+        return decided_before(known, trace, self.trace)
+
+    def _record(self, item: DecidedTrace) -> StoredDecision:
+        """Record a decision; returns what its id has now: of two threads the first's."""
+        known = stored_decision(item)
+        first = self._keeper.recent.add(known)
+        if first is known:
+            self._keeper.decided(item)
+        return first
+
+    def _known(self, decision_id: str) -> StoredDecision | None:
+        try:
+            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
+        except StoreError as error:  # the store is away: what was decided lately is known all the same
+            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
+            return None
+
+    def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
+        if self.trace is None:
+            trace = self._peers_trace() or trace
+            self._maker.agree_on(trace)
+            self._settings.agree_on(trace, inferred)
+        return self.trace or trace
+
+    def _peers_trace(self) -> TraceSpec | None:
+        """What the product's other cells agreed on; where the store is away, the cell's own first trace stands."""
+        try:
+            return self._keeper.ask(lambda: peers_trace(self.store)) if is_shared(self.store) else None
+        except StoreError:
+            log.exception("the product's contract of traces cannot be had")
+            return None
+
+    def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
+        x = as_agreed(trace, self.trace, self._settings.now.inferred and self.version + self.new_labels == 0)
+        if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
+            if self.agree_on(spec, inferred=True) != spec:  # a peer's trace came first
+                return as_agreed(trace, self.trace, False)
+        else:
+            self._settings.save_waiting()
+        return x
+
     def report(
         self, decision_id: str, success: bool, trace: ArrayLike | None = None, part: str | int | None = None
     ) -> RetrainReport | None:
@@ -556,7 +346,31 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written."""
-        return drive(self, cell, cycles)
+        try:
+            for index in range(cycles):
+                yield self._cycle(cell, index)
+        finally:
+            self.flush()
+
+    def _cycle(self, cell: Cell, index: int) -> Cycle:
+        trace = cell.insert()
+        begin = self.clock()
+        decision = self.decide(
+            trace, getattr(cell, "part", None)
+        )  # a cell that knows its parts' numbers tells the last one
+        seconds = self.clock() - begin
+        outcome, success, source = None, None, None
+        if decision.action is Action.VERIFY:
+            success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
+        elif decision.action is Action.ACCEPT:
+            outcome = as_outcome(cell.proceed(), f"decision {decision.id}, by proceed()")
+            success = KNOWN.get(outcome)
+        else:
+            cell.reject()
+        if success is not None:
+            source = source_of(decision.id, decision.action, decision.audit, success)
+            self.report(decision.id, success)
+        return Cycle(index, decision, outcome, success, source, seconds, self.settle(), self.safe_mode)
 
     def settle(self, brief: bool = False) -> RetrainReport | None:
         """Do what need not wait for a report: a retrain, a new version, a slice of training; the newest retrain, once.
@@ -579,8 +393,152 @@ class DataEngine(LateDecisions, EngineReview, Corrections):
                 self._versions.collect(CLOSE)
             self._keeper.close()
 
+    def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
+        """Say that a label was wrong, or that a forgotten one counts again; see `Corrections.correct`."""
+        return self._corrections.correct(decision_id, success, author)
+
+    def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
+        """Leave labels out of all that is learned and counted from now on; see `Corrections.forget`."""
+        return self._corrections.forget(*decision_ids, author=author, reason=reason)
+
+    def rollback(self, version: int, author: str = "") -> Changed:
+        """Let an earlier version answer again, as a new version; see `Corrections.rollback`."""
+        return self._corrections.rollback(version, author)
+
+    def set_policy(self, policy: Policy, author: str = "") -> Changed:
+        """Decide by another policy from the next decision on; see `Corrections.set_policy`."""
+        return self._corrections.set_policy(policy, author)
+
+    def set_shadow(self, on: bool, author: str = "") -> Changed:
+        """Verify every part from the next decision on, or end that; see `Corrections.set_shadow`."""
+        return self._corrections.set_shadow(on, author)
+
+    def find(self, decision_id: str) -> StoredDecision | None:
+        """A decision with its trace, and with its label where it has one; None for an unknown id."""
+        return self._keeper.find(as_id(decision_id))
+
+    def know_ids(self) -> None:
+        """Learn which ids are taken, so that `decide` looks no new one up in the store: quicker, where callers name them.
+
+        It reads every id once, a second for a million of them.
+        """
+        self.flush()
+        self._keeper.recent.know(self.store.decision_ids())
+
+    def flush(self) -> None:
+        """Return when all that is known so far is on the disk."""
+        self._feedback.store_waiting()
+        self._keeper.flush()
+
+    @property
+    def retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or waits to be swapped in."""
+        return self._versions.busy
+
+    @property
+    def swapping(self) -> bool:
+        """Whether a version that an executor has trained is on its way in, a step each time that the engine is asked."""
+        return self._versions.swapping
+
+    @property
+    def encoder_time(self) -> EncoderTime:
+        """What the encoder's training took so far."""
+        return self._versions.retrainer.encoder_time
+
+    @property
+    def recipe(self) -> Recipe:
+        """Every setting as it is in force; all but the policy are fixed once the engine is made."""
+        return self._settings.now.recipe
+
+    @property
+    def policy(self) -> Policy:
+        """The user's numbers as they are in force; `set_policy` changes them."""
+        return self._settings.policy
+
+    @property
+    def shadow(self) -> bool:
+        """Whether every part is verified, and the model only says what it would have done; `set_shadow` changes it."""
+        return self.policy.shadow
+
+    @property
+    def trace(self) -> TraceSpec | None:
+        """The traces' contract; None before the first sound trace."""
+        return self._settings.now.trace
+
+    @property
+    def model(self) -> Any:
+        """The model that answers, a rival as its author knows it; None before the first retrain."""
+        return None if self._versions.answering is None else self._versions.answering.user_model
+
+    @property
+    def version(self) -> int:
+        """Of the model that answers; 0 before the first retrain."""
+        return self._versions.version
+
+    @property
+    def safe_mode(self) -> str:
+        """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
+        return self._feedback.safe_mode
+
+    @property
+    def store_fault(self) -> str:
+        """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
+        return self._keeper.fault
+
+    def certificate(self) -> Certificate:
+        """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
+        self.flush()
+        return self.policy.certificate(self.store.outcomes(self._settings.now.policy_since))
+
+    @property
+    def new_labels(self) -> int:
+        """Labels since the last retrain began."""
+        return self._versions.new_labels
+
+    def exported(self, trace: TraceSpec | None = None) -> Exportable:
+        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
+        own, policy = self._versions.newest.exported(trace or self.trace), self.policy
+        coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
+        about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
+        return replace(own, note=self._keeper.event, **about, **coin)
+
+    def history(
+        self,
+        last: int | None = None,
+        action: Action | str | None = None,
+        reason: Reason | str | None = None,
+        label: str | None = None,
+        since: float | None = None,
+        until: float | None = None,
+        predicted: Action | str | None = None,
+    ) -> Iterator[PastDecision]:
+        """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
+        return history(self.store, last, action, reason, label, since, until, predicted)
+
+    def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
+        """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
+        versions = self._versions
+        return explain(decision_id, Records(self.store, lambda: versions.answering, versions.version), neighbours)
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def explain_stored(store: Store, decision_id: str, neighbours: int = 10) -> Explanation:
+    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes."""
+    last = store.past_retrains()
+    version = max((each.report.version for each in last if each.report.accepted), default=0)
+    return explain(decision_id, Records(store, lambda: _present(store), version), neighbours)
+
+
+def _present(store: Store) -> EngineModel | None:
+    """The model that answers now, rebuilt; None where it needs an object that the store cannot name."""
+    try:
+        settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
+        return resume(store, template, Window(settings.recipe.window), settings.evidence).model
+    except DengineError as error:
+        log.info("the present model cannot be rebuilt from the store alone: %s", error)
+        return None

@@ -16,6 +16,7 @@ from ..records import Action, Source
 from ..store.outbox import Keeper
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
 from .decide import source_of
+from .settings import SettingsInForce
 from .versions import ModelVersions, Point
 
 log = logging.getLogger("dengine")
@@ -25,8 +26,8 @@ BATCH = 100  # confirmed parts that wait for a report, before a decision stores 
 class Feedback:
     """Takes in what became of decided parts.
 
-    stops_all : whether silence until the next decision confirms an accepted part.
-    policy_since : the first model version under this policy: what an earlier one accepted is not waited for.
+    settings : whether silence until the next decision confirms an accepted part, and since which version: what an earlier
+        one accepted is not waited for.
     on_safe_mode : called with the reason, "" where it ends, when the safe mode begins or ends; it is recorded before.
     """
 
@@ -34,12 +35,10 @@ class Feedback:
         self,
         keeper: Keeper,
         versions: ModelVersions,
-        stops_all: bool,
+        settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
-        policy_since: int = 0,
     ) -> None:
-        self.policy_since = policy_since
-        self.keeper, self.versions, self.stops_all = keeper, versions, stops_all
+        self.keeper, self.versions, self.settings = keeper, versions, settings
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
         self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
@@ -50,13 +49,17 @@ class Feedback:
         versions.store_waiting = self.store_all
         versions.journal_cleared = self.journal_cleared
 
+    @property
+    def _stops_all(self) -> bool:
+        return self.settings.policy.stops == "all"
+
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.safe_mode
         store = self.keeper.store
-        ids = store.unreported_accepts(self.policy_since)
-        if not self.stops_all:
-            self._silent = len(ids) - store.silent_total(self.policy_since)
+        ids = store.unreported_accepts(self.settings.now.policy_since)
+        if not self._stops_all:
+            self._silent = len(ids) - store.silent_total(self.settings.now.policy_since)
             return
         for id_ in ids:
             known = store.get_decision(id_)
@@ -75,7 +78,7 @@ class Feedback:
             return
         while self._went_on:
             known = self._went_on.pop(next(iter(self._went_on)))
-            if self.stops_all:
+            if self._stops_all:
                 label, point = self._label(known, True, Source.CONFIRMED)
                 self._learn(known, label, point)
                 self._waiting.append((known, label))
@@ -112,9 +115,7 @@ class Feedback:
             self.versions.unlearn(known)
         self._learn(known, label, point)
         self._keep(known, success, int(seq))
-        if late:
-            self.versions.new_labels -= self.versions.fleet is None
-            self._untrue = True
+        self._untrue |= bool(late)
         self.arrive()
         self.announce()
 
@@ -160,8 +161,8 @@ class Feedback:
 
     def _was_silent(self, known: StoredDecision) -> bool:
         """Whether an accepted part was counted among the silent ones before its label came."""
-        counted = known.action is Action.ACCEPT and known.id not in self._went_on and not self.stops_all
-        return counted and known.model_version >= self.policy_since
+        counted = known.action is Action.ACCEPT and known.id not in self._went_on and not self._stops_all
+        return counted and known.model_version >= self.settings.now.policy_since
 
     def _label(self, known: StoredDecision, success: bool, source: Source, less: int = 0) -> tuple[NewLabel, Point | None]:
         point = None if known.quarantined else self.versions.reference_point(known)
@@ -173,9 +174,8 @@ class Feedback:
         self._silent = 0
         self.versions.learn(known, label.success, point, label.silent)
 
-    def begin_policy(self, stops_all: bool, since: int) -> None:
+    def begin_policy(self) -> None:
         """Go on under another policy. What was accepted under the last one and not heard of stays unheard of."""
-        self.stops_all, self.policy_since = stops_all, since
         self._went_on.clear()
         self._silent = 0
 

@@ -2,7 +2,7 @@
 
 Labels of a product have one sequence over all its cells. An engine keeps a part of it without gaps: its window holds
 every label up to the newest one there, so that a version, which says up to which label it knows, means the same in each
-cell. A label of its own is a reference at once, and waits for the sisters' before it until it enters the window.
+cell. A label of its own is a reference at once, and waits for the peers' before it until it enters the window.
 
 News is asked for between two cycles, once in a while, and never by `decide`. What cannot be had is asked for again later:
 a cell whose connection is lost goes on with what it has.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,56 +25,43 @@ from ..records import TraceSpec, trace_in
 from ..store.base import SharedStore, Store, is_shared
 from ..store.peers import without_rule
 from ..store.records import ModelVersion
-from .resume import Origin, References, join_since, known_to, restored
+from .resume import TrainedOn, join_since, known_to, restored
 from .settings import EngineSettings
-
-if TYPE_CHECKING:
-    from ..store.outbox import Keeper
-    from .versions import ModelVersions
+from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
 NEWS_SECONDS = 1.0  # between two questions for news
 MOST = 200  # labels taken in at once: each is embedded, some tenths of a millisecond
 ROUNDS = 5  # of them before a retrain: after a long absence it need not know all
-OVERDUE = 2  # times a schedule: then a sister whose turn it was to retrain does not do it
+OVERDUE = 2  # times a schedule: then a peer whose turn it was to retrain does not do it
 
 
 def agreed(settings: EngineSettings, store: Store) -> EngineSettings:
-    """An engine's settings with its product's contract of traces, where a sister has one and the engine none yet."""
-    return replace(settings, trace=sisters_trace(store)) if settings.trace is None else settings
+    """An engine's settings with its product's contract of traces, where a peer has one and the engine none yet."""
+    return replace(settings, trace=peers_trace(store)) if settings.trace is None else settings
 
 
-def sisters_trace(store: Store) -> TraceSpec | None:
+def peers_trace(store: Store) -> TraceSpec | None:
     """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
     if not is_shared(store):
         return None
     return next(filter(None, map(trace_in, store.sisters_settings().values())), None)
 
 
-def trace_of_sisters(keeper: Keeper) -> TraceSpec | None:
-    """`sisters_trace`, asked of a store that may be away: then the cell's own first trace stands."""
-    try:
-        return keeper.ask(lambda: sisters_trace(keeper.store)) if is_shared(keeper.store) else None
-    except StoreError:
-        log.exception("the product's contract of traces cannot be had")
-        return None
-
-
-def as_sisters(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
-    """What a new engine is asked for, as `DataEngine` takes it; what was left open, as a sister has it if there is one."""
+def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
+    """What a new engine is asked for, as `DataEngine` takes it; what was left open, as a peer has it if there is one."""
     known = next(iter(store.sisters_settings().values()), {}) if is_shared(store) else {}
     filled = dict(asked)
     if filled.get("seed") is None:
         filled["seed"] = int(known.get("seed", 0))
     chosen = any(filled.get(name) is not None for name in ("reducer", "recipe", "model"))
-    if "recipe" in known and not chosen:
-        recipe = Recipe.from_toml(known["recipe"])
-        filled |= {} if "described" in known else {"recipe": recipe}  # an object must be handed in
+    if "recipe" in known and not chosen and "described" not in known:  # an object must be handed in
+        filled["recipe"] = Recipe.from_toml(known["recipe"])
     return filled
 
 
 @dataclass(frozen=True, slots=True)
-class _Kept:
+class _Own:
     """A label of this cell."""
 
     trace: NDArray[np.float32]
@@ -83,36 +70,39 @@ class _Kept:
 
 
 class Fleet:
-    """What one engine takes in of its product.
+    """What one engine takes in of its product: a `versions.LabelCount` of all its cells' labels.
 
     store : of one cell of a product.  versions : whose model answers, and whose window is filled.
     """
 
+    shared = True
+
     def __init__(self, store: SharedStore, versions: ModelVersions) -> None:
         self.store, self.versions = store, versions
-        self._ahead: dict[int, _Kept] = {}  # own labels by number; of sisters' before them nothing is known yet
+        self._ahead: dict[int, _Own] = {}  # own labels by number; of peers' before them nothing is known yet
         self._since: list[tuple[int, bool]] = []  # labels since the newest retrain began: number, and whether it is own
         self._trained_to = 0  # newest label that the newest retrain knew
-        self.told_to = 0  # newest own label: the rule was told of all until there
+        self._told_to = 0  # newest own label: the rule was told of all until there
         self._holds_to = 0  # references hold every label until there, the window perhaps not yet
         self._refused = 0  # a version that could not be taken over
         self._asked = -np.inf
         self._lost = False
-
-    @property
-    def _window(self) -> Any:
-        return self.versions.retrainer.window
+        self._window = versions.retrainer.window
 
     def resume(self) -> None:
         """The engine has gone on from the store."""
         n, seq = self.versions.new_labels, self._window.snapshot().seq
         self._since = [(int(number), False) for number in seq[len(seq) - n :]]
         self._trained_to = int(seq[-n - 1]) if len(seq) > n else 0
-        self.told_to, self._asked = self._window.newest_seq, self.versions.clock()
+        self._told_to, self._asked = self._window.newest_seq, self.versions.clock()
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What a version has to say of this cell."""
+        return {"told_to": np.array(self._told_to)}
 
     def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
         """Take a label of this cell that was stored, and is a reference already."""
-        self._ahead[seq], self.told_to = _Kept(trace, label, hash_), max(seq, self.told_to)
+        self._ahead[seq], self._told_to = _Own(trace, label, hash_), max(seq, self._told_to)
         if seq == self._window.newest_seq + 1:
             self._admit(trace, label, hash_, seq)
 
@@ -120,12 +110,10 @@ class Fleet:
         own = self._ahead.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
         if seq > self._trained_to:
-            self._since.append((seq, own))
-            self.versions.new_labels = len(self._since)
-        if not own and seq > self._holds_to:
-            model = self.versions.newest
-            if self.versions.answering is not None and model.add_safely(model.place_safely(trace, hash_), label, hash_):
-                self.versions.references.add(seq)
+            self._count([*self._since, (seq, own)])
+        model = self.versions.answering
+        if not own and seq > self._holds_to and model is not None:
+            model.add_safely(model.place_safely(trace, hash_), label, hash_, seq)
 
     def _count(self, since: list[tuple[int, bool]]) -> None:
         self._since, self.versions.new_labels = since, len(since)
@@ -136,7 +124,7 @@ class Fleet:
             self.take_in()
         if not self._turn(retrain_every):
             return False
-        self._take_in_all()  # a sister's version may have come
+        self._take_in_all()  # a peer's version may have come
         return self._turn(retrain_every)
 
     def _turn(self, retrain_every: int) -> bool:
@@ -154,7 +142,7 @@ class Fleet:
                 return
 
     def take_in(self) -> int:
-        """Take in the sisters' newest version and labels, `MOST` at most; returns how many. A lost connection is none."""
+        """Take in the peers' newest version and labels, `MOST` at most; returns how many. A lost connection is none."""
         try:
             self.versions.journal_cleared()
             seq = self._window.newest_seq
@@ -189,41 +177,41 @@ class Fleet:
             log.warning("corrections of product %s cannot be had yet: %s", self.store.product, error)
 
     def _take_over(self, version: ModelVersion) -> None:
-        """Let a sister's version answer, with every label since and this cell's own rule; one that fails is left alone."""
-        versions, window = self.versions, self._window
-        origin = Origin.from_state(version.state)
+        """Let a peer's version answer, with every label since and this cell's own rule; one that fails is left alone."""
+        versions = self.versions
+        trained_on = TrainedOn.from_state(version.state)
         try:
             model = restored(self.store, versions.template, without_rule(version.state))
             if model is None:
                 raise StoreError("a trace that it was fitted on has changed; see `dengine verify`.")
-            references, _ = join_since(model, self.store, version, window)
+            join_since(model, self.store, version, self._window)
         except Exception as error:  # what fails in a model is recorded, and the version before goes on answering
             log.exception("version %d of product %s cannot be taken over", version.version, self.store.product)
             self._refused = self._refused if isinstance(error, StoreError) else version.version
             return
         model.prepare_safely(versions.newest)
         self._holds_to = known_to(version)
-        self._add_ahead(model, self._holds_to, references)
-        versions.take_over(model, version.version, references, origin)
-        self._trained_to = origin.counts_from
+        self._add_ahead(model, self._holds_to)
+        versions.take_over(model, version.version, trained_on)
+        self._trained_to = trained_on.counts_from
         self._count([each for each in self._since if each[0] > self._trained_to])
 
-    def _add_ahead(self, model: EngineModel, last_seq: int, references: References) -> None:
+    def _add_ahead(self, model: EngineModel, last_seq: int) -> None:
         for seq, own in self._ahead.items():
-            if seq > last_seq and model.add_safely(model.place_safely(own.trace, own.hash), own.label, own.hash):
-                references.add(seq)
+            if seq > last_seq:
+                model.add_safely(model.place_safely(own.trace, own.hash), own.label, own.hash, seq)
 
     def swapped(self, model: EngineModel) -> None:
-        """A version that this cell trained answers: labels of its own that wait for sisters' before them are in it too."""
+        """A version that this cell trained answers: labels of its own that wait for peers' before them are in it too."""
         self._holds_to = 0
-        self._add_ahead(model, 0, self.versions.references)
+        self._add_ahead(model, 0)
 
     def begin_counting(self) -> None:
         """Count the labels of the next retrain from here."""
         self._trained_to = self._window.newest_seq
         self._count([])
 
-    def recount(self) -> None:
+    def recount(self, counts_from: int) -> None:
         """The window was filled anew: what was forgotten does not count, and what counts again does."""
         own = {number for number, mine in self._since if mine}
         seq = self._window.snapshot().seq.tolist()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
@@ -15,6 +16,9 @@ from ..model.neighbours import ModelPrediction
 from ..model.rival import as_engine_model
 from ..recipe import OBJECT, Recipe, described
 from ..records import TraceSpec, is_whole, trace_in
+from ..store.outbox import Keeper
+
+log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 LOOP = (
@@ -28,7 +32,15 @@ LOOP = (
     "audit_rate",
     "stops",
 )  # that count for any model
-MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set
+MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceWindow:
+    """What the rule in force is told: what was decided from version `since` on; it began at `began_in` of `SAFE_MODE`."""
+
+    since: int = 0
+    began_in: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +52,7 @@ class EngineSettings:
     described : the object that was handed in, a model or a reducer without a name, with its settings; None: there is none.
     trace : the traces' contract; None until the first sound trace.  inferred : whether it was set by that, and not given.
     policy_since : the first model version under the policy in force; 0: every one.
-    told_since : the first version of whose decisions the rule in force is told.  began_in : the position in `SAFE_MODE`
-        that it began in.
-    shadowed_rate : the audit rate that the shadow mode took the place of.
+    evidence : what the rule in force is told.
     """
 
     recipe: Recipe
@@ -52,9 +62,7 @@ class EngineSettings:
     trace: TraceSpec | None = None
     inferred: bool = False
     policy_since: int = 0
-    told_since: int = 0
-    began_in: int = 0
-    shadowed_rate: float = 0.0
+    evidence: EvidenceWindow = EvidenceWindow()
 
     def __post_init__(self) -> None:
         if not is_whole(self.seed, 0, SEEDS):
@@ -70,7 +78,8 @@ class EngineSettings:
             known["trace"] = json.dumps(asdict(self.trace))
         if self.inferred:
             known["inferred"] = "true"
-        return known | {name: str(value) for name in (*MARKS, "shadowed_rate") if (value := getattr(self, name))}
+        marks = (self.policy_since, self.evidence.since, self.evidence.began_in)
+        return known | {name: str(value) for name, value in zip(MARKS, marks, strict=True) if value}
 
     @classmethod
     def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
@@ -104,9 +113,9 @@ class EngineSettings:
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
         inferred = "inferred" in known
-        marks = {name: int(known.get(name, "0")) for name in MARKS}
-        model_, trace, rate = known.get("model"), trace_in(known), shadowed_rate_in(known)
-        return cls(recipe, seed_in(known), model_, made_with, trace, inferred, **marks, shadowed_rate=rate)
+        policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
+        model_, trace, seed = known.get("model"), trace_in(known), seed_in(known)
+        return cls(recipe, seed, model_, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
@@ -123,8 +132,6 @@ class EngineSettings:
         given = {name: value for name, value in asked.items() if value is not None}
         reducer, recipe, policy = (given.pop(name, None) for name in ("reducer", "recipe", "policy"))
         have = flat(self.recipe) | {"seed": self.seed, "trace": self.trace or given.get("trace")}
-        if self.recipe.policy.audit_rate == 1.0:  # a program's settings are the same in the shadow mode
-            have["audit_rate"] = self.shadowed_rate
         unknown = sorted(set(given) - set(have))
         if unknown:
             raise SettingError(f"Expected settings of a DataEngine, got {', '.join(unknown)}, which it has not.")
@@ -132,7 +139,8 @@ class EngineSettings:
         wished |= given | ({} if policy is None else asdict(policy)) | ({"reducer": reducer} if reducer is not None else {})
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
-        counts = LOOP if self.model is not None else tuple(have)
+        # A program's settings are the same in the shadow mode, which a person begins and ends.
+        counts = LOOP if self.model is not None else tuple(name for name in have if name != "shadow")
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
@@ -163,7 +171,7 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
     idle = [name for name in ("radius", "folds") if beside.get(name) is not None]
     idle += [] if reducer is None else ["reducer"]
     policy = beside.get("policy")
-    idle += [] if policy is None or replace(policy, audit_rate=0.0, stops="some") == Policy() else ["policy"]
+    idle += [] if policy is None or replace(policy, audit_rate=0.0, stops="some", shadow=False) == Policy() else ["policy"]
     if idle:
         raise SettingError(
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
@@ -179,19 +187,40 @@ def seed_in(known: Mapping[str, str]) -> int:
     return int(seed)
 
 
-def shadowed_rate_in(known: Mapping[str, str]) -> float:
-    """The audit rate behind the shadow mode among a store's settings. StoreError for what is none."""
-    text = known.get("shadowed_rate", "0")
-    try:
-        return Policy(audit_rate=float(text)).audit_rate
-    except (ValueError, SettingError) as error:
-        raise StoreError(
-            f"Expected an audit rate in the store's settings, got {shortened(text)}; restore the store from a copy."
-        ) from error
-
-
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
     plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
     policy: Policy = plain.pop("policy")
     return plain | asdict(policy)
+
+
+class SettingsInForce:
+    """The settings in force, and the store's copy of them.
+
+    now : they themselves; whoever changes them for good stores them.
+    """
+
+    def __init__(self, settings: EngineSettings, keeper: Keeper) -> None:
+        self.now = settings
+        self._keeper, self._waiting = keeper, False
+
+    @property
+    def policy(self) -> Policy:
+        """The user's numbers."""
+        return self.now.recipe.policy
+
+    def agree_on(self, trace: TraceSpec, inferred: bool) -> None:
+        """Set the traces' contract."""
+        self.now = replace(self.now, trace=trace, inferred=inferred)
+        self._waiting = True
+        self.save_waiting()
+
+    def save_waiting(self) -> None:
+        """Store what is not stored yet; where the store is away, the next call does."""
+        if not self._waiting:
+            return
+        try:
+            self._keeper.ask(lambda: self._keeper.store.save_settings(self.now.to_store()))
+            self._waiting = False
+        except StoreError:
+            log.exception("the settings are stored later")

@@ -1,8 +1,6 @@
-"""A retrain inside its time budget: the candidate, the gate, the swap's reserve.
+"""A retrain inside its time budget, in line or in an executor, which may die or hang: neither stops the cell.
 
-A retrain in an executor, which may die or hang: neither stops the cell.
-
-The window that a retrain sees: the newest labelled traces, in memory.
+The window that it sees: the newest labelled traces, in memory.
 """
 
 from __future__ import annotations
@@ -11,8 +9,7 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future
-from dataclasses import dataclass, replace
-from typing import Any, Generic, Self, TypeVar
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -25,58 +22,14 @@ from ..store.records import Labelled
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
+SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
+MARGIN = 1.2  # the tail grows a little with each retrain
+SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
+STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
+MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
+DRAWN = 1024  # traces that a slice trains on
 
-T = TypeVar("T")
-
-
-class Pending(Generic[T]):
-    """Work in an executor.
-
-    seq : the labels that it was given.
-    gave_up : whether the executor is of no more use. It is the caller's, and cannot be made anew here: what follows is done
-        in line.
-    """
-
-    def __init__(self, future: Future[T], seq: NDArray[np.int64]) -> None:
-        self.seq = seq
-        self.gave_up = False
-        self._future = future
-        self._began = time.monotonic()
-
-    @classmethod
-    def submit(
-        cls, executor: Executor, work: Callable[..., T], args: tuple[Any, ...], seq: NDArray[np.int64]
-    ) -> Self | None:
-        """Begin; None where the executor takes no more work, for it is broken or shut down."""
-        try:
-            return cls(executor.submit(work, *args), seq)
-        except RuntimeError as error:
-            log.error("the executor takes no more work, retrains are in line from now on: %s", error)
-            return None
-
-    def due(self, wait: float) -> bool:
-        """Whether a result may be asked for: it is there, or worth so many seconds, or will not come."""
-        return self._future.done() or wait > 0.0 or self._left() <= 0.0
-
-    def result(self, wait: float) -> T:
-        """Return it within so many seconds. Raises what the work raised, RuntimeError where it died or is not done."""
-        try:
-            return self._future.result(timeout=max(0.0, min(wait, self._left())))
-        except BrokenExecutor as error:
-            self.gave_up = True
-            raise RuntimeError(f"{type(error).__name__}: {error} Retrains are in line from now on.") from error
-        except TimeoutError as error:
-            if self._future.done():  # the work's own
-                raise
-            self.gave_up = True
-            self._future.cancel()
-            seconds = time.monotonic() - self._began
-            raise RuntimeError(
-                f"not done after {seconds:.0f} s in the executor. Retrains are in line from now on."
-            ) from error
-
-    def _left(self) -> float:
-        return self._began + HUNG - time.monotonic()
+Clock = Callable[[], float]
 
 
 class Window:
@@ -171,16 +124,6 @@ class Window:
         )
 
 
-SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
-MARGIN = 1.2  # the tail grows a little with each retrain
-SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
-STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
-MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
-DRAWN = 1024  # traces that a slice trains on
-
-Clock = Callable[[], float]
-
-
 @dataclass(frozen=True)
 class Limits:
     """What a retrain may use.
@@ -243,30 +186,24 @@ class EncoderTime:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Trained:
     """The outcome of a training.
 
     model : to swap in; None: dropped.  reason : why, in words.
     seconds : of the whole.  tail : of what followed the last step, the next retrain's reserve.
     encoder_steps, encoder_seconds : that the encoder trained before, beside the cell.
+    seq : the labels it was trained on.  begin : when, by the retrainer's clock.
     """
 
     model: EngineModel | None
     reason: str
-    n_steps: int
-    seconds: float
-    tail: float
+    n_steps: int = 0
+    seconds: float = 0.0
+    tail: float = 0.0
     encoder_steps: int = 0
     encoder_seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Trained:
-    """A candidate, the labels it was trained on, and when that began by the retrainer's clock."""
-
-    candidate: Candidate
-    seq: NDArray[np.int64]
-    begin: float
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    begin: float = 0.0
 
 
 class Retrainer:
@@ -289,12 +226,14 @@ class Retrainer:
         self.limits = limits
         self.executor = executor
         self.clock = clock
-        self._pending: Pending[Candidate] | None = None
+        self._future: Future[Trained] | None = None
+        self._began = 0.0  # monotonic seconds
+        self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
 
     @property
     def busy(self) -> bool:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
-        return self._pending is not None
+        return self._future is not None
 
     def improve(self, current: EngineModel) -> None:
         """Train the current model's encoder for a slice, in line, where one is due."""
@@ -310,40 +249,54 @@ class Retrainer:
     def train(self, current: EngineModel) -> Trained:
         """Train a successor of the current model, in line."""
         begin, data = self.clock(), self.window.snapshot()
-        candidate = train_candidate(current.successor(), data, self.limits, self.clock)
-        return self._note(Trained(candidate, data.seq, begin))
+        trained = train_candidate(current.successor(), data, self.limits, self.clock)
+        return self._measured(replace(trained, begin=begin))
 
     def start(self, current: EngineModel) -> bool:
         """Train a successor of the current model beside the cell; False where the executor takes no more work."""
         assert self.executor is not None  # the caller asked; for the type checker
         data, piece = self.window.snapshot(), self.encoder_time.take()
-        work = (current.successor(), data, self.limits, self.clock, piece)
-        self._pending = Pending.submit(self.executor, _train_beside, work, data.seq)
-        self.executor = self.executor if self.busy else None
+        try:
+            self._future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
+        except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
+            log.error("the executor takes no more work, retrains are in line from now on: %s", error)
+            self.executor = None
+        self._began, self._seq = time.monotonic(), data.seq
         return self.busy
 
     def collect(self, wait: float = 0.0) -> Trained | None:
         """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
-        pending = self._pending
-        if pending is None or not pending.due(wait):
+        future, left = self._future, self._began + HUNG - time.monotonic()
+        if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
-        self._pending = None
+        self._future = None
         try:
-            candidate = pending.result(wait)
+            trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # recorded, and the old version goes on answering
-            log.error("a retrain in the executor failed: %s", error, exc_info=not pending.gave_up)
-            candidate = Candidate(None, _dropped(error), 0, 0.0, 0.0)
-            self.executor = None if pending.gave_up else self.executor
-        self.encoder_time.spend(candidate.encoder_steps, candidate.encoder_seconds)
-        return self._note(Trained(candidate, pending.seq, self.clock() - candidate.seconds))
+            trained = Trained(None, self._failed(future, error), seq=self._seq)
+        self.encoder_time.spend(trained.encoder_steps, trained.encoder_seconds)
+        return self._measured(replace(trained, begin=self.clock() - trained.seconds))
 
-    def _note(self, trained: Trained) -> Trained:
-        if trained.candidate.model is not None:
-            self.limits = replace(self.limits, reserve=SWAP_SECONDS + MARGIN * trained.candidate.tail)
+    def _failed(self, future: Future[Trained], error: Exception) -> str:
+        """Why a training is dropped; an executor that died or hangs is of no more use."""
+        own = future.done() and not isinstance(error, BrokenExecutor)
+        log.error("a retrain in the executor failed: %s", error, exc_info=own)
+        if own:
+            return _dropped(error)
+        self.executor = None
+        future.cancel()
+        what = f"{type(error).__name__}: {error}"
+        if isinstance(error, TimeoutError):
+            what = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
+        return f"dropped: RuntimeError: {what} Retrains are in line from now on."
+
+    def _measured(self, trained: Trained) -> Trained:
+        if trained.model is not None:
+            self.limits = replace(self.limits, reserve=SWAP_SECONDS + MARGIN * trained.tail)
         return trained
 
 
-def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock, piece: Slice | None) -> Candidate:
+def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock, piece: Slice | None) -> Trained:
     torch.set_num_threads(1)  # per thread, and first thing in each
     begin, steps = clock(), 0
     if piece is not None and len(data.seq):
@@ -352,7 +305,7 @@ def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock:
     return replace(train_candidate(successor, data, limits, clock), encoder_steps=steps, encoder_seconds=seconds)
 
 
-def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Candidate:
+def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
     """Train a successor on the data; a plain function of plain arguments, so that any executor can run it.
 
     The gate reads no label. One on held-out loss belongs to each head, inside the reducer: here it would let fold k's
@@ -365,7 +318,7 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
     try:
         if not len(data.seq):
             raise SettingError("there is no labelled trace yet; report one first")
-        report = successor.train(data.traces, data.labels, hashes=data.hashes, stop=stop).report
+        report = successor.train(data.traces, data.labels, hashes=data.hashes, stop=stop, numbers=data.seq).report
         n_steps, defect = report.n_steps, successor.defect()
         model = None if defect else successor
         reason = f"dropped: {defect}" if defect else "; ".join(filter(None, ("accepted", report.note)))
@@ -374,7 +327,8 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
     except Exception as error:  # no exception inside a model reaches the cell: it is recorded
         model, reason = None, _dropped(error)
     end = clock()
-    return Candidate(model, reason, n_steps, end - begin, end - (stop.asked_at or begin))
+    tail = end - (stop.asked_at or begin)
+    return Trained(model, reason, n_steps, end - begin, tail, seq=data.seq, begin=begin)
 
 
 def _dropped(error: Exception) -> str:

@@ -1,17 +1,16 @@
-"""The model that answers, and how a new version takes its place.
+"""The model that answers, what it learns from one label after the other, and how a new version takes its place.
 
-A version on its way in: it learns the labels that came during its training, is stored, and then answers.
-
-Where it was trained beside the cell, the cell goes on meanwhile: all of this is done in steps that no part waits for.
-
-The version that answers, and what it learns from one label after the other.
+A candidate that was trained beside the cell comes in by steps that no part waits for: it learns the labels that came
+meanwhile, is stored, and then answers.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,30 +20,32 @@ from ..errors import StoreError
 from ..model.base import EngineModel, Told
 from ..records import Reason, RetrainReport
 from ..reducers.base import State
-from ..store.base import Store, is_shared
+from ..store.base import Store
 from ..store.outbox import Asked, Keeper
 from ..store.peers import without_rule
 from ..store.records import Change, StoredDecision
-from .peers import Fleet
-from .resume import Origin, References, Telling, change, join_since, refit, resume, tell_all
+from .resume import TrainedOn, change, join_since, refit, resume, tell_all
+from .settings import EvidenceWindow
 from .trainer import HUNG, Retrainer, Trained, Window
 
+log = logging.getLogger("dengine")
 STEP = 0.001  # seconds of learning at once: some labels
 
+Point = NDArray[np.float32]
 
-class Incoming:
+
+class Candidate:
     """What was trained, until it answers.
 
     previous : the model that answers, whose rule goes on.  version : its number.
-    references : the labels behind the references.  report : what is known of it so far.  storing : its commit, once begun.
+    report : what is known of it so far.  storing : its commit, once begun.
     """
 
     def __init__(self, trained: Trained, previous: EngineModel, version: int, clock: Callable[[], float]) -> None:
-        candidate = trained.candidate
-        self.model, self.seq, self.references = candidate.model, trained.seq, References(trained.seq)
+        self.model, self.seq = trained.model, trained.seq
         if self.model is not None:
             self.model.prepare_safely(previous)
-        self.report = RetrainReport(version, 0.0, len(trained.seq), candidate.n_steps, False, candidate.reason)
+        self.report = RetrainReport(version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason)
         self.storing: Asked[int | None] | None = None
         self.seconds = clock() - trained.begin  # of work on it: the cell's own, in between, is not counted
         self._clock = clock
@@ -52,42 +53,106 @@ class Incoming:
 
     def learn(self, window: Window, seconds: float = np.inf) -> bool:
         """Make labels that came during its training references, no longer than that; whether it has all."""
-        missing = [] if self.model is None else self._missing(window)
-        if not missing:
+        if (model := self.model) is None:
             return True
+        missing = [seq for seq in window.newer(int(self.seq[-1])).tolist() if seq not in self._seen]
         begin = self._clock()
         while missing and self._clock() - begin < seconds:
-            self._learn_one(missing.pop(0), window)
+            trace, label, hash_ = window.row(seq := missing.pop(0))
+            model.add_safely(model.place_safely(trace, hash_), label, hash_, seq)
+            self._seen.add(seq)
         self.seconds += self._clock() - begin
         return not missing
 
-    def _missing(self, window: Window) -> list[int]:
-        return [seq for seq in window.newer(int(self.seq[-1])).tolist() if seq not in self._seen]
 
-    def _learn_one(self, seq: int, window: Window) -> None:
-        assert self.model is not None  # the caller asked; for the type checker
-        trace, label, hash_ = window.row(seq)
-        if self.model.add_safely(self.model.place_safely(trace, hash_), label, hash_):
-            self.references.add(seq)
-        self._seen.add(seq)
+class LabelCount(Protocol):
+    """Counts the labels that the next retrain waits for: a cell's own, or those of all cells of its product.
+
+    shared : whether labels and versions are a product's.
+    """
+
+    shared: bool
+
+    def resume(self) -> None:
+        """The engine has gone on from the store."""
+
+    def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+        """Take a label of this cell that was stored, and is a reference already."""
+
+    def due(self, retrain_every: int) -> bool:
+        """Whether a retrain is this cell's turn."""
+
+    def begin(self) -> None:
+        """A retrain begins."""
+
+    def begin_counting(self) -> None:
+        """Count the labels of the next retrain from here."""
+
+    def recount(self, counts_from: int) -> None:
+        """The window was filled anew."""
+
+    def swapped(self, model: EngineModel) -> None:
+        """A version that this cell trained answers."""
+
+    def complete(self) -> None:
+        """Know all that was stored, before a person changes something."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """What a version has to say of this cell."""
 
 
-log = logging.getLogger("dengine")
+class OwnLabels:
+    """The `LabelCount` of a cell without a product. Every label counts as soon as it is known."""
 
-Point = NDArray[np.float32]
-TELL_ALL = Telling()
+    shared = False
+
+    def __init__(self, versions: ModelVersions) -> None:
+        self._versions = versions
+
+    def resume(self) -> None:
+        """Nothing beyond what the store said."""
+
+    def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+        """Give it to the next retrain."""
+        self._versions.retrainer.window.add(trace, label, hash_, seq)
+
+    def due(self, retrain_every: int) -> bool:
+        """Whether there are so many."""
+        return self._versions.new_labels >= retrain_every
+
+    def begin(self) -> None:
+        """Count from here."""
+        self.begin_counting()
+
+    def begin_counting(self) -> None:
+        """None is new."""
+        self._versions.new_labels = 0
+
+    def recount(self, counts_from: int) -> None:
+        """Those after the ones that were trained on."""
+        self._versions.new_labels = self._versions.retrainer.window.after(counts_from)
+
+    def swapped(self, model: EngineModel) -> None:
+        """Nobody else's labels are missing."""
+
+    def complete(self) -> None:
+        """Nobody else has labels."""
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Nothing."""
+        return {}
 
 
-class CurrentVersion:
-    """The version of an engine's model that answers; `ModelVersions` is the rest of it.
+class ModelVersions:
+    """The versions of one engine's model: at most one answers, at most one is being trained.
 
     template : untrained; what the first version is trained from.
     answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
-    new_labels : since the last retrain began.
-    keeper : asks the store.
+    new_labels : since the last retrain began, as `count` has them.
+    keeper : asks the store.  evidence : what the rule in force is told of.
     journal_cleared : StoreError while labels of this cell wait in the journal.
     store_waiting : stores what the rule was told of and the store not yet, StoreError where it cannot; called before any
-        training or swap, since a version is stored after all that its rule was told of.
+        training or swap, since a version is stored after all that its rule was told of. Both are set by the feedback.
     """
 
     def __init__(
@@ -96,22 +161,20 @@ class CurrentVersion:
         retrainer: Retrainer,
         keeper: Keeper,
         clock: Callable[[], float],
-        telling: Telling = TELL_ALL,
+        evidence: EvidenceWindow,
     ) -> None:
-        self.template = template
-        self.telling = telling
-        self.retrainer = retrainer
-        self.keeper = keeper
-        self.clock = clock
+        self.template, self.retrainer, self.keeper, self.clock, self.evidence = template, retrainer, keeper, clock, evidence
         self.answering: EngineModel | None = None
-        self.version, self.new_labels = 0, 0
-        self.store_waiting: Callable[[], None] = _nothing_waits
-        self.journal_cleared: Callable[[], None] = _nothing_waits
-        self._references, self._corrected_to = References(), 0
-        self._origin: Origin | None = None
+        self.version, self.new_labels, self.corrected_to = 0, 0, 0
+        self.store_waiting: Callable[[], None] = lambda: None
+        self.journal_cleared: Callable[[], None] = lambda: None
+        self.count: LabelCount = OwnLabels(self)
+        self._trained_on: TrainedOn | None = None
         self._newest = 0  # number that a version ever had; after damage an earlier one may answer
-        self.fleet: Fleet | None = None
+        self._waiting: dict[str, int] = {}  # by decision, the numbers that references have until the store gives one
+        self._provisional = itertools.count(-1, -1)
         self._news: RetrainReport | None = None
+        self._candidate: Candidate | None = None
 
     @property
     def store(self) -> Store:
@@ -130,33 +193,16 @@ class CurrentVersion:
 
     def resume(self) -> None:
         """Go on from the store."""
-        resumed = resume(self.store, self.template, self.retrainer.window, self.telling)
+        resumed = resume(self.store, self.template, self.retrainer.window, self.evidence)
         self.answering, self.version, self.new_labels = resumed.model, resumed.version, resumed.new_labels
-        self._references, self._origin = resumed.references, resumed.origin
-        self._corrected_to = resumed.corrected_to
+        self._trained_on, self.corrected_to = resumed.trained_on, resumed.corrected_to
         self._newest = max((report.version for report in self.store.retrains()), default=0)
-        if self.fleet is not None:
-            self.fleet.resume()
+        self.count.resume()
 
-    def join(self) -> None:
-        """Start a new cell on what the others of its product learned; without a product there is nothing."""
-        if self.fleet is not None:
-            self.resume()
-
-    def take_over(self, model: EngineModel, number: int, references: References, origin: Origin) -> None:
-        """Let a sister's version answer."""
+    def take_over(self, model: EngineModel, number: int, trained_on: TrainedOn) -> None:
+        """Let a peer's version answer."""
         self.answering, self.version, self._newest = model, number, max(number, self._newest)
-        self._references, self._origin = references, origin
-
-    @property
-    def corrected_to(self) -> int:
-        """The newest correction that is known here."""
-        return self._corrected_to
-
-    @property
-    def references(self) -> References:
-        """The labels behind the references of the model that answers."""
-        return self._references
+        self._trained_on = trained_on
 
     def reference_point(self, known: StoredDecision) -> Point | None:
         """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
@@ -169,52 +215,28 @@ class CurrentVersion:
     def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
         """Take in what became of a part: tell the rule, and make the trace a reference."""
         novel = known.reason is Reason.NOVEL
-        if known.model_version >= self.telling.since:
+        if known.model_version >= self.evidence.since:
             self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
-        if self.newest.add_safely(point, int(success), known.content_hash):
-            self._references.add(known.id)
-        self.new_labels += self.fleet is None  # a product's labels are counted in their order, when they are kept
+        number = self._waiting[known.id] = next(self._provisional)
+        self.newest.add_safely(point, int(success), known.content_hash, number)
+        self.new_labels += not self.count.shared  # a product's labels are counted in their order, when they are kept
 
     def unlearn(self, known: StoredDecision) -> None:
         """Take out the reference of a part whose label waits for the store: it was not what happened."""
-        age = self._references.age(known.id)
-        if age is not None:
-            self.newest.change_reference(age, known.content_hash, None)
-            self._references.remove(age)
+        if (number := self._waiting.pop(known.id, None)) is not None:
+            self.newest.change_reference(number, known.content_hash, None)
+        self.new_labels -= not self.count.shared
 
     def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
         """Give a label that is stored to the next retrain."""
-        self._references.number(known.id, seq)
-        if self.fleet is not None:
-            self.fleet.keep(known.trace, int(success), known.content_hash, seq)
-            return
-        self.retrainer.window.add(known.trace, int(success), known.content_hash, seq)
+        if (number := self._waiting.pop(known.id, None)) is not None:
+            self.newest.renumber_reference(number, seq)
+        self.count.keep(known.trace, int(success), known.content_hash, seq)
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.keeper.ask(lambda: self.store.evidence_since(0, self.telling.since))
-        tell_all(self.newest, known, self.telling)
-
-
-def _nothing_waits() -> None:
-    """No label waits for the store."""
-
-
-class ModelVersions(CurrentVersion):
-    """The versions of one engine's model: at most one answers, at most one is being trained."""
-
-    def __init__(
-        self,
-        template: EngineModel,
-        retrainer: Retrainer,
-        keeper: Keeper,
-        clock: Callable[[], float],
-        telling: Telling = TELL_ALL,
-    ) -> None:
-        super().__init__(template, retrainer, keeper, clock, telling)
-        self._incoming: Incoming | None = None
-        if is_shared(keeper.store):
-            self.fleet = Fleet(keeper.store, self)
+        known = self.keeper.ask(lambda: self.store.evidence_since(0, self.evidence.since))
+        tell_all(self.newest, known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
         """Learn what the store's newest corrections say: references, window and rule, before the next decision.
@@ -222,17 +244,14 @@ class ModelVersions(CurrentVersion):
         What keeps references of its own, a rival, is trained anew at once; by the cell that corrected.
         """
         window = self.retrainer.window
-        last = None if self.fleet is None else window.newest_seq  # what sisters stored since comes as their news
+        last = window.newest_seq if self.count.shared else None  # what peers stored since comes as their news
         window.refill(self.store.labelled(window.capacity, last=last))
         done = self.newest.keeps_references or self.answering is None
-        for each in self.store.corrections(self._corrected_to):
+        for each in self.store.corrections(self.corrected_to):
             if self.answering is not None:
-                done &= change(self.answering, self._references, self.store, each)
-            self._corrected_to = each.number
-        if self.fleet is None:
-            self.new_labels = window.after(0 if self._origin is None else self._origin.counts_from)
-        else:
-            self.fleet.recount()
+                done &= change(self.answering, self.store, each)
+            self.corrected_to = each.number
+        self.count.recount(0 if self._trained_on is None else self._trained_on.counts_from)
         self.tell_anew()
         if own and not done:
             self.retrain()
@@ -241,61 +260,52 @@ class ModelVersions(CurrentVersion):
         """Let an earlier version answer again, as a new one, with what came since among its references."""
         begin, version = self.clock(), self.store.load_version(number)
         state = without_rule(version.state)  # which goes on
-        model, origin = self.template.successor(), Origin.from_state(version.state)
+        model, trained_on = self.template.successor(), TrainedOn.from_state(version.state)
         if not model.keeps_references:
             # A rival cannot take a label back: it learns from the same traces as they are labelled now.
-            origin = replace(origin, corrected_to=self._corrected_to)
-        if model.needs_refit(state) and not refit(model, self.store, origin):
+            trained_on = replace(trained_on, corrected_to=self.corrected_to)
+        if model.needs_refit(state) and not refit(model, self.store, trained_on):
             raise StoreError(
                 f"Expected the traces that version {number} was fitted on as they were stored, some have changed; "
                 "see `dengine verify`, and restore the store from a copy."
             )
         model.set_state(state)
         model.prepare_safely(self.newest)
-        references, _ = join_since(model, self.store, version, self.retrainer.window)
-        origin = replace(origin, counts_from=self.retrainer.window.newest_seq)
-        n = len(origin.seq)
+        join_since(model, self.store, version, self.retrainer.window)
+        trained_on = replace(trained_on, counts_from=self.retrainer.window.newest_seq)
+        n = len(trained_on.seq)
         report = RetrainReport(self.next_number, self.clock() - begin, n, 0, True, f"rolled back to version {number}")
-        self._record(event, report, model, references, origin)
-        self.new_labels = 0
-        if self.fleet is not None:
-            self.fleet.begin_counting()
+        self._record(event, report, model, trained_on)
+        self.count.begin_counting()
         return report
 
-    def set_policy(self, policy: Policy | None, telling: Telling, event: Change) -> None:
-        """Go on under another policy, as a new version of the same model; None: only what the engine looks at changed.
-
-        telling : what its rule is to be told.
-        """
+    def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
+        """Go on under another policy, as a new version of the same model; None: only what the engine looks at changed."""
         template, model = self.template, self.answering
         if policy is not None:
             template = template.under(policy)
-            template.begin_safely_in(telling.began_in)
+            template.begin_safely_in(evidence.began_in)
             if model is not None:
                 model = model.under(policy)
                 model.prepare_safely(template)
-        if model is None or self._origin is None:
+        if model is None or self._trained_on is None:
             self.store.record(event)
         else:
-            reason = "another policy, the same model"
-            report = RetrainReport(self.next_number, 0.0, len(self._origin.seq), 0, True, reason)
-            self._record(event, report, model, self._references, self._origin)
-        self.template, self.telling = template, telling
+            n = len(self._trained_on.seq)
+            report = RetrainReport(self.next_number, 0.0, n, 0, True, "another policy, the same model")
+            self._record(event, report, model, self._trained_on)
+        self.template, self.evidence = template, evidence
 
-    def _record(
-        self, event: Change, report: RetrainReport, model: EngineModel, references: References, origin: Origin
-    ) -> None:
+    def _record(self, event: Change, report: RetrainReport, model: EngineModel, trained_on: TrainedOn) -> None:
         """Store a version together with what a person did; then it answers."""
-        state = self._state(model, references, origin)
+        state = self._state(model, trained_on)
         self.store.record(replace(event, version=(report, self.retrainer.window.newest_seq, state)))
         self.answering, self.version, self._news = model, report.version, report
-        self._newest = report.version
-        self._references, self._origin = references, origin
+        self._newest, self._trained_on = report.version, trained_on
 
-    def _state(self, model: EngineModel, references: References, origin: Origin) -> State:
-        own = {"references": references.seqs()} if model.keeps_references else {}
-        own |= {} if self.fleet is None else {"told_to": np.array(self.fleet.told_to)}
-        return model.get_state() | origin.to_state() | own | {"corrected_to": np.array(self._corrected_to)}
+    def _state(self, model: EngineModel, trained_on: TrainedOn) -> State:
+        own = self.count.state() | {"corrected_to": np.array(self.corrected_to)}
+        return model.get_state() | trained_on.to_state() | own
 
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
@@ -308,19 +318,14 @@ class ModelVersions(CurrentVersion):
 
     def _begin(self) -> None:
         self.store_waiting()
-        if self.fleet is not None:
-            self.fleet.begin()
-        self.new_labels = 0
-
-    def _due(self, retrain_every: int) -> bool:
-        return self.new_labels >= retrain_every if self.fleet is None else self.fleet.due(retrain_every)
+        self.count.begin()
 
     def work(self, retrain_every: int) -> RetrainReport | None:
         """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training.
 
         While the store is away nothing is retrained: a version answers only once it is stored.
         """
-        if self._due(retrain_every) and self._ready():
+        if self.count.due(retrain_every) and self._ready():
             return self.start_retrain()
         if self.answering is not None:
             self.retrainer.improve(self.answering)
@@ -336,7 +341,7 @@ class ModelVersions(CurrentVersion):
     @property
     def swapping(self) -> bool:
         """Whether a version that was trained beside the cell is on its way in."""
-        return self._incoming is not None
+        return self._candidate is not None
 
     @property
     def busy(self) -> bool:
@@ -356,64 +361,63 @@ class ModelVersions(CurrentVersion):
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Bring in what an executor has finished: a step further, or to the end, as where it is waited for."""
-        to_the_end |= wait > 0.0 or self.fleet is not None  # sisters' versions and corrections do not come in between
+        to_the_end |= wait > 0.0 or self.count.shared  # peers' versions and corrections do not come in between
         trained = self.retrainer.collect(wait)
         if trained is not None:
             self._take(trained)
-        if self._incoming is not None and (to_the_end or trained is None):  # to take it was a step
+        if self._candidate is not None and (to_the_end or trained is None):  # to take it was a step
             self._advance(to_the_end)
 
     def _take(self, trained: Trained) -> None:
-        self._incoming = Incoming(trained, self.newest, self.version, self.clock)
+        self._candidate = Candidate(trained, self.newest, self.version, self.clock)
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the version on its way in a step further. One that cannot be stored is dropped."""
-        incoming, window = self._incoming, self.retrainer.window
-        assert incoming is not None  # the caller asked; for the type checker
+        candidate, window = self._candidate, self.retrainer.window
+        assert candidate is not None  # the caller asked; for the type checker
         try:
-            if incoming.storing is None:
-                if not incoming.learn(window, np.inf if to_the_end else STEP):
+            if candidate.storing is None:
+                if not candidate.learn(window, np.inf if to_the_end else STEP):
                     return
                 self.store_waiting()
-                incoming.learn(window)
-                incoming.storing = self._store(incoming)
-            if not to_the_end and not incoming.storing.due:
+                candidate.learn(window)
+                candidate.storing = self._store(candidate)
+            if not to_the_end and not candidate.storing.due:
                 return
-            number = incoming.storing.result()
+            number = candidate.storing.result()
         except StoreError as error:  # a version that is not stored would be gone with the process
-            self._incoming = None
-            self._not_stored(incoming.report, error)
+            self._candidate = None
+            self._not_stored(candidate.report, error)
             return
         try:
             self.store_waiting()  # what was confirmed since is to be among its references
         except StoreError as error:
-            log.warning("version %d is stored, and answers once the labels since are: %s", incoming.report.version, error)
+            log.warning("version %d is stored, and answers once the labels since are: %s", candidate.report.version, error)
             return
-        incoming.learn(window)
-        self._incoming = None
-        self._swap(incoming, number)
+        candidate.learn(window)
+        self._candidate = None
+        self._swap(candidate, number)
 
-    def _store(self, incoming: Incoming) -> Asked[int | None]:
-        model, state = incoming.model, None
-        incoming.report = replace(incoming.report, seconds=incoming.seconds)  # storing it comes on top
+    def _store(self, candidate: Candidate) -> Asked[int | None]:
+        model, state = candidate.model, None
+        candidate.report = replace(candidate.report, seconds=candidate.seconds)  # storing it comes on top
         if model is not None:
-            incoming.report = replace(incoming.report, version=self.next_number, accepted=True)
-            state = self._state(model, incoming.references, self._origin_of(incoming))
-        return self.keeper.version(incoming.report, self.retrainer.window.newest_seq, state)
+            candidate.report = replace(candidate.report, version=self.next_number, accepted=True)
+            state = self._state(model, self._trained_on_of(candidate))
+        return self.keeper.version(candidate.report, self.retrainer.window.newest_seq, state)
 
-    def _origin_of(self, incoming: Incoming) -> Origin:
-        return Origin(incoming.seq, self._corrected_to, int(incoming.seq[-1]))
+    def _trained_on_of(self, candidate: Candidate) -> TrainedOn:
+        return TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1]))
 
-    def _swap(self, incoming: Incoming, number: int | None) -> None:
-        report, model = incoming.report, incoming.model
+    def _swap(self, candidate: Candidate, number: int | None) -> None:
+        report, model = candidate.report, candidate.model
         report = replace(report, version=report.version if number is None else number)  # one without products has no other
         if model is not None:
             model.untold = model.untold or self.newest.untold
             self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
-            self._references, self._origin = incoming.references, self._origin_of(incoming)
-            if self.fleet is not None:
-                self.fleet.swapped(model)
+            self._trained_on = self._trained_on_of(candidate)
+            self.count.swapped(model)
         self._news = report
 
     def _not_stored(self, report: RetrainReport, error: StoreError) -> None:

@@ -13,7 +13,6 @@ with its time. So what was near a trace is found again without its reducer, what
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -59,22 +58,9 @@ class Answering:
     last_seq: int
 
     def labels_of_references(self) -> list[PastLabel | None]:
-        """The label behind each reference, in the order of `index.points`; None where it is not known any more.
-
-        References and labels of one part are met from the newest backwards: the oldest references may have left.
-        """
-        by_part: dict[int, list[PastLabel]] = defaultdict(list)
-        for label in self.known:
-            by_part[label.content_hash].append(label)
-        total, n = int(self.index.ring.total), len(self.index)
-        newest_first = [(total - 1 - age) % n for age in range(n)] if total > n else range(n - 1, -1, -1)
-        found: list[PastLabel | None] = [None] * n
-        parts = self.index.parts
-        for slot in newest_first:
-            waiting = by_part.get(int(parts[slot]), [])
-            if waiting:
-                found[slot] = waiting[-1] if len(waiting) == 1 else waiting.pop()
-        return found
+        """The label behind each reference, in the order of `index.points`; None where it is not known any more."""
+        by_number = {label.seq: label for label in self.known}
+        return [by_number.get(number) for number in self.index.numbers.tolist()]
 
 
 def as_it_stood(store: Store, version: int, recipe: Recipe, then: PastDecision | None) -> Answering | None:
@@ -110,7 +96,7 @@ def _index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> Radi
     for label in added:
         if label.point is not None:
             fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
-            index.ring.put(torch.from_numpy(label.point), float(label.success), fold, label.content_hash)
+            index.put(torch.from_numpy(label.point), float(label.success), fold, label.content_hash, label.seq)
     return index
 
 

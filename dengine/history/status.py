@@ -186,7 +186,7 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
         trace=trace_in(settings),
         model=settings.get("model"),
         version=counts["last_version"] or 0,
-        shadow=policy.audit_rate == 1.0,
+        shadow=policy.shadow,
         safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
         safe_mode_time=None if mode is None else mode.time,
         new_labels=sum(not each.quarantined for each in store.past_labels(retrains[-1].last_seq if retrains else 0)),

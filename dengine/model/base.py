@@ -127,8 +127,16 @@ class EngineModel(ABC):
         return recipe
 
     @abstractmethod
-    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
-        """Learn from traces (n, C, T), labels (n,) and content hashes (n,), from where an earlier training ended."""
+    def train(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        hashes: Ints | None = None,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Self:
+        """Learn from traces (n, C, T), labels, content hashes and labels' numbers (n,), from where a training ended."""
 
     def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
         """Train what reads no label further, apart from what answers; see `Reducer.improve`."""
@@ -152,14 +160,14 @@ class EngineModel(ABC):
         """
 
     @abstractmethod
-    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
-        """Make a labelled trace a reference, by its point."""
+    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
+        """Make a labelled trace a reference, by its point; number : of its label."""
 
-    def change_reference(self, newest: int, hash_: int, y: int | None) -> bool:
-        """Give a reference another label, or take it out where `y` is None; False where it is not of this hash.
+    def renumber_reference(self, was: int, number: int) -> None:  # noqa: B027  # a default: a rival numbers nothing
+        """Give a reference the number that its label has by now."""
 
-        newest : its place counted from the newest reference, which is 1.
-        """
+    def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
+        """Give the reference of a label another one, or take it out where `y` is None; False where it is another hash's."""
         return False
 
     @property
@@ -259,16 +267,14 @@ class EngineModel(ABC):
             log.exception("the model cannot place a labelled trace; the next version learns it from the store")
             return None
 
-    def add_safely(self, point: Floats | None, y: int, hash_: int) -> bool:
-        """`add_reference`, where there is a point; whether it is one now. A model that fails at it goes on without."""
+    def add_safely(self, point: Floats | None, y: int, hash_: int, number: int) -> None:
+        """`add_reference`, where there is a point. A model that fails at it goes on without."""
         if point is None:
-            return False
+            return
         try:
-            self.add_reference(point, y, hash_)
-            return True
+            self.add_reference(point, y, hash_, number)
         except Exception:
             log.exception("the model cannot take a labelled trace; the next version learns it from the store")
-            return False
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,16 +160,32 @@ class ModelPrediction(ManyPredictions, EngineModel):
         own = self.spaces.report
         return replace(own, note="; ".join(filter(None, (own.note, self._note))))
 
-    def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        hashes: Ints | None = None,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Self:
         """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
         self.spaces = as_reducer(clone(self.reducer), self.folds)
-        return self.train(X, y, hashes=hashes, stop=stop)
+        return self.train(X, y, hashes=hashes, stop=stop, numbers=numbers)
 
-    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+    def train(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        hashes: Ints | None = None,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference.
 
         X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
-        their content.
+        their content.  numbers : (n,) of the labels.
         Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
         """
         X, y = as_traces(X), as_labels(y)
@@ -180,7 +196,7 @@ class ModelPrediction(ManyPredictions, EngineModel):
         own_unit = self.spaces.own_unit
         self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
-        self.index.add(points / self.scale[folds, None], y, folds, parts)
+        self.index.add(points / self.scale[folds, None], y, folds, parts, numbers)
         self.index.weigh()
         self._note = repeats_note(X, parts)
         self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
@@ -231,12 +247,15 @@ class ModelPrediction(ManyPredictions, EngineModel):
         with torch.inference_mode():
             return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
-    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
         """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
-        self.index.ring.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_)
+        self.index.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number)
 
-    def change_reference(self, newest: int, hash_: int, y: int | None) -> bool:
-        return self.index.relabel(newest, hash_, y)
+    def renumber_reference(self, was: int, number: int) -> None:
+        self.index.renumber(was, number)
+
+    def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
+        return self.index.relabel(number, hash_, y)
 
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])

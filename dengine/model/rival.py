@@ -46,7 +46,15 @@ class RivalAdapter(EngineModel):
         """Its class: its settings are its author's affair."""
         return type(self.model).__qualname__
 
-    def train(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None, stop: StopRule | None = None) -> Self:
+    def train(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        hashes: Ints | None = None,
+        stop: StopRule | None = None,
+        numbers: Ints | None = None,
+    ) -> Self:
         """Train the rival; it sets its own stop."""
         self.model.fit(X, y)
         return self
@@ -67,7 +75,7 @@ class RivalAdapter(EngineModel):
         """The trace itself: a rival keeps what it likes of it."""
         return x
 
-    def add_reference(self, point: Floats, y: int, hash_: int) -> None:
+    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
         """Hand one labelled trace over."""
         self.model.add(point, y)
 

@@ -234,7 +234,7 @@ def test_verify_everything_is_entered_and_left(watched: Watched, demo: DemoCell)
     expect(page.locator("#mode")).to_contain_text("Verifying all", timeout=PATIENT)
     with demo.store() as store:
         assert store.events(1)[0].author == "Kim"
-        assert Recipe.from_toml(store.settings()["recipe"]).policy.audit_rate == 1.0
+        assert Recipe.from_toml(store.settings()["recipe"]).policy.shadow
     opened(page, demo)
     expect(page.locator("#banner")).to_contain_text("every part is verified")
     opened(page, demo, "acts")
