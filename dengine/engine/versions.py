@@ -217,8 +217,9 @@ class ModelVersions:
         novel = known.reason is Reason.NOVEL
         if known.model_version >= self.evidence.since:
             self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
-        number = self._waiting[known.id] = next(self._provisional)
-        self.newest.add_safely(point, int(success), known.content_hash, number)
+        if point is not None:
+            number = self._waiting[known.id] = next(self._provisional)
+            self.newest.add_safely(point, int(success), known.content_hash, number)
         self.new_labels += not self.count.shared  # a product's labels are counted in their order, when they are kept
 
     def unlearn(self, known: StoredDecision) -> None:
