@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import DataError, ReportError, SettingError, StoreError, shortened, without_password
+from .errors import (
+    DataError,
+    ReportConflictError,
+    ReportError,
+    SettingError,
+    StoreError,
+    shortened,
+    without_password,
+)
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -244,6 +252,17 @@ def as_outcome(value: Any, of: str = "") -> Outcome:
             f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}; return "
             "Outcome.UNKNOWN from proceed() where nothing is known."
         ) from error
+
+
+def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
+    """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
+    if action is Action.REJECT:
+        raise ReportConflictError(
+            f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label to report."
+        )
+    if action is Action.VERIFY:
+        return Source.AUDIT if audit else Source.VERIFICATION
+    return Source.CONFIRMED if success else Source.STOP
 
 
 def is_name(value: Any) -> bool:

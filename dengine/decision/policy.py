@@ -96,7 +96,7 @@ class Policy:
         """What may be said of the parts so far; where all stops are known, a part counts once its silence is over."""
         if self.stops == "all":
             outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.forgotten_accepts + outcomes.confirmed)
-        return certify(outcomes, self.alpha, 1.0 - self.lower_bound, self.stops, self.audit_rate)
+        return certify(outcomes, self.alpha, 1.0 - self.lower_bound, self.stops, self.audited_share)
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """(lower, upper) of the success probability, by the policy's interval and alpha."""

@@ -136,13 +136,13 @@ class Corrections:
         """
         if not isinstance(on, bool):
             raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
-        policy = self._settings.policy
+        policy = self._settings.now.recipe.policy
         if on == policy.shadow:
             return self._unchanged("shadow", f"The shadow mode is {'on' if on else 'off'} already; nothing changed.")
         return self._go_on_under(replace(policy, shadow=on), author)
 
     def _go_on_under(self, policy: Policy, author: str) -> Changed:
-        old = self._settings.policy
+        old = self._settings.now.recipe.policy
         new = {name: value for name, value in asdict(policy).items() if value != getattr(old, name)}
         if not new:
             return self._unchanged("policy", "The policy is in force already; nothing changed.")

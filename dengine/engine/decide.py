@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.rule import script
-from ..errors import ReportConflictError, TraceConflictError, TraceError, shortened
+from ..errors import TraceConflictError, TraceError, shortened
 from ..folds import audited, own_hash
 from ..model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
-from ..records import LONGEST, REASONS, Action, Decision, Reason, Source, TraceSpec, is_name
+from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import DecidedTrace, StoredDecision
 from ..traces import TraceGate, as_agreed, first_contract
 from .settings import SettingsInForce
@@ -84,7 +84,7 @@ class DecisionMaker:
         return DecidedTrace(went_on, x, own_hash(content, part), bool(fault), 0.0, part)
 
     def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
-        certain, rate = predicted.action is not Action.VERIFY, self._settings.policy.audited_share
+        certain, rate = predicted.action is not Action.VERIFY, self._settings.now.recipe.policy.audited_share
         audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
         self._count += 1
         return Decision(
@@ -147,14 +147,3 @@ def as_part(part: Any) -> str | None:
             f"{shortened(part)}; strip what a scanner added, or pass None."
         )
     return str(text)
-
-
-def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
-    """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
-    if action is Action.REJECT:
-        raise ReportConflictError(
-            f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label to report."
-        )
-    if action is Action.VERIFY:
-        return Source.AUDIT if audit else Source.VERIFICATION
-    return Source.CONFIRMED if success else Source.STOP

@@ -32,14 +32,26 @@ from ..history.explain import Explanation, Records, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
-from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec, as_id, as_outcome, as_success
+from ..records import (
+    Action,
+    Cycle,
+    Decision,
+    Outcome,
+    Reason,
+    RetrainReport,
+    TraceSpec,
+    as_id,
+    as_outcome,
+    as_success,
+    source_of,
+)
 from ..store.base import Store, is_shared, opening
 from ..store.outbox import CLOSE, Keeper, OwnedStore
 from ..store.records import DecidedTrace, StoredDecision, stored_decision
 from ..store.views import PastDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
-from .decide import DecisionMaker, as_decision, as_part, decided_before, source_of, unasked
+from .decide import DecisionMaker, as_decision, as_part, decided_before, unasked
 from .feedback import Feedback, unknown_stop
 from .peers import Fleet, agreed, as_peers, peers_trace
 from .resume import resume
@@ -233,7 +245,7 @@ class DataEngine:
             if id_ is not None and (known := self._known(id_)) is not None:
                 return decided_before(known, trace, self.trace)
             self._versions.collect()
-            self.encoder_time.earn()
+            self._versions.retrainer.encoder_time.cycles += 1
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
             unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
@@ -305,8 +317,8 @@ class DataEngine:
         if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
             if self.agree_on(spec, inferred=True) != spec:  # a peer's trace came first
                 return as_agreed(trace, self.trace, False)
-        else:
-            self._settings.save_waiting()
+        elif self._settings.waiting:
+            self._settings.save()
         return x
 
     def report(
@@ -453,7 +465,7 @@ class DataEngine:
     @property
     def policy(self) -> Policy:
         """The user's numbers as they are in force; `set_policy` changes them."""
-        return self._settings.policy
+        return self._settings.now.recipe.policy
 
     @property
     def shadow(self) -> bool:

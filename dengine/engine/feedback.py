@@ -12,10 +12,9 @@ import logging
 from collections.abc import Callable
 
 from ..errors import StoreError, UnknownDecisionError
-from ..records import Action, Source
+from ..records import Action, Source, source_of
 from ..store.outbox import Keeper
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
-from .decide import source_of
 from .settings import SettingsInForce
 from .versions import ModelVersions, Point
 
@@ -51,7 +50,7 @@ class Feedback:
 
     @property
     def _stops_all(self) -> bool:
-        return self.settings.policy.stops == "all"
+        return self.settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""

@@ -197,30 +197,24 @@ def flat(recipe: Recipe) -> dict[str, Any]:
 class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
-    now : they themselves; whoever changes them for good stores them.
+    now : they themselves.  waiting : whether the store lacks them, and `save` is to be called again.
     """
 
     def __init__(self, settings: EngineSettings, keeper: Keeper) -> None:
         self.now = settings
-        self._keeper, self._waiting = keeper, False
-
-    @property
-    def policy(self) -> Policy:
-        """The user's numbers."""
-        return self.now.recipe.policy
+        self.waiting = False
+        self._keeper = keeper
 
     def agree_on(self, trace: TraceSpec, inferred: bool) -> None:
         """Set the traces' contract."""
         self.now = replace(self.now, trace=trace, inferred=inferred)
-        self._waiting = True
-        self.save_waiting()
+        self.save()
 
-    def save_waiting(self) -> None:
-        """Store what is not stored yet; where the store is away, the next call does."""
-        if not self._waiting:
-            return
+    def save(self) -> None:
+        """Store them; where the store is away, they wait."""
         try:
             self._keeper.ask(lambda: self._keeper.store.save_settings(self.now.to_store()))
-            self._waiting = False
+            self.waiting = False
         except StoreError:
+            self.waiting = True
             log.exception("the settings are stored later")

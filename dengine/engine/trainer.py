@@ -161,12 +161,17 @@ class EncoderTime:
 
     def __init__(self, per_cycle: float, in_steps: bool) -> None:
         self.per_cycle, self.in_steps = per_cycle, in_steps
-        self.saved = 0.0
+        self.cycles = 0  # begun since the last look
+        self._saved = 0.0
         self.steps, self.seconds, self.longest = 0, 0.0, 0.0
 
-    def earn(self) -> None:
-        """A cycle has begun."""
-        self.saved = min(self.saved + self.per_cycle, max(MOST_SECONDS, self.per_cycle))
+    @property
+    def saved(self) -> float:
+        """Seconds that it may train by now."""
+        for _ in range(self.cycles):
+            self._saved = min(self._saved + self.per_cycle, max(MOST_SECONDS, self.per_cycle))
+        self.cycles = 0
+        return self._saved
 
     def take(self, least: float = 0.0, most: float = MOST_SECONDS) -> Slice | None:
         """Up to `most` seconds of what is saved up, where it is `least` at least; None: nothing is due."""
@@ -181,7 +186,7 @@ class EncoderTime:
         """Account for steps that took so long."""
         counted = steps * STEP_SECONDS if self.in_steps else seconds
         # What trained nothing, having nothing to train or failing at it, is not asked again at every cycle.
-        self.saved = max(0.0, self.saved - counted) if steps else 0.0
+        self._saved = max(0.0, self.saved - counted) if steps else 0.0
         self.steps, self.seconds = self.steps + steps, self.seconds + counted
 
 
@@ -226,14 +231,14 @@ class Retrainer:
         self.limits = limits
         self.executor = executor
         self.clock = clock
-        self._future: Future[Trained] | None = None
+        self.future: Future[Trained] | None = None
         self._began = 0.0  # monotonic seconds
         self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
 
     @property
     def busy(self) -> bool:
         """Whether a retrain is under way beside the cell, or waits to be swapped in."""
-        return self._future is not None
+        return self.future is not None
 
     def improve(self, current: EngineModel) -> None:
         """Train the current model's encoder for a slice, in line, where one is due."""
@@ -257,7 +262,7 @@ class Retrainer:
         assert self.executor is not None  # the caller asked; for the type checker
         data, piece = self.window.snapshot(), self.encoder_time.take()
         try:
-            self._future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
+            self.future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
         except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
             log.error("the executor takes no more work, retrains are in line from now on: %s", error)
             self.executor = None
@@ -266,10 +271,10 @@ class Retrainer:
 
     def collect(self, wait: float = 0.0) -> Trained | None:
         """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
-        future, left = self._future, self._began + HUNG - time.monotonic()
+        future, left = self.future, self._began + HUNG - time.monotonic()
         if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
-        self._future = None
+        self.future = None
         try:
             trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # recorded, and the old version goes on answering

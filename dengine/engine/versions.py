@@ -362,6 +362,8 @@ class ModelVersions:
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Bring in what an executor has finished: a step further, or to the end, as where it is waited for."""
+        if self.retrainer.future is None and self._candidate is None:
+            return
         to_the_end |= wait > 0.0 or self.count.shared  # peers' versions and corrections do not come in between
         trained = self.retrainer.collect(wait)
         if trained is not None:

@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 from ..datasets.importing import CHUNK, ImportReport
 from ..decision.policy import Policy
-from ..engine.decide import source_of
 from ..errors import DataError, StoreError
 from ..folds import own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, TraceSpec, trace_in
+from ..records import REASONS, Action, Decision, Reason, TraceSpec, source_of, trace_in
 from ..store.base import NewLabel, Store, opening
 from ..store.outbox import OwnedStore
 from ..traces import TraceGate, as_trace

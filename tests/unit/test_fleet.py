@@ -161,7 +161,7 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
 ) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
     learn(first, parts, range(15))
-    second._versions.fleet._asked = np.inf  # it asks for no news: it is at it
+    second._versions.count._asked = np.inf  # it asks for no news: it is at it
     take, reports = second._versions._take, []
 
     def late(trained: Any) -> None:
@@ -174,7 +174,7 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     first.settle()
     assert first.version == second.version == 2
     learn(first, parts, range(15, 20))
-    second._versions.fleet.take_in()
+    second._versions.count.take_in()
     assert said(first, probe) == said(second, probe)
 
 
@@ -440,12 +440,12 @@ def test_decide_never_asks_for_news(fleet: Fleet, parts: Dataset) -> None:
     learn(first, parts, range(25))
     ShakyStore.lost = True
     try:
-        second._versions.fleet._lost = False
+        second._versions.count._lost = False
         for x in parts.X[:10]:
             second.decide(x)
-        assert not second._versions.fleet._lost
+        assert not second._versions.count._lost
         second.settle()
-        assert second._versions.fleet._lost
+        assert second._versions.count._lost
     finally:
         ShakyStore.lost = False
 

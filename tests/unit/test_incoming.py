@@ -81,7 +81,7 @@ def test_what_is_reported_while_a_version_is_being_stored_is_in_it_and_in_the_re
     pool, probe = Held(), data.X[150:170]
     engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / "cell.db")
     trained_beside(engine, pool, data)
-    while engine._versions._incoming is None or engine._versions._incoming.storing is None:
+    while engine._versions._candidate is None or engine._versions._candidate.storing is None:
         engine.settle(brief=True)
     assert engine.version == 0
     engine._versions.collect = lambda *args, **options: None  # nobody looks whether it is stored

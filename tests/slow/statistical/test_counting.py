@@ -143,7 +143,7 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
     def learn(self: Any, known: Any, success: bool, point: Any, silent: int) -> None:
         lower, upper = known.lower, known.upper
-        self.newest.add_safely(point, int(success), known.content_hash)
+        self.newest.add_safely(point, int(success), known.content_hash, 0)
         if self.answering is not None:
             now = self.answering.predict_one(known.trace)
             lower, upper = now.lower, now.upper
