@@ -308,15 +308,6 @@ def test_plain_params_come_back_from_toml() -> None:
     assert 'reducer = "sklearn.decomposition._pca:PCA"' in Recipe(PCA(np.int64(2))).to_toml()
 
 
-def test_the_words_of_the_first_version_are_still_read(data: Dataset) -> None:
-    text = 'reducer = "conv"\nmax_steps = 60\n[params]\ndim = 1\nobjective = "supervised"\n'
-    recipe = Recipe.from_toml(text)
-    assert recipe.params == {"n_components": 1}
-    engine = DataEngine(recipe=recipe)
-    list(engine.run(ReplayCell(data), 60))
-    assert np.shape(engine.decide(data.X[70]).embedding) == (5, 1)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
