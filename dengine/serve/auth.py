@@ -1,17 +1,15 @@
-"""Stands before every route: refuses what `Access` does not let in, before any of it is read.
+"""Who may ask, and how much: a token, the names by which the server is called, sizes, times and rates.
 
-Who may ask, and how much: a token, the names by which the server is called, sizes, times and rates.
-
-Whoever is on this machine may ask without a token, but for web pages of others: a browser carries their requests here
-too. They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
+Whoever is on this machine may ask without a token, but for web pages of others: a browser carries their requests here too.
+They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
 """
 
 from __future__ import annotations
 
 import asyncio
 import base64
-import binascii
 import hmac
+import logging
 import os
 import stat
 import time
@@ -30,12 +28,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ..errors import SettingError
 from .api import Refusal, problem
 
+log = logging.getLogger("dengine")
 SHORTEST = 16  # characters of a token
 CLIENTS = 4096  # whose rate is remembered
 SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 WITHOUT_TOKEN = frozenset({"/healthz"})
 RPC = "/RPC2"  # where a robot that cannot send headers may have its token in the path or the query
-NAMES = frozenset({"localhost"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +83,8 @@ def read_token(file: Path) -> str:
     except OSError as error:
         raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
     # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
-    if mode & (0o037 if _is_credential(file) else 0o077):
+    credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
+    if mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
     token = text.strip()
     if len(token) < SHORTEST or not token.isascii() or not token.decode("ascii").isprintable() or b" " in token:
@@ -94,12 +93,6 @@ def read_token(file: Path) -> str:
             f"make one: (umask 077; openssl rand -hex 24 > {file})"
         )
     return token.decode("ascii")
-
-
-def _is_credential(file: Path) -> bool:
-    """Whether systemd handed this file to the service, `LoadCredential`: nobody else gets into its folder."""
-    folder = os.environ.get("CREDENTIALS_DIRECTORY", "")
-    return folder != "" and file.absolute().parent == Path(folder)
 
 
 def is_loopback(host: str) -> bool:
@@ -117,26 +110,20 @@ def in_url(host: str) -> str:
 
 def is_called(host: str | None, names: Iterable[str]) -> bool:
     """Whether a request calls the server by a name that is its own: a page that had its own name point here does not."""
-    name = host_name(host)
-    if name is None:
+    if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
+        return False
+    try:
+        parts = urlsplit(f"//{host}")
+        name = parts.hostname if parts.port is None or parts.port else None  # a ValueError for what is no port
+        if name is None or name == "localhost" or name in {each.lower() for each in names}:
+            return name is not None
+    except ValueError:
         return False
     try:
         ip_address(name)
     except ValueError:
-        return name in NAMES or name in {each.lower() for each in names}
+        return False
     return True
-
-
-def host_name(host: str | None) -> str | None:
-    """The name in a `Host` header, without its port; None where it is none."""
-    if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
-        return None
-    try:
-        parts = urlsplit(f"//{host}")
-        parts.port  # noqa: B018  # it raises for what is no port
-    except ValueError:
-        return None
-    return parts.hostname
 
 
 def is_own_page(origin: str | None, fetch_site: str | None, host: str | None) -> bool:
@@ -154,12 +141,11 @@ def may_ask(token: str, authorization: str | None) -> bool:
     kind, _, said = (authorization or "").partition(" ")
     if kind.lower() == "bearer":
         return is_same(token, said.strip())
-    if kind.lower() == "basic":
-        try:
-            return is_same(token, base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2])
-        except (binascii.Error, UnicodeDecodeError, ValueError):
-            return False
-    return False
+    try:
+        password = base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2]
+    except ValueError:  # binascii's and UnicodeDecodeError are such
+        return False
+    return kind.lower() == "basic" and is_same(token, password)
 
 
 def is_same(token: str, said: str) -> bool:
@@ -200,6 +186,7 @@ class Guard:
         self.app = app
         self.access = access
         self.rates = Rates(access.rate, access.burst)
+        self.lines = Rates(0.1, 3)  # of the log, on a client's wrong tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request in, or answer it."""
@@ -232,27 +219,30 @@ class Guard:
                 "Expected the server to be called by its address, localhost, or a name that it was given "
                 "(dengine serve --allow-host NAME).",
             )
-        self._must_have_token(scope, headers)
-        if scope["method"] not in SAFE and not is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host):
-            raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
         if not self.rates.take(client):
             raise Refusal(
                 HTTPStatus.TOO_MANY_REQUESTS, f"Expected at most {self.access.rate:g} requests a second of one client."
             )
+        self._must_have_token(scope, headers, client)
+        if scope["method"] not in SAFE and not is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host):
+            raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdecimal()):
             raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
         if len(length) > 18 or int(length) > self.access.largest:
             raise _too_large(self.access.largest)
 
-    def _must_have_token(self, scope: MutableMapping[str, Any], headers: Headers) -> None:
+    def _must_have_token(self, scope: MutableMapping[str, Any], headers: Headers, client: str) -> None:
         path, query, said = split_rpc(scope["path"], scope["query_string"])
         if said is not None:  # it is nobody's business from here on, with a token or without
             scope.update(path=path, raw_path=RPC.encode("ascii"), query_string=query)
         token = self.access.token
         if not token or path in WITHOUT_TOKEN or (said is not None and is_same(token, said)):
             return
-        if not may_ask(token, headers.get("authorization")):
+        authorization = headers.get("authorization")
+        if not may_ask(token, authorization):
+            if (authorization or said is not None) and self.lines.take(client):
+                log.warning("a wrong token came from %s", client)
             raise Refusal(
                 HTTPStatus.UNAUTHORIZED,
                 "Expected the server's token: Authorization: Bearer TOKEN, or any user name with it as the password.",

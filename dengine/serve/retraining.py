@@ -1,9 +1,7 @@
 """The process in which a served engine retrains: another one, so that no decision waits for Python's lock.
 
-What goes from one process to another: pickled without copying what is large, and without a file for each tensor.
-
 torch passes every tensor of a model through shared memory of its own: a hundred of them take Python's lock for tens of
-milliseconds, in which nothing is answered. Here they are plain bytes, and large arrays are written from where they lie.
+milliseconds, in which nothing is answered; an executor of the standard library would. Here they are plain bytes.
 """
 
 from __future__ import annotations
@@ -69,9 +67,8 @@ def send(connection: Connection, what: Any) -> None:
 
     _Pickler(file, small).dump(what)
     connection.send([buffer.raw().nbytes for buffer in large])
-    connection.send_bytes(file.getbuffer())
-    for buffer in large:
-        connection.send_bytes(buffer.raw())
+    for each in (file.getbuffer(), *(buffer.raw() for buffer in large)):
+        connection.send_bytes(each)
 
 
 def receive(connection: Connection) -> Any:
@@ -99,8 +96,13 @@ class RetrainingProcess(Executor):
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_work, args=(other,), name="dengine-retraining", daemon=True)
-        with _unheard():
+        resource_tracker.ensure_running()  # its own start would let signals through again
+        # What is started here never hears the signals to the whole group, nor while it begins: its parent ends it in time.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+        try:
             self._process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         other.close()
         self._jobs: queue.SimpleQueue[tuple[Future[Any], Any] | None] = queue.SimpleQueue()
         self._ended = False
@@ -127,31 +129,18 @@ class RetrainingProcess(Executor):
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             future, call = job
-            if future.set_running_or_notify_cancel():
-                self._answer(future, call)
-
-    def _answer(self, future: Future[Any], call: Any) -> None:
-        try:
-            send(self._connection, call)
-            result, error = receive(self._connection)
-        except (EOFError, OSError):
-            self._ended = True
-            future.set_exception(BrokenExecutor(ENDED))
-        except Exception as failure:  # it cannot be pickled
-            future.set_exception(failure)
-        else:
-            future.set_result(result) if error is None else future.set_exception(error)
-
-
-@contextmanager
-def _unheard() -> Iterator[None]:
-    """What is started here never hears the signals to the whole group, nor while it begins: its parent ends it in time."""
-    resource_tracker.ensure_running()  # whose own start would let them through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                send(self._connection, call)
+                result, error = receive(self._connection)
+            except (EOFError, OSError):
+                self._ended = True
+                future.set_exception(BrokenExecutor(ENDED))
+            except Exception as failure:  # it cannot be pickled
+                future.set_exception(failure)
+            else:
+                future.set_result(result) if error is None else future.set_exception(error)
 
 
 @contextmanager

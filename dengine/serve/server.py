@@ -1,11 +1,4 @@
-"""One process in front of one cell: the port, TLS, the engine, the signals, and how it all ends in order.
-
-Log lines that a machine reads as well: time, level, logger, and the message as JSON has a text.
-
-    2026-11-22T18:51:05.120Z level=warning logger=dengine message="labels wait in the journal beside the store: ..."
-
-Nothing in a message ends its line, and no password is in it.
-"""
+"""One process in front of one cell: the port, TLS, the engine, the signals, its log, and how it all ends in order."""
 
 from __future__ import annotations
 
@@ -17,7 +10,7 @@ import socket
 import ssl
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -41,18 +34,16 @@ from .service import DEADLINE, Answer, CellService, Told
 
 
 class Lines(logging.Formatter):
-    """A record as one line."""
+    """A record as one line of time, level, logger and message, as JSON has a text, for a machine to read; no password."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Time, level, logger, message; and what was raised."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        line = f"{time} level={record.levelname.lower()} logger={record.name} message={_said(record.getMessage())}"
-        raised = f" raised={_said(self.formatException(record.exc_info))}" if record.exc_info else ""
-        return line + raised
-
-
-def _said(text: str) -> str:
-    return json.dumps(without_password(text))
+        told = {"message": record.getMessage()}
+        if record.exc_info:
+            told["raised"] = self.formatException(record.exc_info)
+        said = " ".join(f"{name}={json.dumps(without_password(text))}" for name, text in told.items())
+        return f"{time} level={record.levelname.lower()} logger={record.name} {said}"
 
 
 @contextmanager
@@ -61,19 +52,16 @@ def log_lines_to(stream: TextIO) -> Iterator[None]:
     handler = logging.StreamHandler(stream)
     handler.setFormatter(Lines())
     root, ours, theirs = (logging.getLogger(name) for name in ("", "dengine", "uvicorn"))
-    handlers, levels = root.handlers[:], [logger.level for logger in (root, ours, theirs)]
+    handlers, levels = root.handlers[:], {logger: logger.level for logger in (root, ours, theirs)}
     root.handlers[:] = [handler]
-    _set_levels((root, ours, theirs), (logging.WARNING, logging.INFO, logging.CRITICAL))
+    for logger, level in ((root, logging.WARNING), (ours, logging.INFO), (theirs, logging.CRITICAL)):
+        logger.setLevel(level)
     try:
         yield
     finally:
         root.handlers[:] = handlers
-        _set_levels((root, ours, theirs), levels)
-
-
-def _set_levels(loggers: Iterable[logging.Logger], levels: Iterable[int]) -> None:
-    for logger, level in zip(loggers, levels, strict=True):
-        logger.setLevel(level)
+        for logger, level in levels.items():
+            logger.setLevel(level)
 
 
 log = logging.getLogger("dengine")
@@ -139,7 +127,6 @@ def serve(
     with (
         bound(serving.host, serving.port) as listening,
         log_lines_to(sys.stderr),
-        quick_switches(),
         retraining_process() as executor,
         serving.recorder() if serving.recorder else nullcontext() as recorder,
     ):
@@ -152,8 +139,12 @@ def serve(
             port = listening.getsockname()[1]
             line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
             server = CellServer(config, service, lambda: say(f"{line}{'' if access.token else ', to this machine alone'}."))
-            with nothing_old_collected():
-                _run(server, listening, app.state)
+            try:
+                with quick_switches():
+                    server.run([listening])
+            except SystemExit:  # as uvicorn says that the application did not start
+                why = SettingError("The server did not start; its log says why.")
+                raise getattr(app.state, "failure", why) from None
         finally:
             service.close()
 
@@ -173,13 +164,6 @@ def uvicorn_options(serving: Serving) -> dict[str, Any]:
     limits = {"timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE, "ws": "none", "lifespan": "on"}
     silent = {"log_config": None, "access_log": False, "server_header": False, "proxy_headers": False}
     return {"http": Places(serving.connections).connection, "loop": "asyncio"} | limits | silent
-
-
-def _run(server: CellServer, listening: socket.socket, state: object) -> None:
-    try:
-        server.run([listening])
-    except SystemExit:  # as uvicorn says that the application did not start
-        raise getattr(state, "failure", None) or SettingError("The server did not start; its log says why.") from None
 
 
 class CellServer(uvicorn.Server):
@@ -217,24 +201,18 @@ class CellServer(uvicorn.Server):
 
 @contextmanager
 def quick_switches() -> Iterator[None]:
-    """Have the engine's thread and the one that answers give each other Python's lock without delay."""
+    """Have the engine's thread and the one that answers give each other Python's lock without delay, and Python's collector
+    leave alone what is there now, the imported libraries: to look at all of it takes long.
+    """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-
-
-@contextmanager
-def nothing_old_collected() -> Iterator[None]:
-    """Have Python's collector leave alone what is there now, the imported libraries: to look at all of it takes long."""
     gc.collect()
     gc.freeze()
     try:
         yield
     finally:
         gc.unfreeze()
+        sys.setswitchinterval(before)
 
 
 @contextmanager

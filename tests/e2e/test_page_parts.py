@@ -20,7 +20,7 @@ from dengine.records import Action, Reason, Source
 from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.serve.page.charts import Scale, element, number, percent
-from dengine.serve.page.looking import Looking, Pulse
+from dengine.serve.page.looking import Looking, ChangeFeed
 from dengine.serve.page.views import SOURCE, WORDS, duration, history_query
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
@@ -212,18 +212,18 @@ def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService,
     looks: list[int] = []
 
     def slow(looking: Looking) -> int:
-        looks.append(looking.pulse.number)
+        looks.append(looking.feed.number)
         time.sleep(0.02)
         return len(looks)
 
     async def reader() -> None:
-        pulse = Pulse(service)
-        looking = Looking(service, pulse)
+        feed = ChangeFeed(service)
+        looking = Looking(service, feed)
         assert await looking.look("view", slow) == 1
-        pulse.advance()
-        changed = pulse.number
+        feed.advance()
+        changed = feed.number
         assert await looking.look("view", slow) == 1  # what was found before, and whoever watches is told again
-        while pulse.number == changed:
+        while feed.number == changed:
             await asyncio.sleep(0.01)
         assert await looking.look("view", slow) == 2
         looking.look_anew()

@@ -1,7 +1,4 @@
-"""The page's pulse: what changed is told to whoever watches, at a pace that people follow and decisions do not feel.
-
-What the page reads: one look at a time, and no more often than something changes.
-"""
+"""What the page reads, one look at a time and no more often than something changes; and what it is told of changes."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ RETRY = 1000  # ms after which a browser that was cut off tries again
 TICK = 5.0  # seconds of quiet, after which a watcher is told that the line still stands
 
 
-class Pulse:
+class ChangeFeed:
     """Counts changes.  number : of them so far.  boot : of this process, so that a page knows a new one."""
 
     def __init__(self, service: CellService) -> None:
@@ -93,8 +90,8 @@ class Looking:
     Reading shares the interpreter with the engine's thread, so that looks go one after the other, and few are made.
     """
 
-    def __init__(self, service: CellService, pulse: Pulse) -> None:
-        self.service, self.pulse = service, pulse
+    def __init__(self, service: CellService, feed: ChangeFeed) -> None:
+        self.service, self.feed = service, feed
         self._lock = threading.Lock()
         self._kept: dict[Hashable, tuple[Hashable, Any]] = {}
         self._rests: dict[Hashable, float] = {}  # until when, by a view
@@ -116,14 +113,14 @@ class Looking:
         """
         found = await self.service.read(lambda store: self._look(view, read, longest))
         rest = self._rests.get(view, 0.0) - time.monotonic()
-        if rest > 0.0 and self._kept.get(view, (None,))[0] != self.pulse.number:
-            self.pulse.advance_in(rest)  # what was found is old by now: whoever watches is told when it is looked at anew
+        if rest > 0.0 and self._kept.get(view, (None,))[0] != self.feed.number:
+            self.feed.advance_in(rest)  # what was found is old by now: whoever watches is told when it is looked at anew
         return found
 
     def look_anew(self) -> None:
         """Let the next look be fresh, however long it takes: somebody did something."""
         self._rests.clear()
-        self.pulse.advance()
+        self.feed.advance()
 
     def kept(self, what: Hashable, fits: Hashable, read: Callable[[], T]) -> T:
         """What `read` finds, or found when `fits` was the same: for what changes less often than the decisions."""
@@ -143,7 +140,7 @@ class Looking:
             if known is not None and begin < self._rests.get(view, 0.0):
                 found: T = known[1]
                 return found
-            fresh = self.kept(view, self.pulse.number, lambda: read(self))
+            fresh = self.kept(view, self.feed.number, lambda: read(self))
             end = time.monotonic()
             self._rests = {each: until for each, until in self._rests.items() if until > end}
             self._rests[view] = end + min(longest, REST * (end - begin))

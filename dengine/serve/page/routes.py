@@ -20,7 +20,7 @@ from starlette.staticfiles import StaticFiles
 from ..service import CellService
 from . import charts, views
 from .actions import Acts
-from .looking import Looking, Pulse
+from .looking import ChangeFeed, Looking
 from .views import (
     FILTERS,
     PACE,
@@ -77,8 +77,8 @@ class LivePage:
     """The page of one service."""
 
     def __init__(self, service: CellService, check_seconds: float) -> None:
-        self._pulse = Pulse(service)
-        self._looking = Looking(service, self._pulse)
+        self._feed = ChangeFeed(service)
+        self._looking = Looking(service, self._feed)
         self._acts = Acts(self._looking)
         self._check_seconds = check_seconds
 
@@ -141,7 +141,7 @@ class LivePage:
 
     async def events(self, request: Request) -> Response:
         """Server-sent events: that something changed, and what lets a page see that it is cut off."""
-        return EventSourceResponse(self._pulse.events(), headers={"cache-control": "no-store"}, ping=3600)
+        return EventSourceResponse(self._feed.events(), headers={"cache-control": "no-store"}, ping=3600)
 
     async def _how(self) -> HowView:
         return await self._looking.look("how", how_view)
@@ -150,7 +150,7 @@ class LivePage:
         return await self._looking.look(("part", decision_id), lambda looking: part_view(looking, decision_id))
 
     def _page(self, request: Request, view: str, status: int = 200, **values: object) -> Response:
-        self._pulse.begin()
+        self._feed.begin()
         mode, reason = mode_of(self._looking)
         about = {
             "view": view,
@@ -160,7 +160,7 @@ class LivePage:
             "here": urlencode(parse_qsl(request.url.query)),
             "path": request.url.path,
             "token": self._acts.token,
-            "boot": self._pulse.boot,
+            "boot": self._feed.boot,
             "cell": self._looking.store.cell_id,
             "mode": mode,
             "mode_reason": reason,
