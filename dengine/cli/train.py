@@ -40,12 +40,12 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    dataset, recipe = _as_before(source, store).load(), choice.load() if choice.asked else None
+    dataset, recipe = _as_before(source, store).load(quiet=as_json), choice.load() if choice.asked else None
     with interruptible() as asked:
         imported = _import(dataset, store, recipe, seed, as_json, asked)
         trained = _train(store, retrains, as_json, asked)
     if as_json:
-        about = {"verb": "train", "store": store, "interrupted": trained.interrupted}
+        about = {"verb": "train", "store": store, "interrupted": trained.interrupted, "faults": dataset.faults}
         write_json(about | {"import": imported, "retrains": trained.reports})
     else:
         _show(imported, trained, store)

@@ -1,6 +1,5 @@
 """The command line: real commands on small data."""
 
-import json
 import os
 import re
 import shlex
@@ -17,33 +16,17 @@ import click
 import joblib
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from dengine import DataEngine, __version__, load_dataset
+from dengine import DataEngine, load_dataset
 from dengine.cli import main
-from dengine.cli.options import SETTINGS
 from dengine.cli.output import INTERRUPTED, WIDE, duration, size
 from dengine.datasets.importing import import_labelled
 from dengine.store import MemoryStore
+from tests.support.command_line import dengine, document, succeed
+from tests.support.driving import Counting
 
 POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
-
-
-def dengine(*words: object) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def succeed(*words: object) -> str:
-    result = dengine(*words)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def document(*words: object) -> dict:
-    result = dengine(*words, "--json")
-    assert result.exit_code == 0, result.output
-    assert result.stderr == ""
-    return json.loads(result.stdout)
+KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +69,6 @@ def test_importing_dengine_takes_less_than_300_ms() -> None:
 def test_help_imports_nothing_heavy() -> None:
     code = "import sys, dengine.cli; print({'numpy', 'torch', 'pandas', 'rich', 'sklearn'} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout == "set()\n"
-
-
-def test_version_is_the_packages() -> None:
-    assert succeed("--version").strip() == f"dengine {__version__}"
 
 
 VERBS = sorted(main.commands)
@@ -147,23 +126,11 @@ def test_every_help_ends_in_a_command_that_works(
     succeed(named, *words, *LESS.get(verb, []))
 
 
-def test_the_programs_own_example_parses() -> None:
-    program, verb, *words = shlex.split(succeed("--help").rstrip().splitlines()[-1])
-    assert program == "dengine"
-    with click.Context(main, **main.context_settings) as parent:  # click keeps the help option of the first context
-        main.commands[verb].make_context(verb, words, parent=parent)  # UsageError for an option that does not exist
-
-
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_speaks_json_and_explains_each_option(verb: str) -> None:
     options = [p for p in main.commands[verb].params if isinstance(p, click.Option)]
     assert ("--json" in {name for option in options for name in option.opts}) == (verb not in ENDLESS)
     assert not {option.name for option in options if not option.help}
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_h_is_help(verb: str) -> None:
-    assert succeed(verb, "-h") == succeed(verb, "--help")
 
 
 def test_h_lists_every_verb_with_its_whole_sentence() -> None:
@@ -215,16 +182,6 @@ def test_in_order_plays_the_stream_once(data: Path) -> None:
     assert dengine("replay", "--data", data, "--in-order", "--repeats", 3).exit_code == 2
 
 
-def test_compare_has_a_row_a_recipe_files_included(data: Path, tmp_path: Path) -> None:
-    recipe = tmp_path / "often.toml"
-    recipe.write_text('reducer = "pca"\nretrain_every = 20\n')
-    words = ["compare", "--data", data, "--reducers", f"pca,{recipe}", *POLICY, "--repeats", 1, "--cycles", 100]
-    shown = document(*words, "--out", tmp_path / "out")
-    assert [row["recipe"] for row in shown["rows"]] == ["pca", "often"]
-    assert {row["lower_bound"] for row in shown["rows"]} == {0.8}
-    assert (tmp_path / "out" / "curves.png").is_file()
-
-
 def test_a_trained_store_holds_every_label_and_an_answering_version(trained: Path, data: Path) -> None:
     shown = document("status", trained)
     assert shown["labels"] == shown["sources"]["verification"] == 160
@@ -233,12 +190,6 @@ def test_a_trained_store_holds_every_label_and_an_answering_version(trained: Pat
     assert shown["retrains"][-1]["report"]["seconds"] > 0
     with np.load(data) as file, DataEngine.open(trained) as engine:
         assert engine.decide(file["X"][0]).predicted != "verify"
-
-
-def test_status_is_a_table_for_people(trained: Path) -> None:
-    out = succeed("status", trained)
-    for name in ("reducer", "decisions", "reasons", "quarantined", "labels", "version", "worst retrain"):
-        assert name in out
 
 
 def test_the_same_file_twice_counts_no_label_twice(trained: Path, data: Path) -> None:
@@ -281,13 +232,14 @@ def test_an_interrupted_import_goes_on_where_it_stopped(data: Path) -> None:
     ("words", "said"),
     [
         (["--samples", "30"], "Expected 40 samples, got 30"),
-        (["--alpha", "0.5"], "alpha 0.2"),
+        (["--reducer", "pca", "--alpha", "0.5", "--lower-bound", "0.8"], "alpha 0.2"),
+        (["--reducer", "pca", *POLICY, "--guarantee", "pooled"], "guarantee local"),
+        (["--reducer", "pca", *POLICY, "--novelty", "0"], "novelty 1.5"),
         (["--seed", "9"], "seed 0"),
     ],
 )
 def test_a_used_store_refuses_another_contract(trained: Path, data: Path, words: list[str], said: str) -> None:
-    extra = ["--reducer", "pca", "--lower-bound", "0.8"] if "--alpha" in words else []
-    result = dengine("train", "--data", data, "--store", trained, *words, *extra)
+    result = dengine("train", "--data", data, "--store", trained, *words)
     assert result.exit_code == 1
     assert said in result.stderr
 
@@ -380,20 +332,7 @@ def test_a_wrong_call_is_exit_code_2(words: list[str]) -> None:
         ["compare", "--data", "DATA", "--reducers", "a_recipe_of_a_rather_long_name.toml,pca", "--repeats", "1"],
         ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--cycles", "150"],
         ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", "150"],
-        [
-            "replay",
-            "--data",
-            "DATA",
-            "--reducer",
-            "pca",
-            *POLICY,
-            "--guarantee",
-            "pooled",
-            "--stops",
-            "all",
-            "--repeats",
-            "1",
-        ],
+        ["replay", "--data", "DATA", "--reducer", "pca", *KNOWN, "--repeats", "1"],
         ["status", "STORE"],
     ],
 )
@@ -467,27 +406,6 @@ class FirstAndLast(TransformerMixin, BaseEstimator):
 """
 
 
-def in_folder(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    """A fresh process of the installed command, which has no folder of its own in the path as `python -m` has."""
-    command = [
-        sys.executable,
-        "-c",
-        "import sys; sys.path = [p for p in sys.path if p]; from dengine.cli import main; main()",
-    ]
-    return subprocess.run([*command, *map(str, words)], cwd=folder, capture_output=True, text=True, check=False)
-
-
-def test_a_reducer_of_this_folder_is_found_and_named_safely(data: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(OWN_REDUCER)
-    words = ["--data", data, *POLICY, "--repeats", 2, "--cycles", 100, "--out", "out", "--json"]
-    done = in_folder(tmp_path, "compare", "--reducers", "pca,mine:FirstAndLast", *words, "--n-jobs", 2)
-    assert done.returncode == 0, done.stderr
-    rows = {row["recipe"]: row for row in json.loads(done.stdout)["rows"]}
-    assert list(rows) == ["pca", "FirstAndLast"]
-    assert rows["FirstAndLast"]["certain"] > 0
-    assert (tmp_path / "out" / "map_FirstAndLast.png").is_file()
-
-
 def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "his.py").write_text(OWN_REDUCER)
     monkeypatch.chdir(tmp_path)
@@ -496,15 +414,15 @@ def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, tmp_path: Pat
         monkeypatch.delitem(sys.modules, "his", raising=False)
         out = succeed("train", "--data", data, "--store", "e.db", *words)
         assert "his" in sys.modules
+        assert sys.path[-1] == str(tmp_path)  # last: a module of this folder shadows nothing
         assert "FirstAndLast answers" in out or "Nothing new" in out
     assert "his:FirstAndLast" in succeed("status", "e.db")
+    rows = document(
+        "compare", "--data", data, "--reducers", "pca,his:FirstAndLast", *POLICY, "--repeats", 1, "--out", "out"
+    )
+    assert [(row["recipe"], row["certain"] > 0) for row in rows["rows"]] == [("pca", True), ("FirstAndLast", True)]
+    assert (tmp_path / "out" / "map_FirstAndLast.png").is_file()
     monkeypatch.delitem(sys.modules, "his")
-
-
-def test_a_module_of_this_folder_shadows_nothing(tmp_path: Path) -> None:
-    (tmp_path / "joblib.py").write_text("raise RuntimeError('shadowed')\n")
-    done = in_folder(tmp_path, "replay", "--reducer", "pca", "--repeats", 1, "--cycles", 20)
-    assert done.returncode == 0, done.stderr
 
 
 def test_a_reducer_that_is_not_there_makes_no_store(data: Path, tmp_path: Path) -> None:
@@ -515,32 +433,11 @@ def test_a_reducer_that_is_not_there_makes_no_store(data: Path, tmp_path: Path) 
     assert not list(tmp_path.iterdir())
 
 
-def test_compare_refuses_two_of_one_name() -> None:
-    result = dengine("compare", "--reducers", "pca,pca")
-    assert result.exit_code == 2
-    assert "pca, pca" in result.stderr
-
-
-class HalfHalf:
-    """A rival that is never certain."""
-
-    def fit(self, X: np.ndarray, y: np.ndarray) -> None: ...
-    def add(self, x: np.ndarray, y: int) -> None: ...
-    def count(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros(len(X), int), np.zeros(len(X), int)
-
-    def predict_interval(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.zeros(len(X)), np.ones(len(X))
-
-    def decide(self, X: np.ndarray) -> list[str]:
-        return ["verify"] * len(X)
-
-
 def test_status_of_a_handed_in_model_names_it_and_shows_no_number_without_effect(tmp_path: Path) -> None:
-    with DataEngine(model=HalfHalf(), store=tmp_path / "e.db") as engine:
+    with DataEngine(model=Counting(), store=tmp_path / "e.db") as engine:
         engine.decide(np.linspace(0, 1, 40))
     out = succeed("status", tmp_path / "e.db")
-    assert "HalfHalf, decides by its own rule" in out
+    assert "Counting, decides by its own rule" in out
     assert not {"reducer", "policy", "guarantee", "neighbours", "novelty"} & {
         line.split()[1] for line in out.splitlines() if "│" in line
     }
@@ -553,17 +450,6 @@ def test_status_says_what_the_engine_decides_by(trained: Path) -> None:
 
 
 # ------------------------------------------------------------------ guarantees, the certificate, novelty, safe mode
-
-KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
-
-
-@pytest.mark.parametrize("verb", ["replay", "compare", "run", "train"])
-def test_every_verb_that_makes_an_engine_takes_the_same_settings(verb: str) -> None:
-    options = {option.name: option for option in main.commands[verb].params}
-    assert {*SETTINGS, "data", "samples", "part"} <= set(options)
-    assert {name: options[name].help for name in SETTINGS} == {
-        option.name: option.help for option in main.commands["run"].params if option.name in SETTINGS
-    }
 
 
 def test_a_replays_row_names_its_guarantee_and_what_is_known_of_stops(data: Path) -> None:
@@ -689,14 +575,6 @@ def test_a_store_whose_engine_was_never_alarmed_is_off_since_ever(trained: Path)
     assert (held["safe_mode"], held["safe_mode_time"]) == ("", None)
     assert "Nothing can be said yet" in held["certificate"]["sentence"]
     assert (held["ever"]["novel"], held["recent"], held["recent_novel"]) == (0, 160, 0)
-
-
-def test_a_used_store_says_which_of_the_new_settings_differ(trained: Path, data: Path) -> None:
-    words = ["run", "--cell", "replay", "--data", data, "--store", trained, "--reducer", "pca", *POLICY, "--cycles", 5]
-    for option, value, said in (("--guarantee", "pooled", "guarantee local"), ("--novelty", "0", "novelty 1.5")):
-        result = dengine(*words, option, value)
-        assert result.exit_code == 1
-        assert said in result.stderr
 
 
 def test_parts_that_come_again_are_played_on_from_where_the_run_was(data: Path, tmp_path: Path) -> None:

@@ -1,33 +1,21 @@
 """The verbs that put things right: correct, forget, rollback, policy, retrain. Real commands on a small store."""
 
 import getpass
-import json
+import re
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
 
 from dengine import DataEngine, Dataset, Policy
-from dengine.cli import main
 from dengine.datasets.importing import import_labelled
-
-
-def dengine(*words: object) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
+from dengine.history.status import history
+from tests.support.command_line import dengine, document, succeed
 
 
 def said(*words: object) -> str:
-    result = dengine(*words)
-    assert result.exit_code == 0, result.output
-    return " ".join(result.stdout.split())
-
-
-def document(*words: object) -> dict:
-    result = dengine(*words, "--json")
-    assert result.exit_code == 0, result.output
-    assert result.stderr == ""
-    return json.loads(result.stdout)
+    return " ".join(succeed(*words).split())
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +37,8 @@ def store(used: Path, tmp_path: Path) -> Path:
 
 def ids(store: Path) -> list[str]:
     """Of the decisions, in the order of their labels."""
-    with DataEngine.open(store) as engine, engine.store._database.transaction(write=False) as connection:
-        return list(connection.exec_driver_sql("SELECT decision_id FROM label ORDER BY seq").scalars())
+    with DataEngine.open(store) as engine:
+        return [past.id for past in sorted(history(engine.store), key=lambda past: past.label_seq)]
 
 
 def labels(store: Path) -> dict[int, int]:
@@ -107,8 +95,30 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path) -> None:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, LB 80 %" in said("status", store)
+    shown = re.sub("[│┃] *", "", said("policy", store))
+    assert all(words in shown for words in ("alpha 0.2", "audit_rate 0.1", "stops all"))
+    assert document("policy", store)["policy"] == found["policy"]
     line = said("policy", store, "--interval", "jeffreys")
     assert line.startswith("The policy's interval wilson -> jeffreys. Event 2, by")
+
+
+def test_the_shadow_mode_lasts_until_it_is_ended(store: Path) -> None:
+    assert said("policy", store, "--shadow", "on", "--author", "kim").startswith("Shadow mode: every part is verified")
+    assert document("status", store)["shadow"] is True
+    assert "already" in said("policy", store, "--shadow", "on")
+    said("policy", store, "--shadow", "off", "--alpha", 0.3)
+    found = document("status", store)
+    assert (found["shadow"], found["recipe"]["policy"]["alpha"]) == (False, 0.3)
+
+
+def test_a_rule_of_ones_own_is_a_guarantee(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_rule.py").write_text(
+        "from dengine.decision.rule import DecisionRule\n\nclass Mine(DecisionRule): ...\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    assert "guarantee local -> own_rule:Mine" in said("policy", store, "--guarantee", "own_rule:Mine")
+    assert document("status", store)["recipe"]["policy"]["guarantee"] == "own_rule:Mine"
 
 
 @pytest.mark.parametrize(

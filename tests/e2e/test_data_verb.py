@@ -1,6 +1,5 @@
 """`dengine data`, and the other verbs on recordings as people have them."""
 
-import json
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,22 +8,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from dengine import DataEngine, Dataset
-from dengine.cli import main
 from dengine.cli.output import WIDE
 from dengine.datasets import Fault
 from dengine.experiments.figures import save
 from dengine.experiments.pictures import data_picture
 from dengine.experiments.survey import Spread, survey
+from tests.support.command_line import dengine, document
 
 
-def dengine(*words: object) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def succeed(*words: object) -> Result:
+def well(*words: object) -> Result:
     result = dengine(*words)
     assert result.exit_code == 0, result.output
     return result
@@ -39,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, repo: Path) -> Path:
 
 
 def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
-    result = succeed("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
+    result = well("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
     said = " ".join(result.stdout.replace("│", " ").split())
     for words in (
         "77, 3 left out",
@@ -62,7 +57,7 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
 
 
 def test_data_as_json_is_one_document(folder: Path) -> None:
-    found = json.loads(succeed("data", folder, "--json").stdout)["survey"]
+    found = document("data", folder)["survey"]
     assert (found["traces"], len(found["faults"]), found["rate_hz"], found["fit"]) == (77, 3, 500.0, "pad")
     assert found["good"] + found["bad"] == 77
     assert found["lengths"]["low"] < found["lengths"]["high"]
@@ -72,7 +67,7 @@ def test_data_as_json_is_one_document(folder: Path) -> None:
 
 def test_replay_says_once_what_was_left_out(folder: Path) -> None:
     words = ("replay", "--data", folder, "--channel", "FZ_Base", "--reducer", "pca", "--cycles", 60, "--repeats", 1)
-    result = succeed(*words)
+    result = well(*words)
     assert "pca on cell_3" in result.stdout
     assert result.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
     assert result.stderr.count(".csv") == 3
@@ -80,9 +75,9 @@ def test_replay_says_once_what_was_left_out(folder: Path) -> None:
 
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(folder: Path, tmp_path: Path) -> None:
     store = tmp_path / "engine.db"
-    result = succeed("train", "--data", folder, "--store", store, "--reducer", "pca")
+    result = well("train", "--data", folder, "--store", store, "--reducer", "pca")
     assert "Imported 77 labelled traces" in result.stdout
-    again = succeed("train", "--data", folder, "--store", store)
+    again = well("train", "--data", folder, "--store", store)
     assert "all 77 traces were there from an earlier import" in again.stdout
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
@@ -121,7 +116,7 @@ def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Da
     lines = (tmp_path / "wide.csv").read_text().splitlines()
     lines[3:16] = [line + ",1" for line in lines[3:16]]
     (tmp_path / "wide.csv").write_text("\n".join(lines))
-    said = succeed("data", tmp_path / "wide.csv").stdout
+    said = well("data", tmp_path / "wide.csv").stdout
     assert said.count("- wide.csv, line ") == 10
     assert "- and 3 more" in said
 
@@ -182,10 +177,10 @@ def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_pat
     some.mkdir()
     for path in names[50:]:  # the longer ones first: the median falls when the others come
         (some / path.name).write_bytes(path.read_bytes())
-    first = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--reducer", "pca", "--json").stdout)
+    first = document("train", "--data", some, "--store", tmp_path / "a.db", "--reducer", "pca")
     for path in names[:50]:
         (some / path.name).write_bytes(path.read_bytes())
-    again = json.loads(succeed("train", "--data", some, "--store", tmp_path / "a.db", "--json").stdout)
+    again = document("train", "--data", some, "--store", tmp_path / "a.db")
     assert (first["import"]["imported"], again["import"]["known"]) == (30, 30)
     assert again["import"]["imported"] == 47
     wrong = dengine("train", "--data", some, "--store", tmp_path / "a.db", "--samples", 900)

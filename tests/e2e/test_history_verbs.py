@@ -1,6 +1,5 @@
 """`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
 
-import json
 import os
 import re
 import signal
@@ -10,31 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from dengine import DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
-from dengine.cli import main
 from dengine.cli.history import WIDEST
 from dengine.cli.output import WIDE
 from dengine.decision.intervals import wilson_interval
 from dengine.history.status import bad_accepts, course, status
 from dengine.store.records import Outcomes
+from tests.support.command_line import dengine, document, succeed
 
 NOTHING = Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
-
-
-def dengine(*words: object) -> Result:
-    return CliRunner().invoke(main, [str(word) for word in words])
-
-
-def succeed(*words: object) -> str:
-    result = dengine(*words)
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-def document(*words: object) -> dict:
-    return json.loads(succeed(*words, "--json"))
 
 
 @pytest.fixture(scope="module")
