@@ -1,6 +1,7 @@
 """The house keeps its size and its shape: what comes in pushes something out."""
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -83,6 +84,14 @@ def test_no_module_is_imported_by_a_string() -> None:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and {node.value.partition(":")[0]} & KNOWN
     }
     assert not strings, f"import them, or move what needs them; a string only hides a layer: {', '.join(sorted(strings))}"
+
+
+@UNTIL_DONE
+def test_tests_go_through_public_faces() -> None:
+    private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
+    files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
+    found = {f"{found} ({file.name})" for file in files for found in private.findall(file.read_text("utf-8"))}
+    assert not found, f"say it by a public face, or leave it out: {', '.join(sorted(found))}"
 
 
 LOOK = """
