@@ -1,26 +1,8 @@
-"""Maps of the embedding: where the parts of a replay lie, and how far the ball reaches that labels are counted in.
-
-How every picture looks: colours, marks, panels, legends; and saving one.
-
-No pyplot: its global state would leak figures into a user's notebook. Colours: Okabe and Ito (2008), distinct to all eyes.
-
-Pictures of replays and runs, as matplotlib figures that are saved and forgotten.
+"""Pictures of replays, grids, runs and costs, as matplotlib figures that are saved and forgotten; and how all of them look.
 
     save(curves({"conv": replays}), "out/curves.png")
 
-How they look is said in look.py, the maps of the embedding are drawn in maps.py; both are handed on from here.
-
-The paper's figure of its grid: a cell for each alpha and LB, each in two parts.
-
-    save(grid_figure(replays, "conv, wilson"), "out/grid.png")
-
-Above: share of certain decisions and precision in a sliding window; below: the shares of all decisions in the window that
-were false positives and false negatives, as the paper draws them. Source: the paper's figure "Results obtained with varying
-values of the parameters alpha and LB".
-
-The picture of a cost curve: what a part costs under each LB, a line an alpha, beside verifying everything.
-
-save(cost_picture(curve), "out/costs.png")
+No pyplot: its global state would leak figures into a user's notebook. Colours: Okabe and Ito (2008), distinct to all eyes.
 """
 
 from __future__ import annotations
@@ -83,11 +65,16 @@ def sliding_sum(values: NDArray[Any], window: int) -> Floats:
     return out
 
 
-def panels(rows: int, size: tuple[float, float], heights: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    """A figure of panels one below the other, with one axis of cycles."""
+def blank(width: float, height: float) -> Figure:
+    """An empty figure, inches."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, layout="constrained")
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def panels(rows: int, size: tuple[float, float], heights: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
+    """A figure of panels one below the other, with one axis of cycles."""
+    figure = blank(*size)
     axes = list(figure.subplots(rows, 1, sharex=True, height_ratios=heights))
     for each in axes:
         plain(each)
@@ -100,6 +87,18 @@ def plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+def note(axes: Axes, text: str, colour: str = BLACK) -> None:
+    """Words in the middle, where there is nothing to draw."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour)
+
+
+def whole_numbers(axes: Axes) -> None:
+    """Ticks of counts."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+
+
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend above the axes: inside, it would lie on one curve or another."""
     axes.legend(
@@ -109,12 +108,10 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
 
 def draw_errors(axes: Axes, false_positive: NDArray[np.bool_], false_negative: NDArray[np.bool_]) -> None:
     """Wrong decisions so far, (n,) each: bad parts accepted, good parts rejected."""
-    from matplotlib.ticker import MaxNLocator
-
     x = np.arange(1, len(false_positive) + 1)
     axes.step(x, np.cumsum(false_positive), "-", where="post", color=BAD, label="bad part accepted (FP)")
     axes.step(x, np.cumsum(false_negative), "--", where="post", color=GOOD, label="good part rejected (FN)")
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    whole_numbers(axes)
 
 
 def draw_verified(
@@ -146,9 +143,7 @@ def embedding_map(replay: Replay, last: int = NEWEST, title: str = "") -> Figure
     circle is the ball around the newest part, where the recipe fixes its radius. Units are equal on both axes, but where
     the first is a probability: there the second is for the eye, and the ball is cut off above and below.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 5.4), layout="constrained")
+    figure = blank(10.0, 5.4)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     z = _plane(replay.position[-last:])
     for axes, kinds, marks in ((left, replay.truth, TRUTH_MARKS), (right, replay.action, ACTION_MARKS)):
@@ -184,7 +179,7 @@ def _scatter(axes: Axes, z: Floats, kinds: NDArray[Any], marks: Mapping[Any, Mar
         look: dict[str, Any] = {"color": mark.colour, "marker": mark.marker, "s": mark.size, "alpha": 0.7, "linewidths": 0}
         axes.scatter(points[:, 0], points[:, 1], label=f"{mark.name} ({len(points)})", **look)
     if not _known(z).any():
-        axes.text(0.5, 0.5, "no trace was embedded yet", transform=axes.transAxes, ha="center", va="center")
+        note(axes, "no trace was embedded yet")
 
 
 def _draw_balls(figure: Figure, z: Floats, recipe: Recipe) -> None:
@@ -226,8 +221,6 @@ def _around(values: Floats, span: float = 0.0) -> tuple[float, float]:
     half = max(0.56 * (high - low), span / 2) or 1.0
     return (low + high) / 2 - half, (low + high) / 2 + half
 
-
-__all__ = ["curves", "embedding_map", "run_picture", "save", "sliding_sum", "window_curves"]
 
 WINDOW = 300  # cycles, the paper's
 FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
@@ -286,14 +279,23 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
     return figure
 
 
-def _draw_curves(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str) -> None:
+def _draw_certain(
+    axes: Axes, replays: Sequence[Replay], window: int, colour: str, precision: str, lead: str = ""
+) -> dict[str, Floats]:
+    """The certain share with its spread, and the precision, in these colours; returns all of `window_curves`."""
     lines = window_curves(replays, window, FEWEST)
     x = np.arange(1, len(lines["certain"]) + 1)
-    top.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
-    top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
-    top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
+    axes.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
+    axes.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
+    axes.plot(x, lines["precision"], color=precision, linestyle="--", label=f"{lead}precision, of accepted")
+    return lines
+
+
+def _draw_curves(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str) -> None:
+    lines = _draw_certain(top, replays, window, colour, colour, lead)
+    x = np.arange(1, len(lines["certain"]) + 1)
     # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
-    counted = [each.stretch(slice(None)) for each in replays]
+    counted = [each.stretch() for each in replays]
     n = {name: sum(each[name] for each in counted) for name in COUNTS}
     bad, good = "{false_positive} bad of {accepted} accepted", "{false_negative} good of {rejected} rejected"
     bottom.plot(x, lines["false_positive"], color=colour, label=lead + bad.format_map(n))
@@ -319,7 +321,7 @@ def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     if log.clock_s is not None:
         _draw_rate(axes[2], log, log.clock_s, window)
     if not len(log):
-        axes[0].text(0.5, 0.5, "no cycle was finished", transform=axes[0].transAxes, ha="center", va="center")
+        note(axes[0], "no cycle was finished")
     axes[-1].set(xlabel="cycle")
     figure.suptitle(title)
     return figure
@@ -340,12 +342,15 @@ def _draw_rate(axes: Axes, log: Replay, clock_s: Floats, window: int) -> None:
 
 
 def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
-    """A row an alpha, from the largest; a column an LB. replays : of one contender and interval, all equally long."""
-    from matplotlib.figure import Figure
+    """The paper's figure of its grid: a row an alpha, from the largest; a column an LB, each cell in two parts.
 
+    Above: share of certain decisions and precision in a sliding window; below: the shares of all decisions in the window
+    that were false positives and false negatives. replays : of one contender and interval, all equally long.
+    Source: the paper's figure "Results obtained with varying values of the parameters alpha and LB".
+    """
     alphas = sorted({r.recipe.policy.alpha for r in replays}, reverse=True)
     bounds = sorted({r.recipe.policy.lower_bound for r in replays})
-    figure = Figure(figsize=(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas)), layout="constrained")
+    figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas))
     heights = [3, 1.6] * len(alphas)
     axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
     window = min(window, max(1, len(replays[0]) // 3))
@@ -362,11 +367,8 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
 
 
 def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float, window: int) -> None:
-    lines = window_curves(replays, window, FEWEST)
-    x = np.arange(1, len(lines["certain"]) + 1)
-    top.fill_between(x, lines["certain_low"], lines["certain_high"], color=GREEN, alpha=0.15, linewidth=0)
-    top.plot(x, lines["certain"], color=GREEN, label="certain, of all cycles")
-    top.plot(x, lines["precision"], color=GOOD, linestyle="--", linewidth=1.2, label="precision, of accepted")
+    _draw_certain(top, replays, window, GREEN, GOOD)
+    x = np.arange(1, len(replays[0]) + 1)
     top.axhline(100 * bound, label="LB", **LIMIT)
     for name, colour, style, label in (
         ("false_positive", BAD, "-", "false positives, of all cycles"),

@@ -1,9 +1,4 @@
-"""The picture of a data set: what good and bad traces look like, and what changes over the recorded order.
-
-The picture of one decision: the trace among its neighbours and the band of the successes, the ball, and the bound.
-
-The picture of a store: verified share and bad accepts over all of its cycles, retrains and safe mode as marks.
-"""
+"""Pictures of a data set, of one decision among its neighbours, and of a store over all of its cycles."""
 
 from __future__ import annotations
 
@@ -32,10 +27,13 @@ from .figures import (
     SMALL,
     VERIFIED,
     Floats,
+    blank,
     legend_above,
+    note,
     panels,
     plain,
     sliding_sum,
+    whole_numbers,
 )
 from .survey import levels
 
@@ -44,17 +42,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 MOST = 4  # channels drawn: those that leave the band farthest
+MOST_OF_DATA = 3  # channels of a data set drawn
+WINDOW = 10  # of a data set: one in so many
+KINDS = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 CLEAR = 0.1  # band widths below which leaving the band is not marked
 
 
 def explained_picture(found: Explanation) -> Figure:
     """Above, a panel a channel: the trace, its nearest references and the band. Below: their distances, and the bound."""
-    from matplotlib.figure import Figure
-
     channels = _channels(found)
     below = bool(found.neighbours or found.bound)
     heights = [1.5 + 2.3 * len(channels), 2.6]
-    figure = Figure(figsize=(10.0, heights[0] + (heights[1] if below else 0.0)), layout="constrained")
+    figure = blank(10.0, heights[0] + (heights[1] if below else 0.0))
     past = found.decision
     version = f"version {past.model_version}" if past.model_version else "no model yet"
     figure.suptitle(
@@ -103,7 +102,7 @@ def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
         label = f"95 % of {band.n:,} successes"
         axes.fill_between(x, band.low[channel], band.high[channel], color=GREEN, alpha=0.22, linewidth=0, label=label)
         axes.plot(x, band.median[channel], color=GREEN, linewidth=1.0, label="their median")
-    for success, name, colour, line in ((True, "good", GOOD, "-"), (False, "bad", BAD, "--")):
+    for success, name, colour, line, _ in KINDS:
         near = [each.trace for each in found.neighbours if each.trace is not None and each.success is success]
         for i, trace in enumerate(near):
             label = f"neighbours that were {name} ({len(near)})" if i == 0 else "_"
@@ -129,11 +128,11 @@ def _draw_distances(axes: Axes, found: Explanation) -> None:
     plain(axes)
     near = found.neighbours
     if not near or found.radius is None:
-        axes.text(0.5, 0.5, "no neighbours", transform=axes.transAxes, ha="center", va="center", color=GREY)
+        note(axes, "no neighbours", GREY)
         axes.set(xticks=[], yticks=[])
         return
     spaces = sorted({each.space for each in near})
-    for success, name, colour, marker in ((True, "good", GOOD, "o"), (False, "bad", BAD, "X")):
+    for success, name, colour, _, marker in KINDS:
         some = [each for each in near if each.success is success]
         if some:
             rows = [spaces.index(each.space) for each in some]
@@ -156,7 +155,7 @@ def _draw_bound(axes: Axes, bound: Bound | None) -> None:
     plain(axes)
     axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel="success rate in the ball")
     if bound is None:
-        axes.text(0.5, 0.0, "no bound was asked for", ha="center", va="center", color=GREY)
+        note(axes, "no bound was asked for", GREY)
         return
     n = bound.n_success + bound.n_failure
     if n:
@@ -188,7 +187,7 @@ def status_picture(course: Course, title: str = "") -> Figure:
     every = f", {length} a point" if length > 1 else ""
     bottom.set(xlabel=f"cycle{every}", ylabel="bad accepted parts so far")
     if not stretches:
-        top.text(0.5, 0.5, "no decision yet", transform=top.transAxes, ha="center", va="center")
+        note(top, "no decision yet")
     else:
         bottom.set(xlim=(0, ends[-1] * 1.01))
     figure.suptitle(title)
@@ -205,15 +204,13 @@ def _draw_shares(axes: Axes, course: Course, ends: Floats) -> None:
 
 
 def _draw_bad(axes: Axes, course: Course, ends: Floats) -> None:
-    from matplotlib.ticker import MaxNLocator
-
     accepted, bad = (np.cumsum([getattr(each, name) for each in course.stretches]) for name in ("accepted", "bad"))
     x = np.concatenate([[0.0], ends])
     total = f"{int(bad[-1])} bad of {int(accepted[-1]):,}" if len(bad) else "none"
     axes.plot(x, np.concatenate([[0], bad]), color=BAD, label=f"known bad ({total} accepted)")
     tolerated = course.tolerance * np.concatenate([[0], accepted])
     axes.plot(x, tolerated, ":", color=BLACK, label=f"tolerated, {100 * course.tolerance:g} % of the accepted")
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    whole_numbers(axes)
     axes.set(ylim=(0, max(1.0, 1.1 * tolerated[-1], 1.1 * float(bad[-1]) if len(bad) else 0.0)))
 
 
@@ -257,21 +254,14 @@ def _modes(course: Course, ends: Floats) -> Iterator[tuple[float, float]]:
         yield began, float(ends[-1])
 
 
-MOST_OF_SURVEY_PICTURE = 3  # channels drawn
-KINDS = ((1, "good", GOOD, "-"), (0, "bad", BAD, "--"))
-WINDOW = 10  # of the stream: one in so many
-
-
 def data_picture(data: Dataset, title: str = "") -> Figure:
     """Above, a channel a panel: the median trace of good and bad parts, and where the middle 80 % lie. Below: the share of
     good parts and each trace's mean, in the order in which they were recorded. Traces that are not finite are not drawn.
     """
-    from matplotlib.figure import Figure
-
     X = as_traces(data.X)
     shown = np.isfinite(X).all(axis=(1, 2))
-    n_channels = min(X.shape[1], MOST_OF_SURVEY_PICTURE)
-    figure = Figure(figsize=(9.0, 7.6), layout="constrained")
+    n_channels = min(X.shape[1], MOST_OF_DATA)
+    figure = blank(9.0, 7.6)
     top, bottom = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
     time_s, unit = np.arange(X.shape[2]) / data.rate_hz, f" [{data.unit}]" if X.shape[1] == 1 else ""
@@ -291,7 +281,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 def _draw_traces(axes: Axes, time_s: NDArray[np.float64], X: NDArray[np.float32], y: NDArray[np.int8]) -> None:
     """(n, T) of one channel."""
     plain(axes)
-    for label, name, colour, line in KINDS:
+    for label, name, colour, line, _ in KINDS:
         some = X[y == label]
         if len(some):
             low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
@@ -313,7 +303,7 @@ def _draw_share(axes: Axes, y: NDArray[np.int8]) -> None:
 
 def _draw_levels(axes: Axes, x: NDArray[Any], level: NDArray[np.float64], y: NDArray[np.int8]) -> None:
     plain(axes)
-    for label, name, colour, _ in KINDS:
+    for label, name, colour, _, _ in KINDS:
         some = y == label
         axes.scatter(x[some], level[some], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
     window = max(1, len(level) // WINDOW)
