@@ -25,11 +25,17 @@ def store_argument(command: Command) -> Command:
     return click.argument("store", metavar="STORE")(cell_options()(command))
 
 
+shadow_option = click.option(
+    "--shadow",
+    type=click.Choice(["on", "off"]),
+    callback=lambda context, option, state: None if state is None else state == "on",
+    help="Verify every part, and let the model only say what it would have done; or let it decide again.",
+)
 author_option = click.option("--author", help="Who says so, for the record.  [default: the login name]")
 
 
 def _changed(
-    verb: str, store: str, author: str | None, change: Callable[[DataEngine, str], list[Changed]], as_json: bool
+    verb: str, store: str, author: str | None, change: Callable[[DataEngine, str], Changed], as_json: bool
 ) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine.engine import DataEngine
@@ -37,15 +43,14 @@ def _changed(
 
     who = _login() if author is None else author
     with DataEngine.open(store, wait=UNHURRIED) as engine:
-        changes = change(engine, who)
+        changed = change(engine, who)
         certificate, policy = engine.certificate(), engine.policy
     if as_json:
-        about = {"verb": verb, "store": store, "author": who, "changed": any(each.event is not None for each in changes)}
-        write_json(about | asdict(changes[-1]) | {"policy": policy, "certificate": certificate_record(certificate)})
+        about = {"verb": verb, "store": store, "author": who, "changed": changed.event is not None}
+        write_json(about | asdict(changed) | {"policy": policy, "certificate": certificate_record(certificate)})
         return
-    for each in changes:
-        recorded = "" if each.event is None else f" Event {each.event}, by {who or 'nobody named'}."
-        show(f"{each.text}{recorded}")
+    recorded = "" if changed.event is None else f" Event {changed.event}, by {who or 'nobody named'}."
+    show(f"{changed.text}{recorded}")
 
 
 def _login() -> str:
@@ -68,7 +73,7 @@ def correct(store: str, decision: str, label: str, author: str | None, as_json: 
     From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
     decided; the correction is a later row. A forgotten label counts again by it.
     """
-    _changed("correct", store, author, lambda engine, who: [engine.correct(decision, LABELS[label], who)], as_json)
+    _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
 
 
 @click.command(epilog=example("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'"))
@@ -83,7 +88,7 @@ def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | No
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
     where one is unknown or has no label, none.
     """
-    _changed("forget", store, author, lambda engine, who: [engine.forget(*decisions, author=who, reason=reason)], as_json)
+    _changed("forget", store, author, lambda engine, who: engine.forget(*decisions, author=who, reason=reason), as_json)
 
 
 @click.command(epilog=example("dengine rollback engine.db 1"))
@@ -96,38 +101,26 @@ def rollback(store: str, version: int, author: str | None, as_json: bool) -> Non
 
     Labels that came since are among its references, and corrections count.
     """
-    _changed("rollback", store, author, lambda engine, who: [engine.rollback(version, who)], as_json)
+    _changed("rollback", store, author, lambda engine, who: engine.rollback(version, who), as_json)
 
 
 @click.command(epilog=example("dengine policy engine.db --alpha 0.05 --lower-bound 0.95"))
 @store_argument
-@gathered("settings", given, POLICY | {"interval": interval_option})
-@click.option(
-    "--shadow",
-    type=click.Choice(["on", "off"]),
-    help="Verify every part, and let the model only say what it would have done; or let it decide again.",
-)
+@gathered("settings", given, POLICY | {"interval": interval_option, "shadow": shadow_option})
 @author_option
 @json_option
-def policy(store: str, settings: dict[str, Any], shadow: str | None, author: str | None, as_json: bool) -> None:
+def policy(store: str, settings: dict[str, Any], author: str | None, as_json: bool) -> None:
     """Show the policy in force, or decide by another one.
 
     What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
     and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence. The shadow
     mode lasts over restarts; `dengine status` counts what the model would have done, and how much of that was wrong.
     """
-    if not settings and shadow is None:
-        _show_policy(store, as_json)
+    if settings:
+        _changed(
+            "policy", store, author, lambda engine, who: engine.set_policy(replace(engine.policy, **settings), who), as_json
+        )
         return
-
-    def change(engine: DataEngine, who: str) -> list[Changed]:
-        changes = [engine.set_policy(replace(engine.policy, **settings), who)] if settings else []
-        return changes if shadow is None else [*changes, engine.set_shadow(shadow == "on", who)]
-
-    _changed("policy", store, author, change, as_json)
-
-
-def _show_policy(store: str, as_json: bool) -> None:
     from ..engine.engine import DataEngine
 
     with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,27 +34,6 @@ TOLD = {"verification": "verified"}  # in fewer columns
 SHORT = "%y-%m-%d %H:%M:%S"
 
 
-def actions() -> Iterable[str]:
-    """What may have been decided."""
-    from ..records import Action
-
-    return [each.value for each in Action]
-
-
-def reasons() -> Iterable[str]:
-    """Why it may have been."""
-    from ..records import Reason
-
-    return [each.value for each in Reason]
-
-
-def labels() -> Iterable[str]:
-    """What a part may have turned out to be."""
-    from ..store.views import LABELS
-
-    return LABELS
-
-
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
     """A time: how long ago (90s, 30m, 12h, 7d), or when (2026-03-01, 2026-03-01T14:30), in UTC if it does not say."""
 
@@ -76,17 +55,15 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 @click.argument("store", metavar="STORE")
 @cell_options()
 @click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
-@click.option("--action", type=Known(actions), help="Only what was decided so.")
+@click.option("--action", type=Known("action"), help="Only what was decided so.")
 @click.option(
     "--model",
     "predicted",
-    type=Known(actions),
+    type=Known("action"),
     help="Only what the model alone would have done so, as in an audit or in the shadow mode.",
 )
-@click.option(
-    "--reason", type=Known(reasons), cls=Naming, names=reasons, metavar="REASON", help="Only for this one: {names}."
-)
-@click.option("--label", type=Known(labels), help="Only what turned out so, or was never reported.")
+@click.option("--reason", type=Known("reason"), cls=Naming, metavar="REASON", help="Only for this one: {reason}.")
+@click.option("--label", type=Known("label"), help="Only what turned out so, or was never reported.")
 @click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
 @click.option("--until", type=Moment(), help="Only before then, likewise.")
 @click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")

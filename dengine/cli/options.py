@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
@@ -18,77 +19,52 @@ if TYPE_CHECKING:
     from ..recipe import Recipe
 
 Command = Callable[..., Any]
-Names = Callable[[], Iterable[str]]
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
-def guarantees() -> Iterable[str]:
-    """Names of rules."""
-    from ..decision.policy import RULES
-
-    return RULES
-
-
-def stops() -> Iterable[str]:
-    """What may be known of stops."""
-    from ..decision.policy import Stops
-
-    return get_args(Stops)
-
-
-def intervals() -> Iterable[str]:
-    """Names of confidence intervals."""
+def names_of(kind: str) -> tuple[str, ...]:
+    """What can be said where this is asked for: the keys of the package's own tables, read when they are needed."""
     from ..decision.intervals import INTERVALS
-
-    return INTERVALS
-
-
-def reducers() -> Iterable[str]:
-    """Names of reducers."""
+    from ..decision.policy import RULES, Stops
+    from ..experiments.rivals import RIVALS
+    from ..records import FITS, Action, Reason
     from ..reducers import REDUCERS
+    from ..store.views import LABELS
 
-    return REDUCERS
-
-
-def fits() -> Iterable[str]:
-    """What may become of traces of another length."""
-    from ..records import FITS
-
-    return FITS
+    known: dict[str, Iterable[str]] = {"guarantee": RULES, "interval": INTERVALS, "stops": get_args(Stops)}
+    known |= {"reducer": REDUCERS, "rival": RIVALS, "fit": FITS, "label": LABELS}
+    known |= {"action": [each.value for each in Action], "reason": [each.value for each in Reason]}
+    return tuple(known[kind])
 
 
 class Known(click.ParamType[Any]):
-    """A name in a table of the package, which is read when it is needed; or `module:Class`, where `own` may be given."""
+    """A name of a kind, see `names_of`; or `module:Class`, where `own` may be given."""
 
     name = "name"
 
-    def __init__(self, names: Names, own: bool = False) -> None:
-        self.names = names
-        self.own = own
+    def __init__(self, kind: str, own: bool = False) -> None:
+        self.kind, self.own = kind, own
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """[local|pooled|module:Class]."""
-        return f"[{'|'.join([*self.names(), *(['module:Class'] if self.own else [])])}]"
+        return f"[{'|'.join([*names_of(self.kind), *(['module:Class'] if self.own else [])])}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The name; what is in no table is a usage error."""
-        if value not in self.names() and not (self.own and ":" in value):
+        names = names_of(self.kind)
+        if value not in names and not (self.own and ":" in value):
             own = ", or module:Class of your own" if self.own else ""
-            self.fail(f"{value!r} is not one of {', '.join(map(repr, self.names()))}{own}.", param, ctx)
+            self.fail(f"{value!r} is not one of {', '.join(map(repr, names))}{own}.", param, ctx)
         return str(value)
 
 
 class Naming(click.Option):
-    """An option whose help says, in the place of {names}, what can be named."""
-
-    def __init__(self, *words: Any, names: Names, **how: Any) -> None:
-        super().__init__(*words, **how)
-        self.names = names
+    """An option whose help says what can be named, in the place of {reducer} and other kinds."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         """Its words and its help."""
-        self.help = (self.help or "").replace("{names}", ", ".join(self.names()))
+        self.help = re.sub(r"{(\w+)}", lambda kind: ", ".join(names_of(kind[1])), self.help or "")
         return super().get_help_record(ctx)
 
 
@@ -205,13 +181,13 @@ POLICY = {  # what it is by default is the recipe's affair, or the store's
     ),
     "guarantee": click.option(
         "--guarantee",
-        type=Known(guarantees, own=True),
+        type=Known("guarantee", own=True),
         help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled); "
         "or a rule of your own.",
     ),
     "stops": click.option(
         "--stops",
-        type=Known(stops),
+        type=Known("stops"),
         help="Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good.",
     ),
     "audit_rate": click.option(
@@ -229,7 +205,7 @@ SETTINGS = POLICY | {
         help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
     ),
 }
-interval_option = click.option("--interval", type=Known(intervals), help="The confidence interval.")
+interval_option = click.option("--interval", type=Known("interval"), help="The confidence interval.")
 
 
 def given(**options: Any) -> dict[str, Any]:
@@ -251,9 +227,8 @@ recipe_options = gathered(
         "reducer": click.option(
             "--reducer",
             cls=Naming,
-            names=reducers,
             metavar="NAME",
-            help="{names}, or module:Class of your own, looked for in this folder too.  [default: conv]",
+            help="{reducer}, or module:Class of your own, looked for in this folder too.  [default: conv]",
         ),
         "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
         **SETTINGS,
@@ -316,7 +291,7 @@ DATA = {  # how a data set is read: what `load_dataset` calls them
     "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
     "fit": click.option(
         "--fit",
-        type=Known(fits),
+        type=Known("fit"),
         help="What becomes of traces of another length.  [default: strict where all are alike, else pad]",
     ),
     "rate_hz": click.option(

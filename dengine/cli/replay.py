@@ -29,15 +29,13 @@ from .options import (
     data_options,
     example,
     gathered,
-    guarantees,
-    intervals,
     json_option,
     keep_option,
     n_jobs_option,
+    names_of,
     out_option,
     policy_options,
     recipe_options,
-    reducers,
     seed_option,
     short_name,
 )
@@ -179,26 +177,18 @@ def replay(
     _replay("replay", [contender], {"confirms": [confirm]}, source, stream, out, as_json)
 
 
-def rivals() -> Iterable[str]:
-    """Names of rival methods."""
-    from ..experiments.rivals import RIVALS
-
-    return RIVALS
-
-
 LISTS = {
     "alphas": click.option("--alphas", type=Listed(ALPHA), metavar="LIST", help="As in 0.5,0.1,0.05."),
     "lower_bounds": click.option("--lower-bounds", type=Listed(LOWER_BOUND), metavar="LIST", help="As in 0.8,0.9,0.95."),
     "intervals": click.option(
-        "--intervals", type=Listed(Known(intervals)), cls=Naming, names=intervals, metavar="LIST", help="Of {names}."
+        "--intervals", type=Listed(Known("interval")), cls=Naming, metavar="LIST", help="Of {interval}."
     ),
     "guarantees": click.option(
         "--guarantees",
-        type=Listed(Known(guarantees, own=True)),
+        type=Listed(Known("guarantee", own=True)),
         cls=Naming,
-        names=guarantees,
         metavar="LIST",
-        help="Of {names}, module:Class of your own.",
+        help="Of {guarantee}, module:Class of your own.",
     ),
 }
 
@@ -209,12 +199,11 @@ LISTS = {
     "--reducers",
     "asked",
     cls=Naming,
-    names=lambda: [*reducers(), "TOML files", "module:Class of your own", f"and rivals: {', '.join(rivals())}"],
     metavar="NAMES",
     default="conv,umap,pca",
     show_default=True,
     type=Listed(click.STRING),
-    help="With commas between, of {names}.",
+    help="With commas between, of {reducer}, TOML files, module:Class of your own; and rivals: {rival}.",
 )
 @policy_options
 @click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
@@ -272,7 +261,7 @@ def _contender(asked: str, choice: RecipeChoice) -> Contender:
     """A rival by its name, else a recipe; with the settings that were given."""
     from ..experiments.replay import Contender
 
-    if asked in rivals():
+    if asked in names_of("rival"):
         return replace(Contender.load(asked), recipe=choice.load())
     return Contender(short_name(asked), choice.load(asked))
 
@@ -433,13 +422,6 @@ PRICES = {
 }
 
 
-def _tried() -> dict[str, Sequence[float]]:
-    """What is tried where nothing was named."""
-    from ..experiments.costs import ALPHAS, LOWER_BOUNDS
-
-    return {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS}
-
-
 @click.command(
     epilog=example("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 )
@@ -447,22 +429,8 @@ def _tried() -> dict[str, Sequence[float]]:
 @gathered("prices", dict, PRICES)
 @click.option("--unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @recipe_options
-@click.option(
-    "--alphas",
-    type=Listed(ALPHA),
-    cls=Naming,
-    names=lambda: map(str, _tried()["alphas"]),
-    metavar="LIST",
-    help="To be tried.  [default: {names}]",
-)
-@click.option(
-    "--lower-bounds",
-    type=Listed(LOWER_BOUND),
-    cls=Naming,
-    names=lambda: map(str, _tried()["lower_bounds"]),
-    metavar="LIST",
-    help="To be tried.  [default: {names}]",
-)
+@click.option("--alphas", type=Listed(ALPHA), metavar="LIST", help="To be tried.  [default: 0.5,0.1,0.05]")
+@click.option("--lower-bounds", type=Listed(LOWER_BOUND), metavar="LIST", help="To be tried.  [default: 0.8 to 0.99]")
 @click.option(
     "--repeats", type=click.IntRange(2), default=10, show_default=True, help="Shuffles of each policy; half choose."
 )
@@ -493,13 +461,13 @@ def costs(
     seconds of production or money. Ctrl-C shows the curve of the shuffles that every policy has finished.
     """
     _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import cost_tasks, curve_of
+    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, cost_tasks, curve_of
     from ..experiments.metrics import Costs
     from ..experiments.replay import Contender
 
     priced = Costs(**prices)
     stream = Stream(range(seed, seed + repeats), cycles, n_jobs=n_jobs, keep=keep)
-    tried = _tried() | {name: values for name, values in (("alphas", alphas), ("lower_bounds", lower_bounds)) if values}
+    tried: dict[str, Any] = {"alphas": alphas or ALPHAS, "lower_bounds": lower_bounds or LOWER_BOUNDS}
     tasks = cost_tasks(Contender(choice.name, choice.load()), seeds=stream.seeds, cycles=cycles, **tried)
     finished = _played(source.load(quiet=as_json), tasks, stream, as_json)
     seeds = [each.seed for each in finished.replays]
