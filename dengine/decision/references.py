@@ -1,25 +1,17 @@
-"""How far the labels of one part go together: the intraclass correlation that decides what its repeats count.
-
-A part that comes m times is m independent trials only where its labels are no more alike than those of others that look the
-same. With an intraclass correlation rho, m trials are worth m / (1 + (m - 1) rho): all of them at rho = 0, one at rho = 1.
-Nothing is taken for independent until it was seen to be: rho is an upper confidence bound, and 1 while few parts came
-twice.
-
-Sources: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48, for counts of clusters.
-
-Counting known successes and failures around a query: exact, growing by one label at a time, in K spaces at once.
+"""Counting known successes and failures around a query: exact, growing by one label at a time, in K spaces at once.
 
     >>> index = RadiusIndex(dim=2, capacity=10_000)
     >>> index.add(points, labels, spaces)
     >>> n_success, n_failure = index.count(queries, radius=0.3)
 
-Brute force over at most `capacity` points takes tens of microseconds, needs no rebuilding, and scripts to TorchScript:
-one implementation counts in the engine, in the scikit-learn classifier and in the exported file. Points and queries
-are float32, as embeddings are, and so are the distances.
+Brute force over at most `capacity` points takes tens of microseconds, needs no rebuilding, and scripts to TorchScript: one
+implementation counts in the engine, in the scikit-learn classifier and in the exported file. All is float32.
 
-Trials must be independent to be counted, so a part has one vote in a ball however often it came, more only as far as its
-labels were seen to go their own ways (`agreement`), and none where it is asked about itself. A part is known by a hash:
-of its number, or of its trace's content.
+Trials must be independent to be counted. A part, known by a hash of its number or of its trace, has one vote in a ball
+however often it came, and none where it is asked about itself. With an intraclass correlation rho of its labels, m trials
+are worth m / (1 + (m - 1) rho): rho is an upper confidence bound, and 1 while few parts came twice.
+
+Sources: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48, for counts of clusters.
 """
 
 import hashlib
@@ -82,7 +74,7 @@ class ReferenceRing(nn.Module):
     points (d, capacity) float32, one row a dimension; labels (2, capacity) float32, ones, and 1.0 or 0.0;
     spaces (capacity,) int64; parts (capacity,) int64, hashes, 0 for a point of no known part; total () int64, points ever
     added; first (capacity,) int64, the slot that a part's votes are gathered in; repeats () int64, points of parts that are
-    there already; agreement () float64, how far the labels of one part go together (`agreement.label_agreement`).
+    there already; agreement () float64, how far the labels of one part go together (`label_agreement`).
     """
 
     points: Tensor
@@ -317,7 +309,7 @@ class RadiusIndex:
         self._gather_parts()
 
     def weigh(self) -> None:
-        """Find out how far the labels of one part go together, for all counts until this is asked again."""
+        """Estimate how far the labels of one part go together, for all counts from now on."""
         if int(self.ring.repeats) > 0:
             self.ring.agreement.fill_(label_agreement(self.points, self.labels, self.spaces, self.parts))
 
@@ -357,9 +349,8 @@ class RadiusIndex:
         ring.points[:, :n] = torch.from_numpy(np.array(state["points"]))
         ring.labels[1, :n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
         ring.spaces[:n] = torch.from_numpy(np.array(state["spaces"]))
-        if "parts" in state:  # 0.2 and before did not keep them
-            ring.parts[:n] = torch.from_numpy(np.array(state["parts"]))
-            ring.agreement.fill_(float(state["agreement"]))
+        ring.parts[:n] = torch.from_numpy(np.array(state["parts"]))
+        ring.agreement.fill_(float(state["agreement"]))
         if "numbers" in state:
             index._numbers[:n] = state["numbers"]
         ring.total.fill_(int(state["total"]))

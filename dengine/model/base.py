@@ -1,9 +1,6 @@
-"""A model's face towards many traces at once: what the engine asks one by one.
+"""Two contracts: what a rival method must give (`Model`), and what the engine drives (`EngineModel`).
 
-Two contracts: what a rival method must give, and what the engine drives.
-
-A rival is anything with the five methods of `Model`; `rival.RivalAdapter` makes an `EngineModel` of it. Our own model,
-`prediction.ModelPrediction`, is both.
+`rival.RivalAdapter` makes an `EngineModel` of a rival; our own, `neighbours.ModelPrediction`, is both.
 """
 
 from __future__ import annotations
@@ -12,20 +9,21 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..decision.policy import Policy
-from ..decision.references import Counts
 from ..errors import ExportError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
-from ..traces import as_traces
 
 log = logging.getLogger("dengine")
+
+Embedding = tuple[tuple[float, ...], ...]  # (K, d)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +35,7 @@ class Prediction:
     upper: float
     n_success: int
     n_failure: int
-    embedding: tuple[tuple[float, ...], ...] | None
+    embedding: Embedding | None
     reason: Reason
 
 
@@ -60,8 +58,7 @@ class Told:
     """What became of a part.
 
     lower, upper : the bound that it was decided by, before its label was known.  success : its label.
-    novel : whether it was like nothing learned from.
-    silent : accepted parts that went on since the last that was told of, and of which nothing was heard.
+    novel : whether it was like nothing learned from.  silent : accepted parts of unknown outcome since the last label.
     """
 
     lower: float
@@ -99,13 +96,12 @@ class Model(Protocol):
 class EngineModel(ABC):
     """What the engine drives: it predicts, takes references, trains a successor, and is stored.
 
-    untold : whether its rule failed to learn what became of a part; it then raises instead of predicting.
-    keeps_references : whether its state and the points stored with labels restore its references. A rival keeps what it
-        likes, and is restored by a refit.
+    untold : whether its rule missed what became of a part; it then raises instead of predicting.
+    keeps_references : whether its state and the points stored with labels restore its references; a rival is refitted.
     """
 
     keeps_references = True
-    untold = False  # whether its rule missed what became of a part
+    untold = False
 
     @property
     @abstractmethod
@@ -151,9 +147,7 @@ class EngineModel(ABC):
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
 
     @abstractmethod
-    def reference_point(
-        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
-    ) -> Floats:
+    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
         """Where a trace (C, T) with this content hash lies as a reference.
 
         embedding : its (K, d) embedding by this very model, where a prediction has computed it already.
@@ -177,7 +171,7 @@ class EngineModel(ABC):
 
     def under(self, policy: Policy) -> Self:
         """The same model, references shared, under another policy, with a rule that was told nothing yet."""
-        return self  # its numbers are its own
+        return self
 
     def begin_safely_in(self, mode: int) -> None:  # noqa: B027  # a default: it has no safe mode
         """Verify everything for this reason, a position in `SAFE_MODE`, until fresh evidence keeps the tolerance."""
@@ -229,18 +223,12 @@ class EngineModel(ABC):
 
     def improve_safely(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
         """`improve`; one that fails at it goes on with what it has."""
-        try:
-            return self.improve(X, hashes, stop)
-        except Exception:
-            log.exception("the encoder cannot be trained further; it goes on as it is")
-            return 0
+        failed = "the encoder cannot be trained further; it goes on as it is"
+        return _guarded(lambda: self.improve(X, hashes, stop), 0, failed)
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
         """`look_ahead`; what fails at it will say so when it is trained."""
-        try:
-            self.look_ahead(X)
-        except Exception:
-            log.exception("the traces of the store could not be looked at ahead of a retrain")
+        _guarded(lambda: self.look_ahead(X), 0, "the traces of the store could not be looked at ahead of a retrain")
 
     def tell_safely(self, told: Told) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
@@ -252,29 +240,27 @@ class EngineModel(ABC):
 
     def prepare_safely(self, previous: EngineModel) -> None:
         """`prepare`; one that fails at it will verify, and say so, on every part."""
-        try:
-            self.prepare(previous)
-        except Exception:
-            log.exception("the model that was trained cannot be made to answer")
+        _guarded(lambda: self.prepare(previous), None, "the model that was trained cannot be made to answer")
 
-    def place_safely(
-        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
-    ) -> Floats | None:
+    def place_safely(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats | None:
         """`reference_point`, or None where it fails."""
-        try:
-            return self.reference_point(x, hash_, embedding)
-        except Exception:
-            log.exception("the model cannot place a labelled trace; the next version learns it from the store")
-            return None
+        failed = "the model cannot place a labelled trace; the next version learns it from the store"
+        return _guarded(lambda: self.reference_point(x, hash_, embedding), None, failed)
 
     def add_safely(self, point: Floats | None, y: int, hash_: int, number: int) -> None:
         """`add_reference`, where there is a point. A model that fails at it goes on without."""
-        if point is None:
-            return
-        try:
-            self.add_reference(point, y, hash_, number)
-        except Exception:
-            log.exception("the model cannot take a labelled trace; the next version learns it from the store")
+        if point is not None:
+            failed = "the model cannot take a labelled trace; the next version learns it from the store"
+            _guarded(lambda: self.add_reference(point, y, hash_, number), None, failed)
+
+
+def _guarded(call: Callable[[], T], otherwise: T, failed: str) -> T:
+    """What the call returns; `otherwise`, logged, where it raises."""
+    try:
+        return call()
+    except Exception:
+        log.exception(failed)
+        return otherwise
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,29 +281,3 @@ class Exportable:
     model_version: int = 0
     recipe: str = ""
     note: Callable[[str, str], object] | None = None
-
-
-class ManyPredictions(ABC):
-    """Predictions on many traces, from those on one."""
-
-    @abstractmethod
-    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
-        """What it says of one trace (C, T)."""
-
-    def predict_many(self, X: ArrayLike) -> list[Prediction]:
-        """The prediction on each trace of (n, T) or (n, C, T)."""
-        return [self.predict_one(x) for x in as_traces(X)]
-
-    def count(self, X: ArrayLike) -> Counts:
-        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
-        found = self.predict_many(X)
-        return np.array([p.n_success for p in found], dtype=np.int64), np.array([p.n_failure for p in found], np.int64)
-
-    def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(lower, upper), each (n,): the bound on each trace's success probability."""
-        found = self.predict_many(X)
-        return np.array([p.lower for p in found]), np.array([p.upper for p in found])
-
-    def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """(n,) array of `Action`."""
-        return np.array([p.action for p in self.predict_many(X)], dtype=object)

@@ -2,13 +2,6 @@
 
 A label may be counted for a query only in an embedding that never saw that label. So the reducer spans K spaces, fold k's
 references live in space k, a query is embedded in all K, and its counts are summed.
-
-Parts that seem to come twice although nobody says so: traces much closer to another one than to all the rest.
-
-Labels are counted as independent trials. A part that is inserted again brings its label again, so its repeats must be
-known as such (`part=`); where they are not, this notices the plain cases and says so. It reads no label, and changes no
-decision: repeats that look as different as parts do, and those of which there are more than `NEIGHBOURS`, are not seen.
-The independence of parts with different numbers is assumed.
 """
 
 from __future__ import annotations
@@ -26,61 +19,29 @@ from sklearn.base import clone
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
-from ..decision.references import RadiusIndex
+from ..decision.references import Counts, RadiusIndex
 from ..decision.rule import SAFE_MODE, DecisionRule
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, TraceSpec, as_labels, as_success
 from ..reducers import make_reducer, reducer_of
-from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, space_scale
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, part, space_scale
 from ..reducers.cross_fitting import as_reducer
 from ..traces import as_traces
-from .base import EngineModel, Exportable, ManyPredictions, Prediction, Told
+from .base import Embedding, EngineModel, Exportable, Prediction, Told
 from .compiled import CompiledPredictor, compile_predictor
 
-NEWEST = 500  # traces that are looked at: the work does not grow
+NEWEST = 500  # traces that are searched for repeats: the work does not grow
 FEWEST = 100
 POINTS = 50  # of each channel, means of equal stretches: the sensor's noise is no difference
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
 SUSPICIOUS = 0.05  # share of such traces
-
-
-def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
-    """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes."""
-    x, own = traces[-NEWEST:], parts[-NEWEST:]
-    if len(x) < FEWEST:
-        return 0
-    n, channels, samples = x.shape
-    length = max(1, samples // POINTS)
-    from scipy.spatial.distance import cdist
-
-    whole = x[:, :, : samples // length * length].astype(np.float64)
-    means = whole.reshape(n, channels, -1, length).mean(3)
-    scale = means.std((0, 2), keepdims=True)
-    rows = ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
-    distances = cdist(rows, rows)
-    distances[own[:, None] == own] = np.inf
-    nearest = np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]]
-    with np.errstate(invalid="ignore"):
-        return int((nearest[:, 0] < NEAR * nearest[:, 1]).sum())
-
-
-def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
-    """What to say of near repeats; "" where there are few."""
-    n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
-    if n <= SUSPICIOUS * looked_at:
-        return ""
-    return (
-        f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
-    )
-
-
 WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
 
 
-class ModelPrediction(ManyPredictions, EngineModel):
+class ModelPrediction(EngineModel):
     """Reducer + references + rule, from traces.
 
     reducer : a name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never fitted itself.
@@ -238,9 +199,7 @@ class ModelPrediction(ManyPredictions, EngineModel):
         self.add_reference(self.reference_point(X[0], hash_), int(as_success(np.asarray(y))), hash_)
         return self
 
-    def reference_point(
-        self, x: NDArray[np.float32], hash_: int, embedding: tuple[tuple[float, ...], ...] | None = None
-    ) -> Floats:
+    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
         """(C, T) -> (d,): where the trace lives as a reference, in its own fold's space."""
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
@@ -304,6 +263,24 @@ class ModelPrediction(ManyPredictions, EngineModel):
         embedding = tuple(tuple(row) for row in z.tolist())
         return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
 
+    def predict_many(self, X: ArrayLike) -> list[Prediction]:
+        """The prediction on each trace of (n, T) or (n, C, T)."""
+        return [self.predict_one(x) for x in as_traces(X)]
+
+    def count(self, X: ArrayLike) -> Counts:
+        """(n_success, n_failure), each (n,): labels in the balls around each trace, summed over the K spaces."""
+        found = self.predict_many(X)
+        return np.array([p.n_success for p in found], dtype=np.int64), np.array([p.n_failure for p in found], np.int64)
+
+    def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(lower, upper), each (n,): the bound on each trace's success probability."""
+        found = self.predict_many(X)
+        return np.array([p.lower for p in found]), np.array([p.upper for p in found])
+
+    def decide(self, X: ArrayLike) -> NDArray[Any]:
+        """(n,) array of `Action`."""
+        return np.array([p.action for p in self.predict_many(X)], dtype=object)
+
     def successor(self) -> ModelPrediction:
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
         new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule, self.novelty)
@@ -327,25 +304,23 @@ class ModelPrediction(ManyPredictions, EngineModel):
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore references and rule, and the reducer unless it was refitted, so that decisions repeat bit for bit."""
-        if "points" not in state:  # 0.1 drove our own model, handed in, as it drove a rival: it was refitted
-            return self
         if not self.needs_refit(state):
-            self.spaces.set_state(_part(state, "reducer."))
+            self.spaces.set_state(part(state, "reducer."))
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
         self.scale = np.asarray(state["scale"])
         self.index = RadiusIndex.from_state(state, self.classifier.capacity)
         self.gate = NoveltyGate(*self.trace_shape)
-        self.gate.asleep = not _part(state, "novelty.")
+        self.gate.asleep = not part(state, "novelty.")
         for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
             own = module.state_dict()  # shares its tensors with the module
-            for name, value in _part(state, prefix).items():
+            for name, value in part(state, prefix).items():
                 own[name].copy_(torch.from_numpy(np.array(value)))
         self._compiled = None
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
         """Whether the reducer gave no arrays of its own."""
-        return not _part(state, "reducer.")
+        return not part(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
         """The model as an exporter takes it; without a contract, one of its traces' shape."""
@@ -358,5 +333,36 @@ class ModelPrediction(ManyPredictions, EngineModel):
         return self.__dict__ | {"_compiled": None}
 
 
-def _part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
+    """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
+
+    Labels are counted as independent trials, so a part that is inserted again must be known as such (`part=`). This notices
+    the plain cases where it is not; it reads no label and changes no decision. Repeats that look as different as parts do,
+    and those of which there are more than `NEIGHBOURS`, are not seen.
+    """
+    x, own = traces[-NEWEST:], parts[-NEWEST:]
+    if len(x) < FEWEST:
+        return 0
+    n, channels, samples = x.shape
+    length = max(1, samples // POINTS)
+    from scipy.spatial.distance import cdist
+
+    whole = x[:, :, : samples // length * length].astype(np.float64)
+    means = whole.reshape(n, channels, -1, length).mean(3)
+    scale = means.std((0, 2), keepdims=True)
+    rows = ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
+    distances = cdist(rows, rows)
+    distances[own[:, None] == own] = np.inf
+    nearest = np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]]
+    with np.errstate(invalid="ignore"):
+        return int((nearest[:, 0] < NEAR * nearest[:, 1]).sum())
+
+
+def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
+    """What to say of near repeats; "" where there are few."""
+    n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
+    if n <= SUSPICIOUS * looked_at:
+        return ""
+    return (
+        f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
+    )

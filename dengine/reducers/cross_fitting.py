@@ -36,7 +36,7 @@ def as_reducer(transformer: Any, folds: int) -> Reducer:
 
 
 class _Wrapping(Reducer):
-    """What is common to reducers that hand traces on to a transformer of somebody else's."""
+    """A reducer that hands traces on to a transformer of somebody else's."""
 
     reducer: Any
     dim_: int

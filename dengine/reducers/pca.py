@@ -67,7 +67,7 @@ class PcaReducer(Reducer):
         """Restore mean and components."""
         self.mean_, self.components_ = np.array(state["mean"]), np.array(state["components"])
         self.n_features_in_ = len(self.mean_)
-        self.trace_shape_ = tuple(int(n) for n in state.get("shape", (1, self.n_features_in_)))  # 0.1 kept no shape
+        self.trace_shape_ = tuple(int(n) for n in state["shape"])
         return self
 
 

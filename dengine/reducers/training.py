@@ -9,11 +9,6 @@ squared covariances of dimensions (covariance), so that nothing collapses and no
 
 No label is read, so what is learned is honest for every fold. Whether a training may answer is asked of traces that it
 never saw, by the same loss. Source: Bardes, Ponce and LeCun (2022), VICReg, ICLR, arXiv:2105.04906.
-
-Adam, as the encoder trains with it: Kingma and Ba (2015), Adam: a method for stochastic optimization, ICLR, algorithm 1.
-
-`torch.optim`'s gives the same numbers (a test compares them), but loads the compiler of torch at its first use: 2 s in the
-middle of a cell's cycle, where a slice of training has 0.45 s.
 """
 
 from __future__ import annotations
@@ -34,12 +29,21 @@ from .encoder import ConvEncoder
 
 BETA_1, BETA_2 = 0.9, 0.999  # what a step leaves of the means of gradients and of their squares
 EPSILON = 1e-8
+BATCH = 64
+LOOKED_AT = 33  # places of a kernel, about, in a step; others in the next
+PROJECTED = 128  # dimensions of the projector
+RATE = 1e-3  # of Adam
+KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
+INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0  # weights of the loss, as in its paper
+FEWEST = 8  # held-out traces that can say whether a training did well
+WORSE = 1.1  # times the held-out loss that a training may have, against the one that answers
 
 
 class Adam:
-    """Steps down the gradients of parameters, each group at its own rate.
+    """Steps down the gradients of parameters, each group at its own rate.  groups : of parameters and a rate each.
 
-    groups : of parameters and a rate each.
+    `torch.optim`'s gives the same numbers (a test compares them), but loads the compiler of torch at its first use: 2 s in
+    the middle of a cell's cycle. Source: Kingma and Ba (2015), ICLR, algorithm 1.
     """
 
     def __init__(self, groups: Sequence[tuple[Sequence[Tensor], float]]) -> None:
@@ -72,16 +76,6 @@ class Adam:
             for i, moment in enumerate(some):
                 moment.copy_(torch.from_numpy(np.array(state[f"{kind}.{i}"])))
         self._steps = int(state["steps"])
-
-
-BATCH = 64
-LOOKED_AT = 33  # places of a kernel, about, in a step; others in the next
-PROJECTED = 128  # dimensions of the projector
-RATE = 1e-3  # of Adam
-KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
-INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0  # weights of the loss, as in its paper
-FEWEST = 8  # held-out traces that can say whether a training did well
-WORSE = 1.1  # times the held-out loss that a training may have, against the one that answers
 
 
 def scaled(a: Tensor, g: torch.Generator) -> Tensor:

@@ -17,11 +17,6 @@ tolerances = st.floats(0.001, 0.999)
 propensities = st.floats(0.001, 1.0)
 
 
-def test_sixty_parts_of_which_one_is_bad_lie_surely_below_ten_percent() -> None:
-    assert log_evidence(60, 1, 0.1) >= math.log(1 / 0.1)  # the docstring's example
-    assert log_evidence(40, 1, 0.1) < math.log(1 / 0.1)
-
-
 @pytest.mark.parametrize(("n", "tolerance", "alpha"), [(28, 0.1, 0.1), (73, 0.05, 0.05)])
 def test_parts_that_were_all_good_are_soon_enough(n: int, tolerance: float, alpha: float) -> None:
     assert log_evidence(n - 1, 0, tolerance) < math.log(1 / alpha) <= log_evidence(n, 0, tolerance)
@@ -47,11 +42,6 @@ def test_each_bet_is_one_on_the_inverse_probability_weighted_outcome(c: tuple[in
         b * (1 + s * theta) ** (n - n_bad) * (1 + s * (theta - 1 / q)) ** n_bad for b, s in zip(BETS, stakes, strict=True)
     ]
     assert log_evidence(n, n_bad, theta, q) == pytest.approx(math.log(sum(capitals) / sum(BETS)), abs=1e-6)
-
-
-@given(counts, tolerances)
-def test_at_propensity_one_weighting_changes_nothing(c: tuple[int, int], theta: float) -> None:
-    assert log_evidence(*c, theta, 1.0) == log_evidence(*c, theta)
 
 
 @given(counts, tolerances, propensities)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 from statsmodels.stats.proportion import proportion_confint
 
 from dengine import (
@@ -16,7 +15,6 @@ from dengine import (
     jeffreys_interval,
     wilson_interval,
 )
-from dengine.decision.intervals import normal_quantile
 from dengine.errors import SettingError
 
 ALPHAS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.5)
@@ -87,28 +85,6 @@ def test_jeffreys_equals_statsmodels_with_the_ends_closed(alpha: float) -> None:
         lower, upper = proportion_confint(n_s, n_s + n_f, alpha, method="jeffreys")
         expected = (0.0 if n_s == 0 else lower, 1.0 if n_f == 0 else upper)
         np.testing.assert_allclose(jeffreys_interval(n_s, n_f, alpha), expected, rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("alpha", ALPHAS)
-@pytest.mark.parametrize(("interval", "method"), [(wilson_interval, "wilson"), (clopper_pearson_interval, "exact")])
-def test_interval_equals_scipys_binomial_test(interval, method: str, alpha: float) -> None:
-    for n_s, n_f in COUNTS:
-        oracle = stats.binomtest(n_s, n_s + n_f).proportion_ci(1.0 - alpha, method=method)
-        np.testing.assert_allclose(interval(n_s, n_f, alpha), (oracle.low, oracle.high), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("alpha", ALPHAS)
-def test_jeffreys_equals_scipys_beta_quantiles(alpha: float) -> None:
-    for n_s, n_f in COUNTS:
-        posterior = stats.beta(n_s + 0.5, n_f + 0.5)
-        lower, upper = jeffreys_interval(n_s, n_f, alpha)
-        assert lower == pytest.approx(0.0 if n_s == 0 else posterior.ppf(alpha / 2), rel=1e-9)
-        assert upper == pytest.approx(1.0 if n_f == 0 else posterior.ppf(1 - alpha / 2), rel=1e-9)
-
-
-@given(alphas)
-def test_normal_quantile_equals_scipys(alpha: float) -> None:
-    assert normal_quantile(alpha) == pytest.approx(stats.norm.isf(alpha / 2), rel=1e-9, abs=1e-12)
 
 
 # -------------------------------------------------------------------------------------------------- properties

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from sklearn.neighbors import RadiusNeighborsClassifier
 
 from dengine import INTERVALS, Action, Policy, WilsonRadiusClassifier
-from dengine.decision.rule import SCALAR_BOUNDS, script
+from dengine.decision.rule import script
 from dengine.errors import SettingError
 
 
@@ -72,27 +70,6 @@ def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
 
 
 # -------------------------------------------------------------------------------------------------- one bound
-
-
-@pytest.mark.parametrize("interval", SCALAR_BOUNDS)
-@pytest.mark.parametrize("alpha", [0.01, 0.05, 0.1, 0.5])
-def test_the_scripted_bound_is_the_interval_to_twelve_digits(interval: str, alpha: float) -> None:
-    rule = script(Policy(alpha, 0.9, interval).rule())
-    counts = [(s, f) for s in (0, 1, 2, 25, 95, 1000, 9999) for f in (0, 1, 5, 100, 9999)]
-    scripted = np.array([rule(s, f)[1:] for s, f in counts])
-    n_s, n_f = np.array(counts).T
-    np.testing.assert_allclose(scripted.T, INTERVALS[interval](n_s, n_f, alpha), rtol=0, atol=1e-12)
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.integers(0, 200), st.integers(0, 200), st.floats(0.001, 0.9))
-def test_counts_of_references_become_the_wilson_interval(n_s: int, n_f: int, alpha: float) -> None:
-    if n_s + n_f == 0:
-        return
-    model = WilsonRadiusClassifier(alpha=alpha)
-    model.partial_fit(np.zeros((n_s + n_f, 2)), np.repeat([1, 0], [n_s, n_f]), classes=[0, 1])
-    lower, upper = model.predict_interval([[0.0, 0.0]])
-    assert (lower[0], upper[0]) == pytest.approx(INTERVALS["wilson"](n_s, n_f, alpha), abs=1e-12)
 
 
 @pytest.mark.parametrize("shares", [{}, {"fraction": 0.2}, {"fraction": 0.3, "reject_fraction": 0.05}])

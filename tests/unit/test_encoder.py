@@ -18,7 +18,7 @@ from dengine.engine.trainer import STEP_SECONDS, EncoderTime
 from dengine.folds import content_fold, content_hash
 from dengine.reducers.base import StopRule
 from dengine.reducers.encoder import ConvEncoder, averaging
-from dengine.reducers.training import AUGMENTATIONS, Adam, EncoderTraining, vicreg_loss
+from dengine.reducers.training import AUGMENTATIONS, Adam, vicreg_loss
 
 SMALL = {"kernels": 6, "dilations": 3, "width": 8}
 
@@ -65,16 +65,6 @@ def test_what_answers_stays_until_the_next_training_takes_the_encoder_over() -> 
     assert "encoder after 8 steps" in reducer.report.note
     reducer.train(X, y, content_fold(X, 5))
     assert "encoder" not in reducer.report.note  # nothing was trained since
-
-
-def test_training_lowers_the_loss_on_traces_that_it_never_saw() -> None:
-    reducer, X, _ = fitted()
-    improved(reducer, X, 1)
-    training = reducer.training_
-    assert training is not None
-    first = training.held_out_loss(training.learner)
-    improved(reducer, X, 60)
-    assert training.held_out_loss(training.learner) < 0.97 * first
 
 
 @pytest.mark.parametrize(
@@ -137,12 +127,6 @@ def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(cha
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
         whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
         torch.testing.assert_close(found[d], whole[:, :, middle[d]].transpose(1, 2))
-
-
-def test_one_trace_alone_is_pooled_as_it_is_among_others() -> None:
-    reducer, X, _ = fitted()
-    raw = reducer.net_.features.raw
-    torch.testing.assert_close(raw(torch.from_numpy(X[:1])), raw(torch.from_numpy(X))[:1])
 
 
 def test_a_ramp_is_pooled_over_its_region_and_twice_over_the_whole_trace() -> None:
@@ -230,13 +214,6 @@ def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples
         np.testing.assert_allclose(encoder(X), standard, atol=1e-4)
         assert torch.isfinite(standard).all()
         np.testing.assert_allclose(script(encoder)(X[:1]), encoder(X[:1]), atol=1e-6)
-
-
-def test_an_encoder_of_no_traces_and_of_one_trains_nothing() -> None:
-    reducer, X, _ = fitted()
-    assert isinstance(reducer.net_.features, ConvEncoder)
-    training = EncoderTraining(reducer.net_.features, 0)
-    assert training.run(torch.from_numpy(X[:1]), torch.from_numpy(X[:0]), StopRule(max_steps=5)) == 0
 
 
 def test_time_is_saved_up_cycle_by_cycle_and_taken_in_slices() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dengine import INTERVALS, Action, Policy
+from dengine import Action, Policy
 from dengine.errors import SettingError
 
 unit = st.floats(0.0, 1.0)
@@ -55,11 +55,6 @@ def test_swapping_success_and_failure_swaps_accept_and_reject(policy: Policy, a:
 @given(policies)
 def test_without_evidence_every_policy_verifies(policy: Policy) -> None:
     assert policy.action(*policy.bound(0, 0)) is Action.VERIFY
-
-
-@pytest.mark.parametrize("name", INTERVALS)
-def test_a_policy_bounds_by_the_interval_it_names(name: str) -> None:
-    assert Policy(alpha=0.2, interval=name).bound(19, 1) == INTERVALS[name](19, 1, 0.2)
 
 
 @given(policies, st.integers(0, 300), st.integers(0, 300))

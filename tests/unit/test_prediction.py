@@ -133,13 +133,6 @@ def test_a_pipeline_that_uses_labels_works_when_it_is_cross_fitted_by_hand(data:
     assert (decided == Action.ACCEPT).sum() > 20
 
 
-def test_scikit_learns_pca_works_unchanged(data: Dataset) -> None:
-    model = ModelPrediction(PCA(2), classifier()).fit(data.X[:150], data.y[:150])
-    decided = model.decide(data.X[150:])
-    assert (decided[data.y[150:] == 0] != Action.ACCEPT).all()
-    assert (decided == Action.ACCEPT).sum() > 20
-
-
 def test_one_class_outside_a_fold_is_a_setting_error_that_says_so(data: Dataset) -> None:
     with pytest.raises(SettingError, match="Expected both classes outside fold 0"):
         lda().fit(data.X[:20], np.ones(20))
@@ -148,10 +141,6 @@ def test_one_class_outside_a_fold_is_a_setting_error_that_says_so(data: Dataset)
 
 
 # ------------------------------------------------------------------------------------------------- the model itself
-
-
-def test_it_is_a_model_by_the_protocol(data: Dataset) -> None:
-    assert isinstance(ModelPrediction("pca"), Model)
 
 
 def test_bounds_follow_from_counts_and_decisions_from_bounds(data: Dataset) -> None:

@@ -126,14 +126,6 @@ def test_an_archive_without_an_array_is_refused(trained: str) -> None:
         fitted(trained)
 
 
-def test_a_stored_state_needs_the_file_no_more(trained: str) -> None:
-    X, _ = traces()
-    reducer = fitted(trained)
-    state, points = reducer.get_state(), reducer.embed(X)
-    Path(trained).unlink()
-    assert np.array_equal(ConvReducer(start=trained, **SIZES).set_state(state).embed(X), points)
-
-
 def test_a_stored_engine_opens_without_the_file_and_decides_alike(trained: str, tmp_path: Path) -> None:
     X, y = traces(120)
     recipe = replace(Recipe.load("conv"), params={**SIZES, "start": trained}, retrain_every=30)
