@@ -146,6 +146,7 @@ async def opcua_server(
     space = AddressSpace(server, service)
     await space.build()
     async with server:
+        await space.refresh()
         following = asyncio.create_task(space.follow())
         try:
             yield server
@@ -191,26 +192,28 @@ class AddressSpace:
 
     async def follow(self) -> None:
         """Bring the variables up to date whenever something has changed, and now and then, for ever."""
-        changed = asyncio.Event()
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._listen(changed))
+        changes, following = aiter(self._service.changes()), None
+        try:
             while True:
-                changed.clear()
-                await self._look()
+                await self.refresh()
                 await asyncio.sleep(EVERY)  # what was decided just now is in the store by then
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(changed.wait(), SELDOM)
+                following = following or asyncio.ensure_future(anext(changes, None))
+                if following in (await asyncio.wait([following], timeout=SELDOM))[0]:
+                    following = None
+        finally:
+            if following is not None:
+                following.cancel()
 
-    async def _listen(self, changed: asyncio.Event) -> None:
-        async for _ in self._service.changes():
-            changed.set()
-
-    async def _look(self) -> None:
+    async def refresh(self) -> None:
+        """Bring the variables up to date; where that cannot be, the values stay, and say that they are old."""
         try:
             await self.update(await self._calls.status())
-        except Exception as error:  # the store is away, or the line is full: the values stay, and say that they are old
+        except Exception as error:  # the store is away, or the line is full
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
-            await self._grow_old()
+            for name in VARIABLES:
+                old = await self._nodes[name].read_data_value(raise_on_bad_status=False)
+                status = _status(StatusCodes.UncertainLastUsableValue)
+                await self._nodes[name].write_value(ua.DataValue(old.Value, status))
 
     async def update(self, now: Mapping[str, Any]) -> None:
         """Write how the cell is doing into the variables; an alarm that begins or ends is an event."""
@@ -221,12 +224,6 @@ class AddressSpace:
             self._events.event.Severity = ALARM if now["alarm"] else ALARM_ENDED
             await self._events.trigger(message=now["alarm"] or f"Over: {self._alarm}")
             self._alarm = now["alarm"]
-
-    async def _grow_old(self) -> None:
-        for name in VARIABLES:
-            old = await self._nodes[name].read_data_value(raise_on_bad_status=False)
-            status = _status(StatusCodes.UncertainLastUsableValue)
-            await self._nodes[name].write_value(ua.DataValue(old.Value, status))
 
     async def _variable(self, cell: Node, name: str, type_: VariantType, text: str) -> None:
         first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
@@ -270,19 +267,15 @@ def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> ua.CallM
     """What is wrong with a call's arguments, each by itself; None where nothing is."""
     if len(arguments) != len(taken):
         few = len(arguments) < len(taken)
-        return _result(StatusCodes.BadArgumentsMissing if few else StatusCodes.BadTooManyArguments)
-    good = [
-        each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
+        return ua.CallMethodResult(_status(StatusCodes.BadArgumentsMissing if few else StatusCodes.BadTooManyArguments))
+    codes = [
+        StatusCodes.Good
+        if each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
+        else StatusCodes.BadTypeMismatch
         for each, (_, type_, array, _) in zip(arguments, taken, strict=True)
     ]
-    if all(good):
-        return None
-    codes = [StatusCodes.Good if fine else StatusCodes.BadTypeMismatch for fine in good]
-    return _result(StatusCodes.BadInvalidArgument, codes)
-
-
-def _result(code: int, each: list[int] | None = None) -> ua.CallMethodResult:
-    return ua.CallMethodResult(_status(code), [_status(one) for one in each or []])
+    bad = any(code != StatusCodes.Good for code in codes)
+    return ua.CallMethodResult(_status(StatusCodes.BadInvalidArgument), list(map(_status, codes))) if bad else None
 
 
 def _status(code: int) -> ua.StatusCode:

@@ -17,6 +17,7 @@ from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -210,18 +211,14 @@ class RobotCalls:
 
 def as_samples(value: Any) -> NDArray[np.float32]:
     """A list of numbers, or a list of such lists of one length, as float32; TraceError for anything else."""
-    rows = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
-    for row in rows:
-        if not isinstance(row, list) or not {*map(type, row)} <= {int, float}:
-            raise TraceError("Expected a list of numbers, or a list of such lists of one length, a channel each.")
-    if len({*map(len, rows)}) != 1 or not rows[0]:
-        raise TraceError("Expected as many samples of each channel, and at least one.")
     try:
         with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
-            x = np.array(rows, dtype=np.float64).astype(np.float32)
-    except OverflowError as error:
-        raise TraceError("Expected numbers that a float can hold, got an integer beyond that.") from error
-    return x[0] if rows[0] is value else x
+            x = np.array(msgspec.convert(value, list[float | list[float]]), dtype=np.float64).astype(np.float32)
+    except (ValueError, OverflowError) as error:
+        raise TraceError("Expected a list of numbers, or a list of such lists of one length, a channel each.") from error
+    if not x.size:
+        raise TraceError("Expected at least one sample, got none.")
+    return x
 
 
 def _as_action(call: Call) -> Call:

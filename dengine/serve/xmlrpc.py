@@ -1,10 +1,7 @@
 """XML-RPC, as a robot's program speaks it: `rpc_factory("xmlrpc", "http://HOST:8000/RPC2")`.
 
-    app = Starlette(routes=xmlrpc.routes(service))
-
-The calls are those of `RobotCalls`. Every answer is HTTP's 200 with a value or a fault, as XML-RPC wants it; only what is
-no XML-RPC at all is a 405, 413 or 415. A fault is a code and one line. The XML is read by defusedxml: no document type, no
-entity, nothing from outside; only numbers, booleans, texts and lists are taken.
+The calls are those of `RobotCalls`. Every answer is HTTP's 200 with a value or a fault, a code and one line; only what is
+no XML-RPC at all is a 405, 413 or 415. The XML is read by defusedxml: no document type, no entity, nothing from outside.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from dengine.records import Action, Reason, Source
 from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.serve.page.charts import Scale, element, number, percent
-from dengine.serve.page.looking import Looking, ChangeFeed
+from dengine.serve.page.looking import ChangeFeed, Looking
 from dengine.serve.page.views import SOURCE, WORDS, duration, history_query
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
