@@ -1,15 +1,11 @@
 """The contract of a reducer, as checks that an author can run on one of his own.
 
-    from dengine.checks import check_reducer
+    from dengine.testing import check_reducer
     check_reducer(MyReducer())                   # an AssertionError names the clause that is broken
 
-or a test a clause:
-
-    @pytest.mark.parametrize("check", REDUCER_CHECKS, ids=lambda check: check.__name__)
-    def test_my_reducer(check): check(MyReducer())
-
-Any scikit-learn transformer may be checked, as the engine would use it: label-free in one space, label-using cross-fitted.
-The clause that matters most is `labels_of_a_fold_move_nothing_in_its_space`: honest counting rests on it.
+`REDUCER_CHECKS` are the clauses one by one, for pytest's parametrize. Any scikit-learn transformer may be checked, as the
+engine would use it: label-free in one space, label-using cross-fitted. Honest counting rests on
+`labels_of_a_fold_move_nothing_in_its_space`.
 """
 
 from __future__ import annotations

@@ -191,7 +191,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
 
 def as_points(Z: Any) -> Floats:
-    """An embedding as float32, (n, d)."""
+    """An embedding (n, d) as float32."""
     return np.ascontiguousarray(Z, dtype=np.float32)
 
 
