@@ -170,9 +170,7 @@ ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
 LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
 POLICY = {  # what it is by default is the recipe's affair, or the store's
     "alpha": click.option(
-        "--alpha",
-        type=ALPHA,
-        help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]",
+        "--alpha", type=ALPHA, help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
     ),
     "lower_bound": click.option(
         "--lower-bound",
@@ -203,7 +201,7 @@ SETTINGS = POLICY | {
         type=click.FloatRange(0.0),
         metavar="FACTOR",
         help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
-    ),
+    )
 }
 interval_option = click.option("--interval", type=Known("interval"), help="The confidence interval.")
 
