@@ -183,23 +183,6 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(pa
     assert report.missing >= len(fake.lost)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_so_it_is_with_any_faults_at_any_samples(parts: Dataset, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    kinds = ("drop", "hold", "close", "half", "garbage", "repeat")
-    samples = rng.integers(SAMPLES, size=40) * (rng.random(40) < 0.8)  # the first more often than by chance
-    wrong = [Trouble(i, int(samples[i]), str(rng.choice(kinds)), int(rng.integers(1, 200))) for i in range(40)]
-    with FakeController(RobotProgram(parts), speed=None, troubles=wrong) as fake, cell_of(fake) as cell:
-        for part in range(40):
-            trace = cell.insert()
-            lost = {place for place in fake.lost if place[0] == part}
-            unseen = (part, 0) in lost
-            assert nan_places(part, trace) == ({(part, i) for i in range(SAMPLES)} if unseen else lost), wrong[part]
-            there = ~np.isnan(trace)
-            np.testing.assert_array_equal(trace[there], parts.X[part][there])
-            assert cell.verify() == bool(parts.y[part])
-
-
 def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
     with FakeController(RobotProgram(parts), troubles=[Trouble(0, 10, "hold", 60)]) as fake, cell_of(fake) as cell:
         trace = cell.insert()  # in real time
@@ -263,16 +246,6 @@ def test_a_recorder_cuts_by_any_trigger_with_samples_from_before_it(trigger, col
             np.testing.assert_array_equal(recorder.record(WAIT).trace, contact()[180:240].astype(np.float32))
 
 
-def test_a_controller_is_asked_for_the_rate_that_a_trace_has() -> None:
-    with FakeController(Signals(FZ_Base=contact()), speed=None) as fake:  # 500 cycles a second: it sends every fourth
-        how = {"samples": 20, "rate_hz": 125.0, "port": fake.port}
-        with RtdeRecorder(fake.host, ContactTrigger(5.0, quiet_s=0.1), **how) as recorder:
-            insertion = recorder.record(WAIT)
-    assert insertion.complete
-    starts = [contact()[first : first + 80 : 4].astype(np.float32).tolist() for first in range(200, 204)]
-    assert insertion.trace.tolist() in starts
-
-
 def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts: Dataset) -> None:
     columns = {"FX_Base": contact() / 2, "FZ_Base": contact(), "actual_q[5]": contact() / 4}
     how = {"trigger": "contact=5", "samples": 50, "channels": tuple(columns)}
@@ -286,15 +259,6 @@ def test_a_trigger_that_never_goes_on_is_said_after_the_time_that_was_given() ->
     said = pytest.raises(CellError, match="the trigger never went on: RegisterTrigger")
     with FakeController(speed=None) as fake, RtdeRecorder(fake.host, port=fake.port) as recorder, said:
         recorder.record(timeout=0.05)
-
-
-def test_whoever_asks_too_late_for_packages_is_told_how_many_were_given_up() -> None:
-    with FakeController(speed=None) as fake, RtdeStream(fake.host, ("timestamp",), port=fake.port) as stream:
-        stream._most = 10
-        while stream.position < 1000:
-            assert stream.after(10**9, 0.01)[0] == []
-        with pytest.raises(CellError, match="were given up"):
-            stream.after(0, WAIT)
 
 
 @pytest.mark.parametrize("name", ["FZ", "actual_TCP_force", "actual_TCP_force[6]", "timestamp[0]", "actual_q[x]"])
@@ -400,14 +364,6 @@ def test_a_program_that_is_started_anew_carries_no_old_order_out(parts: Dataset)
         with pytest.raises(CellError, match="started anew"):
             cell.insert()
         timer.join()
-
-
-def test_a_program_that_does_not_run_is_said_when_the_cell_is_opened(parts: Dataset, short: dict) -> None:
-    with FakeController(RobotProgram(parts), speed=20.0) as fake:
-        fake.runtime = 1
-        with pytest.raises(CellError, match="its program does not run; start"):
-            UrCell(fake.host, port=fake.port, **short).open()
-        assert not any(thread.name.startswith("rtde") for thread in threading.enumerate())
 
 
 def reconnected(fake: FakeController, stream: RtdeStream) -> float | None:

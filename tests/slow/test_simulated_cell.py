@@ -63,23 +63,10 @@ def test_a_weak_grip_slips_at_its_own_force() -> None:
     assert np.median(pushed.wrench[400:500, 2]) == pytest.approx(12.0, abs=3.0)
 
 
-def test_a_missed_grasp_meets_nothing() -> None:
-    pushed = push(good(fault="missed_grasp"))
-    assert np.abs(pushed.wrench[:, 2]).max() < 2
-    assert pushed.height_mm < -10
-
-
 def test_a_trace_depends_on_seed_and_cycle_only() -> None:
     few, many = simulate(3, seed=9, n_jobs=1), simulate(6, seed=9, n_jobs=2)
     np.testing.assert_array_equal(few.X, many.X[:3])
     assert not np.array_equal(few.X, simulate(3, seed=10, n_jobs=1).X)
-
-
-def test_the_cell_replays_what_simulate_makes() -> None:
-    cell, traces = SimulatedCell(seed=2), simulate(3, seed=2, n_jobs=1)
-    for trace, label in zip(traces.X, traces.y, strict=True):
-        np.testing.assert_array_equal(cell.insert(), trace)
-        assert cell.verify() == bool(label)
 
 
 def test_the_cell_still_makes_the_bundled_traces() -> None:
@@ -110,13 +97,6 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
     report = cell.report()
     assert (report.cycles, report.finished, report.verifications, report.stops) == (2, 0, 1, 1)
     assert report.seconds_saved == 5 - 120
-
-
-def test_a_silent_failure_is_an_escape() -> None:
-    cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=1.0))
-    cell.insert()
-    assert cell.proceed() is Outcome.UNKNOWN
-    assert cell.report().escapes == 1
 
 
 @pytest.mark.parametrize(("confirm_share", "outcome"), [(0.0, Outcome.UNKNOWN), (1.0, Outcome.CONFIRMED)])

@@ -174,14 +174,6 @@ def test_times_that_turn_back_are_a_fault_unless_a_rate_is_stated(bag: Bag, tmp_
     assert len(load_dataset(path, rate_hz=500.0, **ASKED)) == 8
 
 
-def test_without_stamps_the_log_tells_the_times(bag: Bag, tmp_path: Path) -> None:
-    bag.stamped = False
-    bag.lost = {bag.starts[0] + 9}
-    data = load_dataset(bag.write(tmp_path / "cell.mcap"), **ASKED)
-    np.testing.assert_array_equal(data.X, bag.traces[1:, 2].astype(np.float32))
-    assert len(data.faults) == 1
-
-
 def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path) -> None:
     path, table = bag.write(tmp_path / "cell.mcap"), tmp_path / "labels.csv"
     rows = [f"{i},{'OK' if good else 'NOK'},P{i // 2}" for i, good in enumerate(bag.good, start=1)]

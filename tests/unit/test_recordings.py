@@ -119,14 +119,6 @@ def test_several_channels_are_picked_by_name_in_any_order(make_data: Callable[..
     np.testing.assert_array_equal(load_dataset(table, channel="FZ_Base,FX_Base").X, both.X)
 
 
-def test_without_a_force_and_without_a_choice_the_columns_are_listed(small: Dataset, tmp_path: Path) -> None:
-    write_csv(tmp_path / "a_True.csv", np.ones((2, 30)), ("left", "right"))
-    with pytest.raises(DataError, match=r"Expected the channel to be named.*are left, right"):
-        load_dataset(tmp_path)
-    write_csv(tmp_path / "one" / "a_True.csv", np.arange(30.0), ("left",))
-    assert load_dataset(tmp_path / "one").channels == ("left",)
-
-
 # -------------------------------------------------------------------------------------------------------- the folder
 
 
@@ -382,19 +374,6 @@ def test_a_tables_label_and_part_columns_can_be_named(small: Dataset) -> None:
         load_dataset(pd.DataFrame({"FZ": [1.0], "label": [1]}))
 
 
-def test_options_that_say_nothing_to_a_source_are_refused(small: Dataset, tmp_path: Path) -> None:
-    for source in (small, (small.X, small.y), FORMS["npz"](small, tmp_path), "insertion"):
-        with pytest.raises(DataError, match="Expected no label for"):
-            load_dataset(source, label="_(OK)_")
-    for options, words in (
-        ({"fit": "stretch"}, "Expected fit"),
-        ({"rate_hz": 0.0}, "rate above 0"),
-        ({"samples": 0}, "1 or more"),
-    ):
-        with pytest.raises(DataError, match=words):
-            load_dataset(small, **options)
-
-
 def test_transposed_arrays_are_refused() -> None:
     with pytest.raises(DataError, match=r"looks transposed; pass X\.transpose"):
         load_dataset((np.zeros((5, 100, 2)), [1] * 5))
@@ -457,24 +436,6 @@ def test_a_labels_file_names_recordings_as_people_write_paths(small: Dataset, tm
     bare = [f"{file},{word}" for file, word in zip(files, ("ok", "nok") * 3, strict=True)]
     (tmp_path / "bare.csv").write_text("\n".join(bare) + "\n")
     assert load_dataset(tmp_path / "cell", labels=tmp_path / "bare.csv").y.tolist() == [1, 0] * 3
-
-
-def test_a_row_of_a_labels_file_is_not_used_for_two_recordings(small: Dataset, tmp_path: Path) -> None:
-    for name in ("a/1.csv", "b/1.csv", "a/2.csv", "a/3.csv", "c/4.csv", "4.csv"):
-        write_csv(tmp_path / "cell" / name, small.X[0])
-    rows = ["1.csv,OK", "2.csv,NOK", "3.csv,OK", "c/4.csv,NOK", "4.csv,OK"]
-    (tmp_path / "labels.csv").write_text("\n".join(["file,label", *rows]) + "\n")
-    data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
-    assert dict(zip(data.source.tolist(), data.y.tolist(), strict=True)) == {
-        "4.csv": 1,
-        "a/2.csv": 0,
-        "a/3.csv": 1,
-        "c/4.csv": 0,
-    }
-    assert [(f.source, f.what) for f in data.faults] == [
-        ("a/1.csv", "Expected its folder in labels.csv, line 2, which names b/1.csv too"),
-        ("b/1.csv", "Expected its folder in labels.csv, line 2, which names a/1.csv too"),
-    ]
 
 
 def test_what_a_labels_file_does_not_have_is_said(few: Path, tmp_path: Path) -> None:
@@ -579,12 +540,6 @@ def test_labels_of_an_array_may_be_words(small: Dataset, tmp_path: Path) -> None
         load_dataset((small.X[:2], [1, None]))
 
 
-@pytest.mark.parametrize("X", [np.zeros((3, 9), dtype=complex), np.zeros((3, 9)).astype(str), (x for x in range(3))])
-def test_what_holds_no_real_numbers_is_refused(X: Any) -> None:
-    with pytest.raises(DataError, match="Expected X of real numbers"):
-        load_dataset((X, [1, 0, 1]))
-
-
 def test_frames_tell_their_rate_and_give_the_force(small: Dataset) -> None:
     steps = np.arange(50)
     frames = [pd.DataFrame({"Timestamp": 7 + steps / 125, "FX_Base": 0.0 * x, "FZ_Base": x}) for x in small.X[:5]]
@@ -609,19 +564,6 @@ def test_an_archive_that_claims_more_than_there_is_memory_is_a_data_error(small:
     for name in ("claim.npz", "claim.h5"):
         with pytest.raises(DataError, match=r"has another size|at most .* GB of arrays"):
             load_dataset(tmp_path / name)
-
-
-def test_an_archives_facts_are_checked(small: Dataset, tmp_path: Path) -> None:
-    for number, (about, words) in enumerate(
-        (
-            ({"rate_hz": 0.0}, "rate above 0"),
-            ({"rate_hz": [1.0, 2.0]}, "Cannot read"),
-            ({"channels": ["a", "b"]}, "a name for each of 1 channels"),
-        )
-    ):
-        np.savez(tmp_path / f"{number}.npz", X=small.X, y=small.y, **about)
-        with pytest.raises(DataError, match=words):
-            load_dataset(tmp_path / f"{number}.npz")
 
 
 def test_a_file_of_another_kind_lists_those_that_are_read(tmp_path: Path) -> None:

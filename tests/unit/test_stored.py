@@ -35,11 +35,6 @@ def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_reco
     assert np.array_equal(*lower)
 
 
-def test_a_store_that_an_engine_owns_can_be_read_beside_it(store: Path) -> None:
-    with DataEngine.open(store):
-        assert len(load_dataset(str(store), samples=30).cut(20)) == 120
-
-
 def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not(stream: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "cell.db"
     with DataEngine(recipe=RECIPE, store=path) as engine:
@@ -62,14 +57,6 @@ def test_a_part_that_came_twice_is_one_part_there_too(stream: Dataset, tmp_path:
     part = load_dataset(path).part
     assert part is not None
     assert (part[0] == part[2], part[0] == part[1]) == (True, False)
-
-
-def test_several_channels_stay_several(make_data, tmp_path: Path) -> None:
-    three = make_data(5, samples=40, channels=3)
-    with DataEngine(recipe=RECIPE, store=tmp_path / "cell.db") as engine:
-        for x in three.X:
-            engine.report(engine.decide(x).id, success=True)
-    assert np.array_equal(load_dataset(tmp_path / "cell.db").X, three.X)
 
 
 def test_a_store_without_a_label_and_a_pattern_for_labels_are_refused(store: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from dengine import (
 )
 from dengine.decision.rule import script
 from dengine.records import FITS
-from dengine.traces import REASONS, TraceGate, as_trace, as_traces, fits, fitted, spec_of
+from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of
 
 LENGTHS, CHANNELS = (152, 800, 1000), (1, 2, 3, 6)
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
@@ -38,16 +38,6 @@ def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False)
 
 
 # --------------------------------------------------------------------------------------------- shapes and types
-
-
-@pytest.mark.parametrize("samples", LENGTHS)
-@pytest.mark.parametrize("channels", CHANNELS)
-def test_any_length_and_number_of_channels_becomes_channels_by_samples(samples: int, channels: int) -> None:
-    x = ramp(samples, channels)
-    spec = TraceSpec(samples=samples, channels=channels)
-    assert as_trace(x, None).shape == as_trace(x, spec).shape == (channels, samples)
-    assert spec_of(as_trace(x, None)) == spec
-    assert as_traces(np.stack([x, x, x]), spec).shape == (3, channels, samples)
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
@@ -245,14 +235,6 @@ def test_a_dataframe_has_samples_in_rows_and_channels_in_columns() -> None:
     assert spec_of(got, frame) == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
     np.testing.assert_array_equal(as_trace(frame, TraceSpec(60, channels=3)), got)
     np.testing.assert_array_equal(as_trace(frame["FZ"], None), got[2:])
-
-
-def test_named_columns_are_picked_whatever_their_order() -> None:
-    spec = TraceSpec(60, channels=2, columns=("FZ", "FX"))
-    expected = recording()[["FZ", "FX"]].to_numpy(dtype=np.float32).T
-    np.testing.assert_array_equal(as_trace(recording()[["FX", "FY", "Timestamp", "FZ"]], spec), expected)
-    with pytest.raises(TraceError, match="Expected the columns FZ, FX, got Timestamp, FX, FY"):
-        as_trace(recording().drop(columns="FZ"), spec)
 
 
 def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:

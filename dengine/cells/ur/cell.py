@@ -176,16 +176,14 @@ class UrCell:
             rows = self._rows(end, f"to answer order {self._number} ({verb.name.lower()})", answer is not None)
             if not rows:
                 break
-            n = self._record(rows) if verb is Verb.INSERT and self.last is None else len(rows)
+            n = len(rows)
+            if verb is Verb.INSERT and self.last is None:
+                self.last, n = self.recorder.cutter.feed(rows)
             answer = answer or next((found for row in rows[:n] if (found := self._answered(row, verb))), None)
             self.recorder.seen(n)
         self.recorder.stream.write(None)
         assert answer is not None  # `_rows` has raised
         return answer
-
-    def _record(self, rows: list[Row]) -> int:
-        self.last, n = self.recorder.cutter.feed(rows)
-        return n
 
     def _rows(self, end: float, what: str, spare: bool = False) -> list[Row]:
         """The next packages; none, where that is no fault, or else CellError once `end` is past."""

@@ -337,10 +337,8 @@ class FakeController:
 
     def _on_inputs(self, connection: Connection, payload: bytes) -> bytes:
         names = named(payload)
-        others = {
-            name for each in self._connections if each is not connection for r in each.inputs.values() for name in r.names
-        }
-        types = [IN_USE if name in self.held | others else type_of(name) for name in names]
+        taken = self.held.union(*(each.writes for each in self._connections if each is not connection))
+        types = [IN_USE if name in taken else type_of(name) for name in names]
         number = 0 if {IN_USE, NOT_FOUND} & set(types) else len(connection.inputs) + 1
         if number:
             connection.inputs[number] = Recipe(number, tuple(names), tuple(types))
