@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import zlib
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -94,8 +95,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("examples")
     succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "conv", "--retrains", 1)
     traces = load_dataset("insertion")
-    rows = np.column_stack([traces.y, traces.X])[:2]
-    np.savetxt(folder / "cell.csv", rows, delimiter=",", fmt="%g")
+    lines = [
+        f"part,p{i},{traces.y[i]},,verify,verify,uncertain,0.5,0.9,4,1,{','.join(f'{x:.9g}' for x in traces.X[i] + 1)}"
+        for i in range(2)
+    ]
+    checked = [f"{line},{zlib.crc32(line.encode()):08x}" for line in lines]
+    (folder / "cell.csv").write_text("\n".join(["# dengine 3 0123", *checked, ""]))
     return folder
 
 
