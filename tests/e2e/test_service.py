@@ -128,27 +128,6 @@ def held(service: CellService) -> Iterator[None]:
         free.set()
 
 
-@pytest.mark.parametrize("where", ["file", "memory"])
-def test_of_two_threads_that_decide_on_one_id_the_first_counts(
-    where: str, tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with DataEngine.open_or_create(tmp_path / "cell.db" if where == "file" else None, recipe=RECIPE) as engine:
-        engine.decide(stream.X[0])
-        decide, late = engine._maker.decide, []
-
-        def and_late(*words):
-            item = decide(*words)  # what the engine's thread thinks of it, while somebody's patience ends
-            late.append(engine.decide_late(stream.X[1], decision_id="order-1"))
-            return item
-
-        monkeypatch.setattr(engine._maker, "decide", and_late)
-        decided = engine.decide(stream.X[1], decision_id="order-1", late=where == "memory")
-        assert decided.reason is Reason.LATE
-        assert [decided] == late
-        assert engine.find("order-1").reason is Reason.LATE
-        engine.report("order-1", True)
-
-
 def test_a_full_line_takes_no_more_and_records_nothing_of_it(stream: Dataset) -> None:
     service, free = CellService(lambda: DataEngine(recipe=RECIPE), deadline=30.0, most=2), threading.Event()
 

@@ -4,6 +4,7 @@ import asyncio
 import socket
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -67,15 +68,6 @@ class Plant:
     async def decide(self, trace: np.ndarray, request: str = "", part: str = "", channels: int = 1) -> list[Any]:
         arguments = (trace.ravel().tolist(), FLOAT), (channels, COUNT), (request, TEXT), (part, TEXT)
         return await self.call("Decide", *(ua.Variant(*each) for each in arguments))
-
-    async def learn(self, data: Dataset) -> None:
-        """Have a version answer, whichever test came before."""
-        for i in range(len(data)):
-            if self.service.engine.version:
-                return
-            action, id_, *_ = await self.decide(data.X[i], f"learn-{i}")
-            if action == VERIFY:
-                await self.report(id_, bool(data.y[i]))
 
     async def report(self, id_: str, success: bool) -> bool:
         return await self.call("Report", ua.Variant(id_, TEXT), ua.Variant(success))
@@ -249,20 +241,21 @@ def test_an_alarm_is_a_variable_and_an_event(plant: Plant, stream: Dataset, run,
         assert await plant.until("Shadow", bool)
         await plant.service.ask(lambda engine: engine.set_shadow(False, "the operator"))
         assert not await plant.until("Shadow", lambda on: not on)
-        await plant.learn(stream)
-        monkeypatch.setattr(plant.service.engine._versions.answering, "predict_one", None)
-        await plant.decide(-stream.X[0])
+        found = await plant.service.status()
+        monkeypatch.setattr(plant.service, "status", lambda: asyncio.sleep(0, replace(found, store_fault="disk full")))
+        await plant.decide(stream.X[0])
         assert await plant.until("Alarm", bool)
         event = await asyncio.wait_for(heard.get(), 60)
         assert (event.Severity, event.SourceName) == (opcua.ALARM, "Cell")
-        assert event.Message.Text == await plant.value("AlarmText") == "The model failed on 1 of the newest decisions."
+        assert event.Message.Text == await plant.value("AlarmText") == "The store cannot be written: disk full"
 
     run(scada())
 
 
 def test_a_store_that_cannot_be_read_leaves_values_that_say_they_are_old(plant: Plant, run, monkeypatch) -> None:
     async def scada() -> None:
-        before = await plant.value("Decisions")
+        decided = await plant.decisions()
+        before = await plant.until("Decisions", lambda n: n == decided)
         monkeypatch.setattr(plant.service, "status", away)
         await status(ua.StatusCodes.UncertainLastUsableValue)
         assert await plant.value("Decisions") == before
