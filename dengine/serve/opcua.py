@@ -38,6 +38,7 @@ from .service import CellService
 
 log = logging.getLogger("dengine")
 MOST, CHUNK = 1 << 20, 65535  # bytes of a message, 250,000 samples; and of a message's part
+CONNECTIONS, SUBSCRIPTIONS = 50, 100
 USER = "dengine"
 
 
@@ -132,6 +133,7 @@ async def opcua_server(
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it writes tracebacks of whatever strangers send
     server = Server(user_manager=Users(token, secure))
     server.limits.max_message_size, server.limits.max_chunk_count = MOST, MOST // CHUNK + 1
+    server.iserver.max_connections, server.iserver.max_subscriptions = CONNECTIONS, SUBSCRIPTIONS
     server.set_identity_tokens([ua.AnonymousIdentityToken if token is None else ua.UserNameIdentityToken])
     await server.init()
     server.allow_remote_admin(False)

@@ -244,7 +244,8 @@ def map_chart(found: PartMap, chosen: str, root: str) -> Markup:
     """The picture; every mark is a link to its part, and one of them is reached by the tab key."""
     xs, ys = np.array([mark.x for mark in found.marks]), np.array([mark.y for mark in found.marks])
     low, high = (0.0, 1.0) if found.probability else (float(xs.min()), float(xs.max()))
-    x, y = MAP.x(low, high, 18), MAP.y(*np.quantile(ys, (0.005, 0.995)).tolist(), 18)
+    bottom, top = np.quantile(ys, (0.005, 0.995)).tolist()
+    x, y = MAP.x(low, high, 18), MAP.y(bottom, top, 18)
     spoken = next((mark for mark in found.marks if mark.id == chosen), found.marks[-1])
     links = [_link(mark, x, y, mark is spoken, mark.id == chosen, root) for mark in found.marks]
     good, bad = (sum(mark.label == label and not mark.action for mark in found.marks) for label in ("good", "bad"))
