@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..decision.rule import script
 from ..errors import TraceConflictError, TraceError, shortened
 from ..folds import audited, own_hash
-from ..model.base import NOTHING_KNOWN, EngineModel, Prediction, checked
+from ..model.base import NOTHING_KNOWN, EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import DecidedTrace, StoredDecision
 from ..traces import TraceGate, as_agreed, first_contract
@@ -108,10 +108,21 @@ def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> P
     if model is None:
         return NOTHING_KNOWN
     try:
-        return checked(model.predict_one(x, hash_))
+        return _checked(model.predict_one(x, hash_))
     except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
         log.exception("the model failed on a trace; the part is verified")
         return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
+
+
+def _checked(prediction: Prediction) -> Prediction:
+    """A prediction as every store can keep it; ValueError for counts or bounds that are none."""
+    for name in ("n_success", "n_failure"):
+        count = getattr(prediction, name)
+        if not isinstance(count, int) or not 0 <= count < 2**63:
+            raise ValueError(f"Expected {name} as a whole number from 0 to below 2**63, got {shortened(count)}.")
+    if not 0.0 <= prediction.lower <= prediction.upper <= 1.0:  # a NaN is refused too
+        raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {prediction.lower} and {prediction.upper}.")
+    return prediction
 
 
 def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:

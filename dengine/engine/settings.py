@@ -94,8 +94,7 @@ class EngineSettings:
         made_with = known.get("described")
         if "model" in known and model is None:
             raise SettingError(f"The engine of {name} drove a {known['model']}; hand it in again: open(url, model=...).")
-        unnamed = str(known.get("dengine")).startswith("0.1.")  # that version did not say whose model it drove
-        if "model" not in known and model is not None and not unnamed:
+        if "model" not in known and model is not None:
             raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
         if model is not None or recipe.name.startswith(OBJECT):
             if model is None and (reducer is None or isinstance(reducer, str)):

@@ -56,6 +56,8 @@ class Candidate:
         if (model := self.model) is None:
             return True
         missing = [seq for seq in window.newer(int(self.seq[-1])).tolist() if seq not in self._seen]
+        if not missing:
+            return True
         begin = self._clock()
         while missing and self._clock() - begin < seconds:
             trace, label, hash_ = window.row(seq := missing.pop(0))

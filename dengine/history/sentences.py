@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -158,78 +158,39 @@ def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -
     did = DID[past.action].capitalize()
     if _was_lost(past):
         return f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
-    return f"{did}{WHY[past.reason](past, trace, found)}"
+    said = {
+        "would": DID[past.predicted],
+        "coin": found.coin,
+        "rate": past.propensity,
+        "n": int((~np.isfinite(trace)).sum()),
+        "size": trace.size,
+        "first": float(trace.flat[0]),
+        "unit": found.spec.unit,
+        "saturation": _saturation(trace, found.spec),
+        "score": "" if found.novelty is None else f": {_scores(found.novelty)}",
+        "mode": found.safe_mode or "its reason is not kept",
+    }
+    return did + WHY[past.reason].format(**said)
 
 
-Why = Callable[[PastDecision, NDArray[np.float32], Circumstances], str]
-
-
-def _certain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": the bound meets the policy."
-
-
-def _uncertain(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": the bound does not meet the policy."
-
-
-def _no_model(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": no model had been trained yet, so every part was."
-
-
-def _audit(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return (
-        f" as an audit: the model alone would have {DID[past.predicted]} it. The audits' coin fell on {found.coin:.4f}, "
-        f"below the audit rate {past.propensity:g}; it is a function of the trace and the seed."
-    )
-
-
-def _not_finite(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    n = int((~np.isfinite(trace)).sum())
-    return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
-
-
-def _constant(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return f": every sample is {float(trace.flat[0]):g} {found.spec.unit}: a dead sensor."
-
-
-def _saturated(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return f": {_saturation(trace, found.spec)}"
-
-
-def _model_error(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": the model raised an error, which the log of that time tells."
-
-
-def _novel(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    score = "" if found.novelty is None else f": {_scores(found.novelty)}"
-    return f": unlike all that was learned from{score}. What its neighbours say does not count then."
-
-
-def _safe(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
-
-
-def _no_store(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
-
-
-def _late(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    return ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."
-
-
-WHY: dict[Reason, Why] = {
-    Reason.CERTAIN: _certain,
-    Reason.UNCERTAIN: _uncertain,
-    Reason.NO_MODEL: _no_model,
-    Reason.AUDIT: _audit,
-    Reason.NOT_FINITE: _not_finite,
-    Reason.CONSTANT: _constant,
-    Reason.SATURATED: _saturated,
-    Reason.MODEL_ERROR: _model_error,
-    Reason.NOVEL: _novel,
-    Reason.SAFE_MODE: _safe,
-    Reason.NO_STORE: _no_store,
-    Reason.LATE: _late,
+WHY = {
+    Reason.CERTAIN: ": the bound meets the policy.",
+    Reason.UNCERTAIN: ": the bound does not meet the policy.",
+    Reason.NO_MODEL: ": no model had been trained yet, so every part was.",
+    Reason.AUDIT: (
+        " as an audit: the model alone would have {would} it. The audits' coin fell on {coin:.4f}, below the audit rate "
+        "{rate:g}; it is a function of the trace and the seed."
+    ),
+    Reason.NOT_FINITE: ": {n} of {size} samples are NaN or infinite; a trace that was cut or padded too far is.",
+    Reason.CONSTANT: ": every sample is {first:g} {unit}: a dead sensor.",
+    Reason.SATURATED: ": {saturation}",
+    Reason.MODEL_ERROR: ": the model raised an error, which the log of that time tells.",
+    Reason.NOVEL: ": unlike all that was learned from{score}. What its neighbours say does not count then.",
+    Reason.SAFE_MODE: " in safe mode, in which every part is: {mode}.",
+    Reason.NO_STORE: (
+        ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
+    ),
+    Reason.LATE: ": whoever asked could wait no longer for the answer, and verified, so the model was not asked.",
 }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..decision.policy import Policy
-from ..errors import ExportError, shortened
+from ..errors import ExportError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
@@ -40,17 +40,6 @@ class Prediction:
 
 
 NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, Reason.NO_MODEL)
-
-
-def checked(prediction: Prediction) -> Prediction:
-    """A prediction as every store can keep it; ValueError for counts or bounds that are none."""
-    for name in ("n_success", "n_failure"):
-        count = getattr(prediction, name)
-        if not isinstance(count, int) or not 0 <= count < 2**63:
-            raise ValueError(f"Expected {name} as a whole number from 0 to below 2**63, got {shortened(count)}.")
-    if not 0.0 <= prediction.lower <= prediction.upper <= 1.0:  # a NaN is refused too
-        raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {prediction.lower} and {prediction.upper}.")
-    return prediction
 
 
 @dataclass(frozen=True, slots=True)

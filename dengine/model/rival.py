@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import SettingError, shortened
 from ..records import Action, Reason
 from ..reducers.base import Floats, Ints, StopRule
-from .base import Embedding, EngineModel, Model, Prediction, checked
+from .base import Embedding, EngineModel, Model, Prediction
 
 
 def as_engine_model(model: Model) -> EngineModel:
@@ -67,7 +67,7 @@ class RivalAdapter(EngineModel):
         action = Action(self.model.decide(X)[0])
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
         counts = _whole(n_success), _whole(n_failure)
-        return checked(Prediction(action, float(lower), float(upper), *counts, None, reason))
+        return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
         """The trace itself: a rival keeps what it likes of it."""

@@ -61,16 +61,17 @@ def evidence(d: Decision) -> tuple:
 
 def asked(engine: DataEngine, data: Dataset) -> list:
     """What the model says of every trace, without a trace of the asking."""
-    return [] if engine.version == 0 else engine._versions.answering.predict_many(data.X)
+    return [] if engine.version == 0 else engine.model.predict_many(data.X)
 
 
 def state(engine: DataEngine) -> tuple:
     """All that decides what an engine does next."""
-    window = engine._versions.retrainer.window.snapshot()
-    rule = {name: t.tolist() for name, t in engine._versions.newest.rule.state_dict().items()}
+    held = engine.store.labelled(engine.recipe.window)
+    rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
+    numbers = engine.model and sorted(engine.model.index.numbers.tolist())
     return (
         (engine.version, engine.new_labels, engine.safe_mode, engine.policy, engine.certificate(), rule),
-        (window.seq.tolist(), window.labels.tolist(), engine._feedback._silent + len(engine._feedback._went_on)),
+        (held.seq.tolist(), held.labels.tolist(), numbers),
     )
 
 
@@ -276,7 +277,7 @@ def test_a_part_that_came_twice_is_corrected_where_it_was_meant(data: Dataset) -
 def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_others(tmp_path: Path, data: Dataset) -> None:
     engine = make(replace(RECIPE, window=60), store=tmp_path / "engine.db")
     play(engine, data, slice(0, 130))
-    oldest = int(engine._versions.retrainer.window.snapshot().seq[0])
+    oldest = int(engine.store.labelled(60).seq[0])
     engine.forget(labelled(engine, oldest + 10), labelled(engine, oldest + 20))
     play(engine, data, slice(130, 139))
     with again(engine, tmp_path) as reopened:

@@ -22,7 +22,6 @@ from dengine import (
     Policy,
     Recipe,
     ReplayCell,
-    SqlStore,
     TraceSpec,
     WilsonRadiusClassifier,
     make_reducer,
@@ -370,12 +369,3 @@ def test_a_seed_makes_the_reducer(data: Dataset) -> None:
     assert make_reducer("conv", random_state=3).random_state == 3
     model = ModelPrediction.from_recipe(RECIPES["conv"], seed=3)
     assert (model.reducer.random_state, model.reducer.folds) == (3, RECIPES["conv"].folds)
-
-
-def test_a_store_of_the_first_version_that_did_not_say_whose_model_it_drove_is_opened_with_it(data, tmp_path: Path) -> None:
-    made_with(data, tmp_path / "engine.db", model=Constant())
-    with SqlStore(str(tmp_path / "engine.db")) as store:
-        known = {name: text for name, text in store.settings().items() if name not in ("model", "described")}
-        store.save_settings(known | {"dengine": "0.1.0"})
-    with DataEngine.open(tmp_path / "engine.db", model=Constant()) as engine:
-        assert engine.version == 1
