@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
 from importlib import import_module
 from numbers import Integral, Real
@@ -281,9 +281,12 @@ def as_id(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None, no passwords."""
+    """A value that `json` takes: records as objects, paths and enums as text, NaN and infinities as None, no passwords.
+
+    A field whose metadata say "flat" gives its own fields, one that says "apart" none.
+    """
     if is_dataclass(value) and not isinstance(value, type):
-        return plain(asdict(value))
+        return dict(_fields(value))
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -292,11 +295,17 @@ def plain(value: Any) -> Any:
         return without_password(value)
     if isinstance(value, bool | int) or value is None:
         return value
-    if hasattr(value, "item"):  # a NumPy scalar
-        return plain(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if hasattr(value, "tolist"):  # of NumPy
+        return plain(value.tolist())
     return without_password(str(value))
+
+
+def _fields(record: Any) -> Iterator[tuple[str, Any]]:
+    for each in fields(record):
+        said = plain(getattr(record, each.name)) if "apart" not in each.metadata else {}
+        yield from said.items() if {"flat", "apart"} & each.metadata.keys() else [(each.name, said)]
 
 
 def find_class(where: str) -> type:

@@ -6,7 +6,6 @@ import math
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import percent
+from ..records import plain
 from .options import Known, Naming, cell_options, example, force_option, json_option, out_file_option
 from .output import duration, facts, show, when, write_json
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ..history.envelope import Envelope, Excess
     from ..history.explain import Explanation, Neighbour
     from ..history.status import Happened
-    from ..store.records import Event
-    from ..store.views import PastDecision, PastRetrain
+    from ..store.records import Event, StoredDecision
+    from ..store.views import PastRetrain
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 COLUMNS = ("time (UTC)", "decision", "part", "action", "model", "bound", "good", "bad", "reason", "v", "label")
@@ -88,7 +88,7 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
         opened.close()
     if as_json:
         listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
-        decisions = [asdict(past) | {"label": past.label} for past in found]
+        decisions = [plain(past) | {"label": past.label} for past in found]
         write_json({"verb": "history", "store": store, "decisions": decisions} | listed)
         return
     happened: Iterator[Happened] = iter(found) if others is None else interleaved(found, others)
@@ -98,11 +98,11 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
 
 def lines(happened: Sequence[Happened]) -> list[str]:
     """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
-    from ..store.views import PastDecision
+    from ..store.records import StoredDecision
 
     if not happened:
         return ["No decision of that kind."]
-    rows = [_cells(each) for each in happened if isinstance(each, PastDecision)]
+    rows = [_cells(each) for each in happened if isinstance(each, StoredDecision)]
     widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
     # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
     too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
@@ -111,7 +111,7 @@ def lines(happened: Sequence[Happened]) -> list[str]:
         row[PART] = row[PART] if len(row[PART]) <= widths[PART] else "~" + row[PART][1 - widths[PART] :]
     waiting = iter(rows)
     body = [
-        _line(next(waiting), widths) if isinstance(each, PastDecision) else _told(each)[: WIDEST - 1] for each in happened
+        _line(next(waiting), widths) if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1] for each in happened
     ]
     return [_line(COLUMNS, widths), "  ".join("-" * width for width in widths), *body]
 
@@ -121,19 +121,19 @@ def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
     return "  ".join(text.rjust(n) if name in RIGHT else text.ljust(n) for name, text, n in pairs).rstrip()
 
 
-def _cells(past: PastDecision) -> list[str]:
+def _cells(past: StoredDecision) -> list[str]:
     source = "" if past.source is None else f" {TOLD.get(past.source.value, past.source.value)}"
     return [
         when(past.time, SHORT),
-        past.id,
-        past.part or "-",
-        past.action.value,
-        "" if past.predicted is past.action else past.predicted.value,
-        "-" if math.isnan(past.lower) else f"{past.lower:.2f}-{past.upper:.2f}",
-        str(past.n_success),
-        str(past.n_failure),
-        past.reason.value,
-        str(past.model_version),
+        past.decision.id,
+        past.decision.part or "-",
+        past.decision.action.value,
+        "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
+        "-" if math.isnan(past.decision.lower) else f"{past.decision.lower:.2f}-{past.decision.upper:.2f}",
+        str(past.decision.n_success),
+        str(past.decision.n_failure),
+        past.decision.reason.value,
+        str(past.decision.model_version),
         "-" if past.success is None else f"{past.label}{source}",
     ]
 
@@ -179,7 +179,7 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, force:
             newest = next(history(opened, last=1), None)
             if newest is None:
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
-            decision = newest.id
+            decision = newest.decision.id
         found = explain_stored(opened, decision, neighbours)
     finally:
         opened.close()
@@ -199,7 +199,7 @@ def _drawn(found: Explanation, out: Path, force: bool) -> Path:
 
 def _tables(found: Explanation) -> Iterator[Any]:
     past = found.decision
-    yield facts(f"{past.id}: {past.action.value}, {past.reason.value}", _rows(found))
+    yield facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))
     if found.neighbours:
         title = f"Nearest references of version {found.neighbours_version}; the ball's radius is {found.radius:.3g}"
         yield facts(title, map(_neighbour, found.neighbours), ("decision", "part", "label", "distance", "fold", "ball"))
@@ -207,9 +207,13 @@ def _tables(found: Explanation) -> Iterator[Any]:
 
 def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
     past = found.decision
-    yield "decided", f"{when(past.time)}, by " + (f"version {past.model_version}" if past.model_version else "no model")
-    if past.part is not None:
-        yield "part", past.part
+    yield (
+        "decided",
+        f"{when(past.time)}, by "
+        + (f"version {past.decision.model_version}" if past.decision.model_version else "no model"),
+    )
+    if past.decision.part is not None:
+        yield "part", past.decision.part
     for i, sentence in enumerate(found.said):
         yield "" if i else "why", sentence
     for i, note in enumerate(found.notes):

@@ -175,12 +175,11 @@ def _import_chunk(
     good = [i for i in new if not faults[i]]
     if good:
         decisions = [_verified(ids[i], Reason.NO_MODEL, parts[i]) for i in good]
-        numbers = [parts[i] for i in good]
-        store.put_labelled(decisions, traces[good], own[good], labels[good], Source.VERIFICATION, numbers)
+        store.put_labelled(decisions, traces[good], own[good], labels[good], Source.VERIFICATION)
     bad = [i for i in new if faults[i]]
     for i in bad:  # kept, but never given to training
         decision = _verified(ids[i], REASONS[faults[i]], parts[i])
-        store.put_decision(decision, traces[i], int(own[i]), quarantined=True, part=parts[i])
+        store.put_decision(decision, traces[i], int(own[i]), quarantined=True)
         store.put_label(ids[i], bool(labels[i]), Source.VERIFICATION, 0, None)
     if on_traces is not None:
         on_traces(len(ids))

@@ -65,10 +65,12 @@ class Corrections:
         label = as_success(success)
         (known,) = self._to_correct([decision_id])
         if known.success is label:
-            return self._unchanged("correct", f"Decision {known.id} counts as a {SAID[label]} already; nothing changed.")
-        text = f"decision {known.id} counts as a {SAID[label]}, was {_was(known)}"
-        data = {"decisions": {known.id: {"was": known.success, "now": label}}}
-        return self._correct(Change("correct", text, data, author, (known.id,), label))
+            return self._unchanged(
+                "correct", f"Decision {known.decision.id} counts as a {SAID[label]} already; nothing changed."
+            )
+        text = f"decision {known.decision.id} counts as a {SAID[label]}, was {_was(known)}"
+        data = {"decisions": {known.decision.id: {"was": known.success, "now": label}}}
+        return self._correct(Change("correct", text, data, author, (known.decision.id,), label))
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on; `correct` brings one back.
@@ -82,11 +84,13 @@ class Corrections:
         if not decision_ids:
             raise ReportError("Expected the ids of decisions to forget, got none; name at least one.")
         known = self._to_correct(list(dict.fromkeys(decision_ids)))
-        ids = [each.id for each in known if each.success is not None]
+        ids = [each.decision.id for each in known if each.success is not None]
         if not ids:
-            return self._unchanged("forget", f"{_listed([each.id for each in known])} forgotten already; nothing changed.")
+            return self._unchanged(
+                "forget", f"{_listed([each.decision.id for each in known])} forgotten already; nothing changed."
+            )
         text = f"{_listed(ids)} forgotten" + (f": {reason}" if reason else "")
-        was = {each.id: {"was": each.success, "now": None} for each in known if each.success is not None}
+        was = {each.decision.id: {"was": each.success, "now": None} for each in known if each.success is not None}
         return self._correct(Change("forget", text, {"decisions": was, "reason": reason}, author, tuple(ids), None))
 
     def rollback(self, version: int, author: str = "") -> Changed:

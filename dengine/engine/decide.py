@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import uuid
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from ..errors import TraceConflictError, TraceError, shortened
 from ..folds import audited, own_hash
 from ..model.base import NOTHING_KNOWN, EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
-from ..store.records import DecidedTrace, StoredDecision
+from ..store.records import StoredDecision
 from ..traces import TraceGate, as_agreed, first_contract
 from .settings import SettingsInForce
 
@@ -53,7 +53,7 @@ class DecisionMaker:
         version: int,
         unasked: Reason | None = None,
         decision_id: str | None = None,
-    ) -> DecidedTrace:
+    ) -> StoredDecision:
         """(C, T) of a part with this number -> what goes into the store.
 
         unasked : why the part is verified whatever the model says; None: it is asked.
@@ -64,24 +64,24 @@ class DecisionMaker:
         prediction = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
         decision = self._record(prediction, part, content, version)
         named = decision if decision_id is None else replace(decision, id=decision_id)
-        return DecidedTrace(named, x, hash_, bool(fault), 0.0, part)
+        return StoredDecision(named, x, hash_, bool(fault))
 
     def unasked(
         self, x: NDArray[np.float32], part: str | None, version: int, reason: Reason, decision_id: str
-    ) -> DecidedTrace:
+    ) -> StoredDecision:
         """(C, T) that is verified whatever the model says, for this reason or for what is wrong with it; in any thread."""
         fault, content = self._gate(torch.from_numpy(x))
         decision = unasked(decision_id, part, version, REASONS[fault] if fault else reason)
-        return DecidedTrace(decision, x, own_hash(content, part), bool(fault), 0.0, part)
+        return StoredDecision(decision, x, own_hash(content, part), bool(fault))
 
-    def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> DecidedTrace:
+    def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> StoredDecision:
         """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
         fault, content = self._gate(torch.from_numpy(x))
         accept = replace(NOTHING_KNOWN, action=Action.ACCEPT, reason=Reason.CERTAIN)
         decision = self._record(accept, part, content, version)
         # The part went on unchecked, whatever the audits' coin says.
         went_on = replace(decision, id=decision_id, action=Action.ACCEPT, reason=Reason.CERTAIN, audit=False)
-        return DecidedTrace(went_on, x, own_hash(content, part), bool(fault), 0.0, part)
+        return StoredDecision(went_on, x, own_hash(content, part), bool(fault))
 
     def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
         certain, rate = predicted.action is not Action.VERIFY, self._settings.now.recipe.policy.audited_share
@@ -130,14 +130,9 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
     x = as_agreed(trace, spec, False)
     if not np.array_equal(x, known.trace, equal_nan=True):
         raise TraceConflictError(
-            f"Expected the trace that decision {known.id!r} was made on, got another; give it an id of its own."
+            f"Expected the trace that decision {known.decision.id!r} was made on, got another; give it an id of its own."
         )
-    return as_decision(known)
-
-
-def as_decision(known: StoredDecision) -> Decision:
-    """The decision as it was answered."""
-    return Decision(**{field.name: getattr(known, field.name) for field in fields(Decision)})
+    return known.decision
 
 
 def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:

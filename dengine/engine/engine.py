@@ -47,11 +47,10 @@ from ..records import (
 )
 from ..store.base import Store, is_shared, opening
 from ..store.outbox import CLOSE, Keeper, OwnedStore
-from ..store.records import DecidedTrace, StoredDecision, stored_decision
-from ..store.views import PastDecision
+from ..store.records import StoredDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
-from .decide import DecisionMaker, as_decision, as_part, decided_before, unasked
+from .decide import DecisionMaker, as_part, decided_before, unasked
 from .feedback import Feedback, unknown_stop
 from .peers import Fleet, agreed, as_peers, peers_trace
 from .resume import resume
@@ -254,9 +253,9 @@ class DataEngine:
                 self._keeper.flush()
             elif id_ is not None:
                 self._keeper.secure()
-        return as_decision(known)
+        return known.decision
 
-    def _put(self, item: DecidedTrace) -> StoredDecision:
+    def _put(self, item: StoredDecision) -> StoredDecision:
         known = self._record(item)
         self._feedback.decided(known)
         return known
@@ -281,11 +280,10 @@ class DataEngine:
         self._keeper.secure()
         return decided_before(known, trace, self.trace)
 
-    def _record(self, item: DecidedTrace) -> StoredDecision:
+    def _record(self, item: StoredDecision) -> StoredDecision:
         """Record a decision; returns what its id has now: of two threads the first's."""
-        known = stored_decision(item)
-        first = self._keeper.recent.add(known)
-        if first is known:
+        first = self._keeper.recent.add(item)
+        if first is item:
             self._keeper.decided(item)
         return first
 
@@ -523,7 +521,7 @@ class DataEngine:
         since: float | None = None,
         until: float | None = None,
         predicted: Action | str | None = None,
-    ) -> Iterator[PastDecision]:
+    ) -> Iterator[StoredDecision]:
         """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
         return history(self.store, last, action, reason, label, since, until, predicted)
 

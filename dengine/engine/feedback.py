@@ -92,14 +92,14 @@ class Feedback:
 
     def decided(self, known: StoredDecision) -> None:
         """A part was decided on."""
-        if known.action is Action.ACCEPT:
-            self._went_on[known.id] = known
+        if known.decision.action is Action.ACCEPT:
+            self._went_on[known.decision.id] = known
 
     def report(self, known: StoredDecision, success: bool) -> None:
         """Take in a report; it is stored before anything else changes."""
-        source = source_of(known.id, known.action, known.audit, success)
-        late = [each for each in self._waiting if each[0].id == known.id]  # it was taken for confirmed
-        self._waiting = [each for each in self._waiting if each[0].id != known.id]
+        source = source_of(known.decision.id, known.decision.action, known.decision.audit, success)
+        late = [each for each in self._waiting if each[0].decision.id == known.decision.id]  # it was taken for confirmed
+        self._waiting = [each for each in self._waiting if each[0].decision.id != known.decision.id]
         try:
             self.store_waiting()
             label, point = self._label(known, success, source, int(self._was_silent(known)))
@@ -107,7 +107,7 @@ class Feedback:
         except Exception:
             self._waiting += late  # nothing was stored: it still waits as it did
             raise
-        self._went_on.pop(known.id, None)
+        self._went_on.pop(known.decision.id, None)
         if known.quarantined:
             return
         if late:
@@ -136,7 +136,7 @@ class Feedback:
         if seq:
             self.versions.keep(known, success, seq)
         else:
-            self._in_journal[known.id] = known, success
+            self._in_journal[known.decision.id] = known, success
 
     def store_waiting(self) -> None:
         """Commit the labels of confirmed parts, and give them to the next retrain."""
@@ -160,14 +160,14 @@ class Feedback:
 
     def _was_silent(self, known: StoredDecision) -> bool:
         """Whether an accepted part was counted among the silent ones before its label came."""
-        counted = known.action is Action.ACCEPT and known.id not in self._went_on and not self._stops_all
-        return counted and known.model_version >= self.settings.now.policy_since
+        counted = known.decision.action is Action.ACCEPT and known.decision.id not in self._went_on and not self._stops_all
+        return counted and known.decision.model_version >= self.settings.now.policy_since
 
     def _label(self, known: StoredDecision, success: bool, source: Source, less: int = 0) -> tuple[NewLabel, Point | None]:
         point = None if known.quarantined else self.versions.reference_point(known)
         stored = point if self.versions.newest.keeps_references else None
         silent = 0 if known.quarantined else self._silent - less
-        return NewLabel(known.id, success, source, self.versions.version, stored, silent), point
+        return NewLabel(known.decision.id, success, source, self.versions.version, stored, silent), point
 
     def _learn(self, known: StoredDecision, label: NewLabel, point: Point | None) -> None:
         self._silent = 0

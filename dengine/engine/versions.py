@@ -211,28 +211,28 @@ class ModelVersions:
         if self.answering is None:
             return None
         # What this very version embedded when it decided need not be embedded again.
-        embedding = known.embedding if known.model_version == self.version else None
+        embedding = known.decision.embedding if known.decision.model_version == self.version else None
         return self.answering.place_safely(known.trace, known.content_hash, embedding)
 
     def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
         """Take in what became of a part: tell the rule, and make the trace a reference."""
-        novel = known.reason is Reason.NOVEL
-        if known.model_version >= self.evidence.since:
-            self.newest.tell_safely(Told(known.lower, known.upper, success, novel, silent))
+        novel = known.decision.reason is Reason.NOVEL
+        if known.decision.model_version >= self.evidence.since:
+            self.newest.tell_safely(Told(known.decision.lower, known.decision.upper, success, novel, silent))
         if point is not None:
-            number = self._waiting[known.id] = next(self._provisional)
+            number = self._waiting[known.decision.id] = next(self._provisional)
             self.newest.add_safely(point, int(success), known.content_hash, number)
         self.new_labels += not self.count.shared  # a product's labels are counted in their order, when they are kept
 
     def unlearn(self, known: StoredDecision) -> None:
         """Take out the reference of a part whose label waits for the store: it was not what happened."""
-        if (number := self._waiting.pop(known.id, None)) is not None:
+        if (number := self._waiting.pop(known.decision.id, None)) is not None:
             self.newest.change_reference(number, known.content_hash, None)
         self.new_labels -= not self.count.shared
 
     def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
         """Give a label that is stored to the next retrain."""
-        if (number := self._waiting.pop(known.id, None)) is not None:
+        if (number := self._waiting.pop(known.decision.id, None)) is not None:
             self.newest.renumber_reference(number, seq)
         self.count.keep(known.trace, int(success), known.content_hash, seq)
 

@@ -54,10 +54,11 @@ def explained_picture(found: Explanation) -> Figure:
     below = bool(found.neighbours or found.bound)
     heights = [1.5 + 2.3 * len(channels), 2.6]
     figure = blank(10.0, heights[0] + (heights[1] if below else 0.0))
-    past = found.decision
-    version = f"version {past.model_version}" if past.model_version else "no model yet"
+    past, made = found.decision, found.decision.decision
+    version = f"version {made.model_version}" if made.model_version else "no model yet"
     figure.suptitle(
-        f"{past.id}: {past.action.value}, {past.reason.value} ({version}); label: {past.label}", fontweight="bold"
+        f"{made.id}: {made.action.value}, {made.reason.value} ({version}); label: {past.label}",
+        fontweight="bold",
     )
     rows = figure.subfigures(2 if below else 1, 1, squeeze=False, height_ratios=heights if below else None)[:, 0]
     _draw_channels(rows[0], found, channels)

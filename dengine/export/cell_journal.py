@@ -265,7 +265,7 @@ def _import_lines(
             held = store.get_decision(line.id)
             if held is None:
                 decision = _decided(line, fault, policy.audited_share)
-                store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault), line.part)
+                store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault))
             elif held.source is not None:  # a forgotten one has a label too
                 if line.label is not None:
                     counts["known" if line.label == held.success else "contradicted"] += 1

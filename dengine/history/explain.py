@@ -29,10 +29,10 @@ from ..errors import ReportError, StoreError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..model.base import EngineModel
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceSpec, trace_in
+from ..records import Action, Reason, Source, TraceSpec, plain, trace_in
 from ..store.base import Store
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision
-from ..store.views import PastDecision, PastLabel
+from ..store.views import PastLabel
 from .envelope import Envelope, envelope_of
 from .sentences import Bound, Circumstances, Novelty, bound_of, verdict
 from .status import safe_mode_event
@@ -63,7 +63,7 @@ class Answering:
         return [by_number.get(number) for number in self.index.numbers.tolist()]
 
 
-def as_it_stood(store: Store, version: int, recipe: Recipe, then: PastDecision | None) -> Answering | None:
+def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision | None) -> Answering | None:
     """A version as it stood when a decision was made, or as it stands now; None where the store does not keep it."""
     stored = store.kept_version(version)
     if stored is None or "points" not in stored.state:  # a rival keeps nothing
@@ -84,10 +84,10 @@ def as_it_stood(store: Store, version: int, recipe: Recipe, then: PastDecision |
     return Answering(version, index, known, _gate(stored), _rule(stored, later, recipe.policy), last)
 
 
-def _known_at(label: PastLabel, then: PastDecision, stops_all: bool) -> bool:
+def _known_at(label: PastLabel, then: StoredDecision, stops_all: bool) -> bool:
     """Whether an engine knew of a label when it made a decision: silence confirms a part before it is stored."""
     by_silence = stops_all and label.source is Source.CONFIRMED
-    return label.decided < then.time if by_silence else label.time <= then.time and label.decision_id != then.id
+    return label.decided < then.time if by_silence else label.time <= then.time and label.decision_id != then.decision.id
 
 
 def _index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
@@ -197,7 +197,7 @@ class Explanation:
     envelope : the band of the known successes; None while there are too few.
     """
 
-    decision: PastDecision
+    decision: StoredDecision
     trace: NDArray[np.float32]
     spec: TraceSpec
     said: tuple[str, ...]
@@ -211,13 +211,13 @@ class Explanation:
 
     def record(self) -> dict[str, Any]:
         """All but the arrays, as plain values for a machine."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("trace", "neighbours", "envelope")}
-        plain = {name: asdict(value) if hasattr(value, "__dataclass_fields__") else value for name, value in own.items()}
-        plain["neighbours"] = [_without(each, "trace") for each in self.neighbours]
+        own = [f.name for f in fields(self) if f.name not in ("trace", "neighbours", "envelope")]
+        said = {name: plain(getattr(self, name)) for name in own}
+        said["neighbours"] = [_without(each, "trace") for each in self.neighbours]
         band = self.envelope
         if band is not None:
-            plain["envelope"] = _without(band, "low", "median", "high") | {"largest": band.largest and asdict(band.largest)}
-        return {"envelope": None} | plain
+            said["envelope"] = _without(band, "low", "median", "high") | {"largest": band.largest and asdict(band.largest)}
+        return {"envelope": None} | said
 
 
 def _without(thing: Any, *names: str) -> dict[str, Any]:
@@ -249,7 +249,7 @@ def explain(decision_id: str, records: Records, neighbours: int = NEIGHBOURS) ->
     if past is None or stored is None:
         raise unknown(decision_id, store.cell_id)
     recipe, spec = Recipe.from_toml(known["recipe"]), trace_in(known) or _spec_of(stored)
-    answering = as_it_stood(store, past.model_version, recipe, past) if past.model_version else None
+    answering = as_it_stood(store, past.decision.model_version, recipe, past) if past.decision.model_version else None
     around = _around(past, stored, answering, records, recipe)
     found = Circumstances(
         recipe=recipe,
@@ -302,7 +302,7 @@ def _coin(stored: StoredDecision, seed: int) -> float:
     return float(fell) / float(2**COIN_BITS)
 
 
-def _safe_mode(store: Store, past: PastDecision) -> str:
+def _safe_mode(store: Store, past: StoredDecision) -> str:
     """Why everything was verified when a decision was made; "" where it was not."""
     mode = safe_mode_event(store, past.time)
     return mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else ""
@@ -318,12 +318,12 @@ class _Around:
 
 
 def _around(
-    past: PastDecision, stored: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe
+    past: StoredDecision, stored: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe
 ) -> _Around | None:
-    if stored.quarantined or past.reason is Reason.MODEL_ERROR:
+    if stored.quarantined or past.decision.reason is Reason.MODEL_ERROR:
         return None
-    if answering is not None and stored.embedding is not None:
-        return _Around(answering, _ball(answering, stored.embedding, past, recipe), own=True)
+    if answering is not None and stored.decision.embedding is not None:
+        return _Around(answering, _ball(answering, stored.decision.embedding, past, recipe), own=True)
     model = records.present()
     now = None if model is None else as_it_stood(records.store, records.version, recipe, None)
     embedding = None if model is None or now is None else _embedding(model, stored)
@@ -336,13 +336,13 @@ def _embedding(model: EngineModel, stored: StoredDecision) -> Embedding | None:
     return None if model.untold else model.predict_one(stored.trace, stored.content_hash).embedding
 
 
-def _ball(answering: Answering, z: Embedding, past: PastDecision, recipe: Recipe) -> Ball:
+def _ball(answering: Answering, z: Embedding, past: StoredDecision, recipe: Recipe) -> Ball:
     """The ball that decided: the wide one, or the narrow one that rejections may be judged by."""
     wide = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.fraction or 0.0)
-    if past.predicted is not Action.REJECT or not recipe.reject_fraction:
+    if past.decision.predicted is not Action.REJECT or not recipe.reject_fraction:
         return wide
     narrow = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.reject_fraction)
-    return narrow if (narrow.n_success, narrow.n_failure) == (past.n_success, past.n_failure) else wide
+    return narrow if (narrow.n_success, narrow.n_failure) == (past.decision.n_success, past.decision.n_failure) else wide
 
 
 def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
@@ -355,7 +355,7 @@ def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
         stored = None if label is None else store.get_decision(label.decision_id)
         neighbour = Neighbour(
             decision_id=None if label is None else label.decision_id,
-            part=None if stored is None else stored.part,
+            part=None if stored is None else stored.decision.part,
             success=bool(index.labels[slot]),
             source=None if label is None else label.source,
             distance=float(ball.distances[slot]),
@@ -368,7 +368,7 @@ def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
 
 
 def _envelope(
-    store: Store, past: PastDecision, stored: StoredDecision, answering: Answering | None, spec: TraceSpec
+    store: Store, past: StoredDecision, stored: StoredDecision, answering: Answering | None, spec: TraceSpec
 ) -> Envelope | None:
     """The band of the successes that were known then; where those were too few, of those known now."""
     known_then = None if answering is None else answering.last_seq
@@ -381,17 +381,17 @@ def _envelope(
     return None
 
 
-def _notes(past: PastDecision, answering: Answering | None, around: _Around | None, bound: Bound | None) -> list[str]:
-    version, found = past.model_version, []
+def _notes(past: StoredDecision, answering: Answering | None, around: _Around | None, bound: Bound | None) -> list[str]:
+    version, found = past.decision.model_version, []
     if past.quarantined:
         found.append("The trace is quarantined: it was not embedded, is never trained on, and has no neighbours.")
     elif around is None:
         found.append("Nothing that embeds this trace is kept, so no neighbours are shown.")
     elif around.own:
-        ball, recorded = around.ball, (past.n_success, past.n_failure)
+        ball, recorded = around.ball, (past.decision.n_success, past.decision.n_failure)
         again = (ball.n_success, ball.n_failure)
         found.append(f"Neighbours: the references of version {version}, which answered, as they stood then.")
-        if past.reason is not Reason.NOVEL and again != recorded:
+        if past.decision.reason is not Reason.NOVEL and again != recorded:
             found.append(
                 f"Counted again, the ball holds {again[0]} successes and {again[1]} failures; recorded were {recorded[0]} "
                 f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."

@@ -12,7 +12,7 @@ from ..decision.policy import RULES, Policy
 from ..decision.rule import NOBODY, DecisionRule
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
-from ..store.views import PastDecision
+from ..store.records import StoredDecision
 
 MOST = 20_000  # more labels in a ball than that are not thought of
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
@@ -79,33 +79,38 @@ class Circumstances:
     safe_mode: str = ""
 
 
-def bound_of(past: PastDecision, found: Circumstances) -> Bound | None:
+def bound_of(past: StoredDecision, found: Circumstances) -> Bound | None:
     """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
-    if past.reason not in BOUNDED or _was_lost(past):
+    if past.decision.reason not in BOUNDED or _was_lost(past):
         return None
     policy = found.recipe.policy
     accept_at, reject_at, level = _thresholds(found)
-    lower, upper = policy.bound(past.n_success, past.n_failure)
+    lower, upper = policy.bound(past.decision.n_success, past.decision.n_failure)
     return Bound(
         interval=policy.interval,
         alpha=policy.alpha,
-        n_success=past.n_success,
-        n_failure=past.n_failure,
-        lower=past.lower,
-        upper=past.upper,
+        n_success=past.decision.n_success,
+        n_failure=past.decision.n_failure,
+        lower=past.decision.lower,
+        upper=past.decision.upper,
         ball=_ball(past, found),
         accept_at=accept_at,
         reject_at=reject_at,
         level=level,
         successes_needed=None if accept_at is None else _needed(policy, past, accept_at, 1),
         failures_needed=None if reject_at is None else _needed(policy, past, reject_at, 0),
-        repeats=found.model is not None or bool(np.allclose((lower, upper), (past.lower, past.upper), atol=1e-6)),
+        repeats=found.model is not None
+        or bool(np.allclose((lower, upper), (past.decision.lower, past.decision.upper), atol=1e-6)),
     )
 
 
-def _was_lost(past: PastDecision) -> bool:
+def _was_lost(past: StoredDecision) -> bool:
     """Whether the row was made from a stop whose decision was lost: an accept on no evidence."""
-    return past.reason is Reason.CERTAIN and past.action is Action.ACCEPT and (past.lower, past.upper) == (0.0, 1.0)
+    return (
+        past.decision.reason is Reason.CERTAIN
+        and past.decision.action is Action.ACCEPT
+        and (past.decision.lower, past.decision.upper) == (0.0, 1.0)
+    )
 
 
 def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
@@ -127,41 +132,41 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
     )
 
 
-def _ball(past: PastDecision, found: Circumstances) -> str:
+def _ball(past: StoredDecision, found: Circumstances) -> str:
     recipe = found.recipe
     if found.model is not None and found.rule is None:
         return "as the model counts them"
     if recipe.fraction is None:
         return f"within the radius {recipe.radius:g}"
-    narrow = recipe.reject_fraction if past.predicted is Action.REJECT else None
+    narrow = recipe.reject_fraction if past.decision.predicted is Action.REJECT else None
     return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
 
 
-def _needed(policy: Policy, past: PastDecision, threshold: float, success: int) -> int | None:
+def _needed(policy: Policy, past: StoredDecision, threshold: float, success: int) -> int | None:
     more = np.arange(MOST + 1)
-    lower, upper = policy.bound(past.n_success + success * more, past.n_failure + (1 - success) * more)
+    lower, upper = policy.bound(past.decision.n_success + success * more, past.decision.n_failure + (1 - success) * more)
     enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
     return int(enough[0]) if len(enough) else None
 
 
-def verdict(past: PastDecision, trace: NDArray[np.float32], bound: Bound | None, found: Circumstances) -> Iterator[str]:
+def verdict(past: StoredDecision, trace: NDArray[np.float32], bound: Bound | None, found: Circumstances) -> Iterator[str]:
     """The sentences: what was done and why, then how the bound came out."""
     yield _why(past, trace, found)
     if bound is not None:
         yield from _bound_sentences(past, bound, found)
-    if found.novelty is not None and past.reason is not Reason.NOVEL:
+    if found.novelty is not None and past.decision.reason is not Reason.NOVEL:
         yield f"It is not novel: {_scores(found.novelty)}."
     yield _outcome(past)
 
 
-def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    did = DID[past.action].capitalize()
+def _why(past: StoredDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    did = DID[past.decision.action].capitalize()
     if _was_lost(past):
         return f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
     said = {
-        "would": DID[past.predicted],
+        "would": DID[past.decision.predicted],
         "coin": found.coin,
-        "rate": past.propensity,
+        "rate": past.decision.propensity,
         "n": int((~np.isfinite(trace)).sum()),
         "size": trace.size,
         "first": float(trace.flat[0]),
@@ -170,7 +175,7 @@ def _why(past: PastDecision, trace: NDArray[np.float32], found: Circumstances) -
         "score": "" if found.novelty is None else f": {_scores(found.novelty)}",
         "mode": found.safe_mode or "its reason is not kept",
     }
-    return did + WHY[past.reason].format(**said)
+    return did + WHY[past.decision.reason].format(**said)
 
 
 WHY = {
@@ -212,7 +217,7 @@ def _scores(novelty: Novelty) -> str:
     return ", ".join(f"in {name} {value:.2f} times the limit" for name, value in both)
 
 
-def _bound_sentences(past: PastDecision, bound: Bound, found: Circumstances) -> Iterator[str]:
+def _bound_sentences(past: StoredDecision, bound: Bound, found: Circumstances) -> Iterator[str]:
     n = bound.n_success + bound.n_failure
     if found.model is not None and found.rule is None:
         yield f"{found.model} gives {bound.n_success} successes, {bound.n_failure} failures, bound {_range(bound)}."
@@ -223,9 +228,9 @@ def _bound_sentences(past: PastDecision, bound: Bound, found: Circumstances) -> 
     if bound.accept_at is None and bound.reject_at is None:
         yield f"Nothing could pass, whatever the bound: {_no_level(bound, found)}."
         return
-    if past.predicted is not Action.REJECT:
+    if past.decision.predicted is not Action.REJECT:
         yield _side("accept", "lower", bound.lower, "at least", bound.accept_at, bound.successes_needed, bound.level)
-    if past.predicted is not Action.ACCEPT:
+    if past.decision.predicted is not Action.ACCEPT:
         yield _side("reject", "upper", bound.upper, "at most", bound.reject_at, bound.failures_needed, bound.level)
 
 
@@ -249,7 +254,7 @@ def _range(bound: Bound) -> str:
     return f"{bound.lower:.3f} to {bound.upper:.3f}"
 
 
-def _outcome(past: PastDecision) -> str:
+def _outcome(past: StoredDecision) -> str:
     if past.success is None:
         return "Nothing was reported of the part."
     source = "" if past.source is None else f" ({past.source.value})"

@@ -22,15 +22,15 @@ from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec, trace_in
 from ..store.base import Store, is_shared
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Evidence, Outcomes
-from ..store.views import LABELS, HistoryFilter, Key, PastDecision, PastRetrain, Stretch, Tally
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Evidence, Key, Outcomes, StoredDecision
+from ..store.views import LABELS, HistoryFilter, PastRetrain, Stretch, Tally
 
 PAGE = 500  # decisions read at a time
 NEWEST = 500  # decisions that are looked at apart
 RECENT = 200  # labels that the share of novel traces is told of
 EVENTS = 5  # newest ones that a status shows
 
-Happened = PastDecision | PastRetrain | Event
+Happened = StoredDecision | PastRetrain | Event
 Name = TypeVar("Name", bound=StrEnum)
 
 
@@ -319,7 +319,7 @@ def history(
     since: float | None = None,
     until: float | None = None,
     predicted: Action | str | None = None,
-) -> Iterator[PastDecision]:
+) -> Iterator[StoredDecision]:
     """The decisions of a store, newest last, one after the other as they are read.
 
     last : the newest so many of those that are meant; None: all.
@@ -344,15 +344,15 @@ def _named(kind: type[Name], value: Name | str | None) -> Name | None:
         raise SettingError(f"Expected {kind.__name__.lower()} to be one of {known}, got {value!r}.") from None
 
 
-def _forward(store: Store, where: HistoryFilter) -> Iterator[PastDecision]:
+def _forward(store: Store, where: HistoryFilter) -> Iterator[StoredDecision]:
     beyond: Key | None = None
     while page := store.decisions(where, PAGE, beyond, newest=False):
         yield from page
         beyond = page[-1].key
 
 
-def _newest(store: Store, where: HistoryFilter, last: int) -> list[PastDecision]:
-    pages: list[list[PastDecision]] = []
+def _newest(store: Store, where: HistoryFilter, last: int) -> list[StoredDecision]:
+    pages: list[list[StoredDecision]] = []
     beyond: Key | None = None
     left = last
     while left and (page := store.decisions(where, min(PAGE, left), beyond)):
@@ -379,6 +379,6 @@ def beside(store: Store, since: float | None = None, until: float | None = None)
     return Beside(retrains, tuple(each for each in store.events() if meant(each.time)))
 
 
-def interleaved(decisions: list[PastDecision], others: Beside) -> Iterator[Happened]:
+def interleaved(decisions: list[StoredDecision], others: Beside) -> Iterator[Happened]:
     """All of it in the order in which it happened; what has the same time keeps that order too."""
     return heapq.merge(others.retrains, others.events, decisions, key=lambda each: each.time)

@@ -36,7 +36,6 @@ from ..errors import (
 from ..history.status import Status
 from ..records import Action, Decision
 from ..store.records import StoredDecision
-from ..store.views import PastDecision
 from .service import Told
 
 log = logging.getLogger("dengine")
@@ -197,8 +196,8 @@ def fields_of(*records: type, without: Iterable[str] = (), **more: Any) -> dict[
 TRACE = list[list[float | None]]
 HIDDEN = ("content_hash",)  # JavaScript has no integers of 64 bits
 DECISION = fields_of(Decision)
-STORED = fields_of(StoredDecision, without=("trace", *HIDDEN))
-PAST = fields_of(PastDecision, without=HIDDEN)
+OF_STORE = fields_of(StoredDecision, without=("decision", "trace", *HIDDEN))
+STORED = DECISION | OF_STORE
 STATUS = fields_of(Status, without=("settings", "retrains"))  # `ever.retrains` counts these
 LINE = {"waiting": int, "late": int, "busy": int, "deadline": float}  # of the service
 
@@ -238,7 +237,7 @@ ABOUT_LINE = (
     "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
     "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at."
 )
-PastAnswer = answer_type("PastDecision", "A decision as it was recorded.", PAST, Decision, PastDecision)
+PastAnswer = answer_type("PastDecision", "A decision as it was recorded.", STORED, Decision, StoredDecision)
 ANSWERS: dict[str, Any] = {
     "Answer": answer_type(
         "Answer", f"A decision, as it is recorded.\n{LATE}", DECISION | {"late": bool, "seconds": float}, Decision
@@ -255,6 +254,11 @@ ANSWERS: dict[str, Any] = {
 def record(value: object, names: Iterable[str], **more: Any) -> Json:
     """Some fields of a record, to be answered."""
     return {name: getattr(value, name) for name in names} | more
+
+
+def stored_record(stored: StoredDecision, **more: Any) -> Json:
+    """A decision with its label, to be answered."""
+    return record(stored.decision, DECISION) | record(stored, OF_STORE, **more)
 
 
 def answered(body: Any, status: int = 200, headers: Mapping[str, str] | None = None, kind: str = JSON) -> Response:

@@ -20,16 +20,15 @@ from .. import __version__
 from ..errors import SettingError, UnknownDecisionError, shortened
 from ..records import Action, plain
 from ..store.base import Store
-from ..store.views import HistoryFilter, PastDecision
+from ..store.records import StoredDecision
+from ..store.views import HistoryFilter
 from . import http, page, xmlrpc
 from .api import (
     DECISION,
     HANDLERS,
     JSON,
     LINE,
-    PAST,
     STATUS,
-    STORED,
     DetailQuery,
     ListQuery,
     Operation,
@@ -43,6 +42,7 @@ from .api import (
     read_struct,
     read_trace,
     record,
+    stored_record,
 )
 from .auth import Access, Guard
 from .metrics import Metrics
@@ -107,7 +107,7 @@ class HttpApi:
         known = await self.service.find(request.path_params["id"])
         if known is None:
             raise UnknownDecisionError("Expected the id of a decision of this cell, got one that is unknown.")
-        return answered(record(known, STORED, **{"trace": known.trace} if shown.trace else {}))
+        return answered(stored_record(known, **{"trace": known.trace} if shown.trace else {}))
 
     async def decisions(self, request: Request) -> Response:
         """The newest decisions, newest first; with open=true those that wait for a label: what a controller that died goes
@@ -115,7 +115,7 @@ class HttpApi:
         """
         asked = read_query(request, ListQuery)
         found = await self.service.look(lambda store: _newest(store, asked.limit, asked.open))
-        return answered({"decisions": [record(each, PAST) for each in found]})
+        return answered({"decisions": [stored_record(each) for each in found]})
 
     async def metrics(self, request: Request) -> Response:
         """What Prometheus reads."""
@@ -141,10 +141,10 @@ class HttpApi:
         return HTMLResponse("\n".join(as_page(document(self.operations(), __version__))))
 
 
-def _newest(store: Store, limit: int, waiting: bool) -> list[PastDecision]:
+def _newest(store: Store, limit: int, waiting: bool) -> list[StoredDecision]:
     """Newest first. A forgotten label is none that is waited for."""
     where = HistoryFilter(action=Action.VERIFY, label="none") if waiting else HistoryFilter()
-    found: list[PastDecision] = []
+    found: list[StoredDecision] = []
     page = store.decisions(where, limit)
     while page and len(found) < limit:
         found += [past for past in reversed(page) if not waiting or past.source is None]

@@ -21,7 +21,6 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..engine.decide import as_decision
 from ..errors import BusyError, DengineError, SettingError, StoreError, TraceError, UnknownDecisionError, shortened
 from ..records import ACTIONS, Action, Decision, as_id
 from .service import CellService
@@ -206,7 +205,7 @@ class RobotCalls:
             known = await self._service.find(as_id(request))
         except (BusyError, StoreError):
             return None
-        return None if known is None else _answered(as_decision(known))
+        return None if known is None else _answered(known.decision)
 
 
 def as_samples(value: Any) -> NDArray[np.float32]:

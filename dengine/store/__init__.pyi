@@ -1,7 +1,5 @@
 from .base import Store as Store
 from .base import open_store as open_store
-from .dump import Dump as Dump
-from .dump import dump_store as dump_store
 from .memory import MemoryStore as MemoryStore
 from .records import AddedPoints as AddedPoints
 from .records import Change as Change

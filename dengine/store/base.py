@@ -76,11 +76,9 @@ class Store(StoreViews, Protocol):
         trace: NDArray[np.float32],
         content_hash: int,
         quarantined: bool,
-        part: str | None = None,
     ) -> None:
         """Take a decision and its trace, (C, T) or (T,), without waiting for the disk.
 
-        part : serial number of the part that the trace was recorded on.
         content_hash : of the trace's content, or of its part's number where one is given.
         """
 
@@ -118,12 +116,8 @@ class Store(StoreViews, Protocol):
         hashes: NDArray[np.int64],
         labels: NDArray[np.int8],
         source: Source,
-        parts: Sequence[str | None] | None = None,
     ) -> NDArray[np.int64]:
-        """Import labelled traces, all or none; returns their sequence numbers.
-
-        parts : serial number of the part of each trace, as in `put_decision`; None: of all unknown.
-        """
+        """Import labelled traces, all or none; returns their sequence numbers."""
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
         """Record a retrain; a dropped candidate has no state. Returns the version's number.

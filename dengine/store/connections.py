@@ -23,8 +23,8 @@ import sqlalchemy as sa
 from ..errors import DengineError, StoreError, shortened
 from .ledger import LedgerEntry, chain_writes
 from .queries import Scope, join_product
-from .records import DecidedTrace, as_text, duplicate_id
-from .schema import DECISION, EVENT, TRACE, chunks, decision_row, event_row, prepare_tables, trace_row
+from .records import Event, StoredDecision, as_text, duplicate_id, to_row
+from .schema import DECISION, EVENT, TRACE, chunks, decision_row, prepare_tables, trace_row
 
 # Of a server that answers no more, libpq says so after some seconds, not hours.
 PATIENCE = {
@@ -293,7 +293,7 @@ class SqlDatabase(SqlConnections):
 
     def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
         """Open or create the database, and start its writer thread."""
-        self._queue: dict[str, DecidedTrace] = {}
+        self._queue: dict[str, StoredDecision] = {}
         super().__init__(url, cell_id, clock, product)
         self._queue_bytes = 0
         self._clash: StoreError | None = None
@@ -318,7 +318,7 @@ class SqlDatabase(SqlConnections):
                 self._set_aside(bad)
                 return self._commit(work, [item for item in batch if item.decision.id not in bad])
 
-    def _commit(self, work: Callable[[sa.Connection], T], batch: Sequence[DecidedTrace]) -> T:
+    def _commit(self, work: Callable[[sa.Connection], T], batch: Sequence[StoredDecision]) -> T:
         with self.transaction(write=True) as connection:
             self.insert(connection, self._not_yet_stored(connection, batch) if self._doubtful else batch)
             result = work(connection)
@@ -326,7 +326,7 @@ class SqlDatabase(SqlConnections):
         self._forget(batch)
         return result
 
-    def _unstorable(self, batch: Sequence[DecidedTrace]) -> dict[str, str]:
+    def _unstorable(self, batch: Sequence[StoredDecision]) -> dict[str, str]:
         """Return which rows the database refuses for what they hold, each with the reason; nothing is written."""
         refused: dict[str, str] = {}
         with self._told("write to"), self._connected(write=True) as plain:
@@ -352,7 +352,8 @@ class SqlDatabase(SqlConnections):
             first = self.next_number(connection, EVENT.c.number)
             for number, (name, reason) in enumerate(refused.items(), first):
                 text = as_text(f"a decision that the database refused, {name!r}: {reason}")
-                connection.execute(sa.insert(EVENT), event_row(self.cell_id, number, now, "set aside", text))
+                row = to_row(Event(number, now, "set aside", text)) | {"cell_id": self.cell_id}
+                connection.execute(sa.insert(EVENT), row)
                 log.error("%s", text)
 
         self._commit(record, [])
@@ -367,7 +368,7 @@ class SqlDatabase(SqlConnections):
 
     # The queue
 
-    def put(self, item: DecidedTrace) -> None:
+    def put(self, item: StoredDecision) -> None:
         """Queue a decision for the writer thread; where the queue is full, write it first."""
         self._check_open()
         if self._queue_bytes > QUEUE_BYTES:
@@ -379,30 +380,30 @@ class SqlDatabase(SqlConnections):
             self._queue_bytes += item.trace.nbytes
             self._lock.notify()
 
-    def queued(self, decision_id: str) -> DecidedTrace | None:
+    def queued(self, decision_id: str) -> StoredDecision | None:
         """Return a decision that still waits; None where it was written or is unknown."""
         with self._lock:
             return self._queue.get(decision_id)
 
-    def insert(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> None:
+    def insert(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> None:
         """Add decisions and their traces in a transaction that is under way."""
         for part in chunks(batch):
             connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
             connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
 
-    def insert_new(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> None:
+    def insert_new(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> None:
         """Add those decisions of a batch that are not stored yet."""
         stored = self._stored(connection, batch)
         self.insert(connection, [item for item in batch if item.decision.id not in stored])
 
-    def _forget(self, batch: Sequence[DecidedTrace]) -> None:
+    def _forget(self, batch: Sequence[StoredDecision]) -> None:
         with self._lock:
             for item in batch:
                 if self._queue.pop(item.decision.id, None) is None:
                     continue
                 self._queue_bytes -= item.trace.nbytes
 
-    def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> list[DecidedTrace]:
+    def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> list[StoredDecision]:
         """After a failure: leave out what was committed although the answer got lost, and ids that were taken."""
         stored = self._stored(connection, batch)
         for item in batch:
@@ -411,7 +412,7 @@ class SqlDatabase(SqlConnections):
                 self._clash = duplicate_id(item.decision.id)  # raised by the next flush; the queue must go on
         return [item for item in batch if item.decision.id not in stored]
 
-    def _stored(self, connection: sa.Connection, batch: Sequence[DecidedTrace]) -> dict[str, tuple[int, str, float]]:
+    def _stored(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> dict[str, tuple[int, str, float]]:
         columns = (DECISION.c.id, DECISION.c.content_hash, DECISION.c.action, DECISION.c.time)
         query = sa.select(*columns).where(DECISION.c.cell_id == self.cell_id)
         parts = chunks([item.decision.id for item in batch])

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..errors import StoreError
 from ..records import Action, Decision, Reason, Source
-from .records import DecidedTrace, NewLabel
+from .records import NewLabel, StoredDecision
 
 LENGTH = struct.Struct("<I")  # of the JSON text, before it; a trace's samples follow it
 
@@ -46,12 +46,12 @@ class LateEvent:
     time: float
 
 
-Record = DecidedTrace | LateLabel | LateEvent
+Record = StoredDecision | LateLabel | LateEvent
 
 
 def to_bytes(record: Record) -> bytes:
     """Return a record as a journal keeps it."""
-    if isinstance(record, DecidedTrace):
+    if isinstance(record, StoredDecision):
         about = {
             "kind": "decision",
             "decision": asdict(record.decision),
@@ -59,7 +59,6 @@ def to_bytes(record: Record) -> bytes:
             "content_hash": record.content_hash,
             "quarantined": record.quarantined,
             "time": record.time,
-            "part": record.part,
         }
         return _framed(about, record.trace.astype("<f4", copy=False).tobytes())
     if isinstance(record, LateLabel):
@@ -90,13 +89,13 @@ def _framed(about: dict[str, Any], rest: bytes = b"") -> bytes:
     return LENGTH.pack(len(text)) + text + rest
 
 
-def _decision(about: dict[str, Any], samples: bytes) -> DecidedTrace:
+def _decision(about: dict[str, Any], samples: bytes) -> StoredDecision:
     said = about["decision"]
     embedding = None if said["embedding"] is None else tuple(tuple(point) for point in said["embedding"])
     kinds = {"action": Action(said["action"]), "predicted": Action(said["predicted"]), "reason": Reason(said["reason"])}
     decision = Decision(**(said | kinds | {"embedding": embedding}))
     trace = np.frombuffer(samples, dtype="<f4").astype(np.float32).reshape(about["shape"])
-    return DecidedTrace(decision, trace, about["content_hash"], about["quarantined"], about["time"], about["part"])
+    return StoredDecision(decision, trace, about["content_hash"], about["quarantined"], about["time"])
 
 
 def _label(about: dict[str, Any], rest: bytes) -> LateLabel:

@@ -22,13 +22,14 @@ from ..records import Action, Decision, Reason, RetrainReport, Source
 from .records import (
     FORGOTTEN,
     KEEP,
+    NO_TRACE,
     STATUS_EVENTS,
     AddedPoints,
     Change,
     Correction,
-    DecidedTrace,
     Event,
     Evidence,
+    Key,
     Labelled,
     ModelVersion,
     NewLabel,
@@ -40,10 +41,9 @@ from .records import (
     as_text,
     check_decision,
     check_import,
-    check_parts,
     check_state,
+    checked_decision,
     checked_label,
-    decided_trace,
     duplicate_id,
     imported_labels,
     keeps_state,
@@ -51,13 +51,10 @@ from .records import (
     nothing_to_correct,
     refuse_repeats,
     stack,
-    stored_decision,
     unknown_decision,
 )
 from .views import (
     HistoryFilter,
-    Key,
-    PastDecision,
     PastLabel,
     PastRetrain,
     Stretch,
@@ -75,7 +72,7 @@ class StoredLabel:
 
     seq: int
     time: float
-    item: DecidedTrace
+    item: StoredDecision
     given: NewLabel
 
 
@@ -83,7 +80,7 @@ class MemoryHistory:
     """The part of `MemoryStore` that is about its history. Of versions it keeps the states that a database keeps."""
 
     _clock: Callable[[], float]
-    _open: dict[str, DecidedTrace]
+    _open: dict[str, StoredDecision]
     _labels: list[StoredLabel]
     _label_of: dict[str, StoredLabel]
     _settings: dict[str, str]
@@ -184,7 +181,7 @@ class MemoryHistory:
             return self._said
         return {each.decision_id: each.success for each in self._corrections[: max(0, corrected_to)]}
 
-    def count(self, item: DecidedTrace, label: int | None, n: int) -> None:
+    def count(self, item: StoredDecision, label: int | None, n: int) -> None:
         """Count `n` more decisions of this kind and label."""
         made = item.decision
         self._became[made.action, made.predicted, made.audit, label, made.model_version] += n
@@ -206,8 +203,8 @@ def _copied(version: ModelVersion) -> ModelVersion:
 class MemoryViews:
     """`StoreViews` in plain dicts; decisions that were forgotten are not among them."""
 
-    _open: dict[str, DecidedTrace]
-    _done: dict[str, DecidedTrace]
+    _open: dict[str, StoredDecision]
+    _done: dict[str, StoredDecision]
     _label_of: dict[str, Any]
     _labels: list[Any]
     _retrains: list[RetrainReport]
@@ -218,37 +215,24 @@ class MemoryViews:
         def counted(self, label: Any) -> int: ...
         def labelled(self, limit: int | None = None) -> Labelled: ...
 
-    def _every(self) -> list[PastDecision]:
+    def _every(self) -> list[StoredDecision]:
         found = [self._past(item) for kept in (self._done, self._open) for item in kept.values()]
         return sorted(found, key=lambda past: past.key)
 
-    def _past(self, item: DecidedTrace) -> PastDecision:
-        decision, label = item.decision, self._label_of.get(item.decision.id)
-        return PastDecision(
-            id=decision.id,
-            time=item.time,
-            part=item.part,
-            action=decision.action,
-            predicted=decision.predicted,
-            lower=decision.lower,
-            upper=decision.upper,
-            n_success=decision.n_success,
-            n_failure=decision.n_failure,
-            reason=decision.reason,
-            audit=decision.audit,
-            propensity=decision.propensity,
-            model_version=decision.model_version,
-            content_hash=item.content_hash,
-            quarantined=item.quarantined,
-            success=None if label is None else as_label(self.counted(label)),
-            source=None if label is None else label.given.source,
-            label_seq=None if label is None else label.seq,
-            label_time=None if label is None else label.time,
-        )
+    def _past(self, item: StoredDecision) -> StoredDecision:
+        return replace(self._known(item), trace=NO_TRACE)
+
+    def _known(self, item: StoredDecision) -> StoredDecision:
+        """A decision with its label as it counts."""
+        label = self._label_of.get(item.decision.id)
+        if label is None:
+            return item
+        said = as_label(self.counted(label))
+        return replace(item, success=said, source=label.given.source, label_seq=label.seq, label_time=label.time)
 
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
-    ) -> list[PastDecision]:
+    ) -> list[StoredDecision]:
         """Return the newest (or oldest) `limit` decisions that are meant, oldest first."""
         found = [past for past in self._every() if where.takes(past)]
         if newest:
@@ -256,7 +240,7 @@ class MemoryViews:
             return found[max(0, len(found) - limit) :]
         return [past for past in found if beyond is None or past.key > beyond][:limit]
 
-    def past_decision(self, decision_id: str) -> PastDecision | None:
+    def past_decision(self, decision_id: str) -> StoredDecision | None:
         """Return one decision; None where it is unknown or forgotten."""
         item = self._open.get(decision_id) or self._done.get(decision_id)
         return None if item is None else self._past(item)
@@ -270,7 +254,7 @@ class MemoryViews:
         return PastLabel(
             seq=row.seq,
             time=row.time,
-            decision_id=past.id,
+            decision_id=past.decision.id,
             success=given.success,
             source=given.source,
             model_version=given.model_version,
@@ -279,9 +263,9 @@ class MemoryViews:
             silent=given.silent,
             point=given.point if points else None,
             decided=past.time,
-            lower=past.lower,
-            upper=past.upper,
-            novel=past.reason == "novel",
+            lower=past.decision.lower,
+            upper=past.decision.upper,
+            novel=past.decision.reason is Reason.NOVEL,
         )
 
     def past_retrains(self) -> list[PastRetrain]:
@@ -322,8 +306,8 @@ class MemoryStore(MemoryHistory, MemoryViews):
         self.cell_id = cell_id
         self._clock = clock
         self._settings: dict[str, str] = {}
-        self._open: dict[str, DecidedTrace] = {}  # decisions without a label
-        self._done: dict[str, DecidedTrace] = {}  # and with one
+        self._open: dict[str, StoredDecision] = {}  # decisions without a label
+        self._done: dict[str, StoredDecision] = {}  # and with one
         self._labels: list[StoredLabel] = []  # label seq stands at index seq - 1
         self._label_of: dict[str, StoredLabel] = {}
         self._train: list[StoredLabel] = []  # not quarantined
@@ -343,10 +327,9 @@ class MemoryStore(MemoryHistory, MemoryViews):
         trace: NDArray[np.float32],
         content_hash: int,
         quarantined: bool,
-        part: str | None = None,
     ) -> None:
         """Keep a decision with a copy of its trace."""
-        item = decided_trace(decision, trace, content_hash, quarantined, self._clock(), part)
+        item = checked_decision(decision, trace, content_hash, quarantined, self._clock())
         if self._holds(decision.id):
             raise duplicate_id(decision.id)
         self._open[decision.id] = item
@@ -367,10 +350,7 @@ class MemoryStore(MemoryHistory, MemoryViews):
         kept = self._open.get(decision_id) or self._done.get(decision_id)
         if kept is None:
             return None
-        label = self._label_of.get(decision_id)
-        if label is None:
-            return stored_decision(kept)
-        return stored_decision(kept, self._said.get(decision_id, label.given.success), label.given.source)
+        return replace(self._known(kept), trace=kept.trace.copy())
 
     def decision_ids(self) -> list[str]:
         """Return the ids of every decision, in any order."""
@@ -417,16 +397,15 @@ class MemoryStore(MemoryHistory, MemoryViews):
         hashes: NDArray[np.int64],
         labels: NDArray[np.int8],
         source: Source,
-        parts: Sequence[str | None] | None = None,
     ) -> NDArray[np.int64]:
-        traces, numbers = check_import(decisions, traces, hashes, labels), check_parts(parts, len(decisions))
+        traces = check_import(decisions, traces, hashes, labels)
         for decision in decisions:
             check_decision(decision)
             if self._holds(decision.id):
                 raise duplicate_id(decision.id)
         first, given = len(self._labels) + 1, imported_labels(decisions, labels, source)
-        for decision, trace, hash_, label, part in zip(decisions, traces, hashes, given, numbers, strict=True):
-            self.put_decision(decision, trace, int(hash_), False, part)
+        for decision, trace, hash_, label in zip(decisions, traces, hashes, given, strict=True):
+            self.put_decision(decision, trace, int(hash_), False)
             self._take(label)  # at once, or the import would be forgotten
         return np.arange(first, first + len(given), dtype=np.int64)
 

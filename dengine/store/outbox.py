@@ -32,7 +32,7 @@ from ..errors import StoreError
 from ..records import RetrainReport
 from .base import Store
 from .journal import HEADER, RESERVE, Journal, LateEvent, LateLabel, Record, from_bytes, to_bytes
-from .records import DecidedTrace, NewLabel, StoredDecision, already_reported, stored_decision
+from .records import NewLabel, StoredDecision, already_reported
 
 T = TypeVar("T")
 Committing = Callable[[Callable[[], bool]], AbstractContextManager[None]]
@@ -140,7 +140,7 @@ class Backlog:
         self.store = store
         self.journal = journal
         self.lock = threading.RLock()
-        self._unsafe: dict[str, DecidedTrace] = {}  # not known to be committed, and not in the journal
+        self._unsafe: dict[str, StoredDecision] = {}  # not known to be committed, and not in the journal
         self._offsets: dict[str, int] = {}  # of decisions in the journal
         self._labels: dict[str, NewLabel] = {}  # in the journal, by decision
         self._arrived: list[tuple[str, int]] = []
@@ -152,7 +152,7 @@ class Backlog:
         with self.lock:
             return list(self._unsafe)
 
-    def add(self, item: DecidedTrace) -> None:
+    def add(self, item: StoredDecision) -> None:
         """A decision was handed to the store, or waits for it."""
         with self.lock:
             self._unsafe[item.decision.id] = item
@@ -168,9 +168,9 @@ class Backlog:
         with self.lock:
             offset, label = self._offsets.get(decision_id), self._labels.get(decision_id)
             item = None if offset is None else from_bytes(self.journal.read(offset))
-        if not isinstance(item, DecidedTrace):
+        if not isinstance(item, StoredDecision):
             return None
-        return stored_decision(item) if label is None else stored_decision(item, label.success, label.source)
+        return item if label is None else replace(item, success=label.success, source=label.source)
 
     def write(self, records: Sequence[Record]) -> None:
         """Put records into the journal, after all decisions that are not safe yet; StoreError where that fails."""
@@ -205,7 +205,7 @@ class Backlog:
         with self.lock:
             self._arrived += arrived
             self._played = end
-            self.committed([record.decision.id for record in batch if isinstance(record, DecidedTrace)])
+            self.committed([record.decision.id for record in batch if isinstance(record, StoredDecision)])
         return refused
 
     def stored_upto(self, end: int) -> None:
@@ -277,11 +277,11 @@ class RecentDecisions:
     def add(self, known: StoredDecision) -> StoredDecision:
         """One more, in any thread; the oldest goes where there are too many. Returns the one that has its id: the first."""
         with self._adding:
-            if (first := self._known.get(known.id)) is not None:
+            if (first := self._known.get(known.decision.id)) is not None:
                 return first
-            self._known[known.id] = known
+            self._known[known.decision.id] = known
             if self._taken is not None:
-                self._taken.add(known.id)
+                self._taken.add(known.decision.id)
             if len(self._known) > MOST:
                 self._known.popitem(last=False)
         return known
@@ -309,7 +309,7 @@ class RecentDecisions:
         for label in labels:
             known = self._known.get(label.decision_id)
             if known is not None and known.success is not None and known.source is not None:
-                raise already_reported(known.id, (known.success, known.source), (label.success, label.source))
+                raise already_reported(known.decision.id, (known.success, known.source), (label.success, label.source))
 
     def forget(self, decision_id: str) -> None:
         """What was known of this one is no longer so."""
@@ -393,17 +393,17 @@ class Keeper:
 
     # What the engine asks
 
-    def decided(self, item: DecidedTrace) -> None:
+    def decided(self, item: StoredDecision) -> None:
         """Take a decision and its trace without waiting."""
         self.check()
         if (backlog := self._backlog) is None:
-            self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
+            self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
             return
         self._look_at_the_beat()
         fault = self.fault
         try:
             if not fault:
-                self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined, item.part)
+                self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
         except StoreError as error:
             fault = str(error)
         with backlog.lock:  # what is here when the fault ends is played back

@@ -136,14 +136,23 @@ def remembered(corrected_to: int | None = None) -> sa.ColumnElement[bool]:
     return sa.func.coalesce(corrected(corrected_to), 0) != FORGOTTEN
 
 
+SAID: sa.ColumnElement[int | None] = sa.func.nullif(
+    counted(), FORGOTTEN
+)  # a label as it counts now: 0, 1, NULL where there is none, or is forgotten
+
+
+def past_query(cell_id: str) -> Query:
+    """Decisions with their labels, without traces; the columns of `read_decision`."""
+    labels = (SAID.label("success"), LABEL.c.source, LABEL.c.seq.label("label_seq"), LABEL.c.time.label("label_time"))
+    return sa.select(*DECISION.c, *labels).select_from(WITH_LABELS).where(DECISION.c.cell_id == cell_id)
+
+
 def decision_query(cell_id: str, decision_id: str) -> Query:
     """A decision with its trace, and with its label where it has one."""
-    mine = (DECISION.c.cell_id == cell_id) & (DECISION.c.id == decision_id)
-    traces = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
+    same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
     stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
-    label = (counted().label("success"), LABEL.c.source)
-    columns = (*DECISION.c, *TRACE.c["channels", "samples", "data"], *stored, *label)
-    return sa.select(*columns).select_from(DECISION.join(TRACE, traces).outerjoin(LABEL, LABEL_OF_DECISION)).where(mine)
+    query = past_query(cell_id).add_columns(*TRACE.c["channels", "samples", "data"], *stored)
+    return query.join(TRACE, same).where(DECISION.c.id == decision_id)
 
 
 def ids_query(cell_id: str) -> Query:

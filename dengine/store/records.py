@@ -16,8 +16,11 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import lru_cache
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,16 +97,12 @@ def as_point(point: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
     return copy
 
 
-def as_part(part: str | None) -> str | None:
-    """Return a part's number as every database can hold it; a StoreError before it is queued, not at the next write."""
-    if part is None:
-        return None
-    if not isinstance(part, str) or len(part) > LONGEST or part != as_text(part):
+def _check_part(part: str | None) -> None:
+    if part is not None and (not isinstance(part, str) or len(part) > LONGEST or part != as_text(part)):
         raise StoreError(
             f"Expected a part's number as plain text of at most {LONGEST} characters, or None, got {shortened(part)}; "
             "strip what a scanner added."
         )
-    return str(part)
 
 
 def as_text(text: str) -> str:
@@ -149,16 +148,6 @@ def check_import(
     return traces
 
 
-def check_parts(parts: Sequence[str | None] | None, n: int) -> list[str | None]:
-    """Return the part's number of each of n traces of an import; None where none is given."""
-    numbers = [as_part(part) for part in ([None] * n if parts is None else parts)]
-    if len(numbers) != n:
-        raise StoreError(
-            f"Expected a part's number for each of {n} traces, got {len(numbers)}; give None where it is unknown."
-        )
-    return numbers
-
-
 def duplicate_id(decision_id: str) -> StoreError:
     """Return the error for two decisions of one id; the first stands."""
     return StoreError(
@@ -175,25 +164,10 @@ def mixed_shapes(shapes: set[tuple[int, ...]]) -> StoreError:
 
 
 SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
+T = TypeVar("T")
 STATUS_EVENTS = 5  # newest ones that a status shows
+NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
-
-
-@dataclass(frozen=True, slots=True)
-class DecidedTrace:
-    """A decision on its way into a store.
-
-    trace : (C, T) float32, a copy.  time : of the decision, in seconds.
-    content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given.
-    part : serial number of the part that the trace was recorded on.
-    """
-
-    decision: Decision
-    trace: NDArray[np.float32]
-    content_hash: int
-    quarantined: bool
-    time: float
-    part: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,37 +186,42 @@ class NewLabel:
     silent: int = 0
 
 
+Key = tuple[float, str]  # of a decision in its history: time and id
+
+
 @dataclass(frozen=True, slots=True)
 class StoredDecision:
-    """What a report needs to know of a decision; fields as in `Decision`.
+    """A decision as a store holds it, with the label that counts.
 
-    trace : (C, T) float32.
+    trace : (C, T) float32; (0, 0) where a list of decisions leaves it out.
     content_hash : signed 64 bit, of the trace's content, or of its part's number where one is given. It deals the
         permanent fold, and says who may vote once: equal traces share it, or the traces of one part.
     quarantined : kept, but never given to training.
+    time : of the decision, in seconds.
     success, source : the label as it counts, if one was reported: of a corrected one the newest correction's, of a
         forgotten one None, beside the source that it had.
-    part : serial number of the part that the trace was recorded on, where one was given.
+    label_seq, label_time : number of the label, and when it came.
     """
 
-    id: str
-    action: Action
-    predicted: Action
-    audit: bool
-    reason: Reason
-    lower: float
-    upper: float
-    embedding: tuple[tuple[float, ...], ...] | None
-    model_version: int
-    trace: NDArray[np.float32]
+    decision: Decision = field(metadata={"flat": True})
+    trace: NDArray[np.float32] = field(repr=False, compare=False, metadata={"apart": True})
     content_hash: int
     quarantined: bool
-    success: bool | None
-    source: Source | None
-    n_success: int
-    n_failure: int
-    propensity: float
-    part: str | None = None
+    time: float = 0.0
+    success: bool | None = None
+    source: Source | None = None
+    label_seq: int | None = None
+    label_time: float | None = None
+
+    @property
+    def key(self) -> Key:
+        """Its place in the history."""
+        return self.time, self.decision.id
+
+    @property
+    def label(self) -> str:
+        """good, bad or none."""
+        return "none" if self.success is None else "good" if self.success else "bad"
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,29 +336,59 @@ class ModelVersion:
     state: dict[str, NDArray[Any]]
 
 
-def stored_decision(item: DecidedTrace, success: bool | None = None, source: Source | None = None) -> StoredDecision:
-    """Return what a report needs, with a trace of its own."""
-    decision = item.decision
-    return StoredDecision(
-        id=decision.id,
-        action=decision.action,
-        predicted=decision.predicted,
-        audit=decision.audit,
-        reason=decision.reason,
-        lower=decision.lower,
-        upper=decision.upper,
-        embedding=decision.embedding,
-        model_version=decision.model_version,
-        trace=item.trace.copy(),
-        content_hash=item.content_hash,
-        quarantined=item.quarantined,
-        success=success,
-        source=source,
-        n_success=decision.n_success,
-        n_failure=decision.n_failure,
-        propensity=decision.propensity,
-        part=item.part,
-    )
+@lru_cache
+def columns(kind: Any) -> dict[str, tuple[type, bool]]:
+    """The fields of a record by name: the type that a column holds, and whether None is a value too."""
+    found: dict[str, tuple[type, bool]] = {}
+    for name, hint in get_type_hints(kind).items():
+        kinds = [each for each in (get_args(hint) if isinstance(hint, UnionType) else (hint,)) if each is not type(None)]
+        found[name] = (get_origin(kinds[0]) or kinds[0], isinstance(hint, UnionType))
+    return found
+
+
+def to_row(record: Any, *names: str) -> dict[str, Any]:
+    """A record's fields as a row holds them; names : these alone."""
+    of: Any = type(record)
+    kinds = columns(of)
+    return {name: _written(getattr(record, name), kinds[name][0]) for name in names or kinds}
+
+
+def from_row(kind: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
+    """The record that `to_row` wrote; a row may hold more, and lack what is given or has a default."""
+    said = {name: _read(row[name], each) for name, (each, _) in columns(kind).items() if name in row and name not in given}
+    return kind(**said, **given)
+
+
+def _written(value: Any, kind: type) -> Any:
+    if value is None or kind is str:
+        return value
+    if issubclass(kind, StrEnum):
+        return kind(value).value
+    writers: dict[type, Callable[[Any], Any]] = {tuple: _as_json, dict: _as_json, np.ndarray: pack}
+    return writers.get(kind, kind)(value)
+
+
+def _read(value: Any, kind: type) -> Any:
+    if value is None or kind in (str, int, float):
+        return value
+    if kind is tuple:
+        return tuple(tuple(row) for row in json.loads(value))
+    readers: dict[type, Callable[[Any], Any]] = {dict: json.loads, np.ndarray: unpack}
+    return readers.get(kind, kind)(value)
+
+
+def _as_json(value: Any) -> str:
+    return json.dumps(value, default=float)
+
+
+def pack(values: NDArray[np.float32]) -> bytes:
+    """Values as little-endian float32, without their shape."""
+    return values.astype("<f4", copy=False).tobytes()
+
+
+def unpack(blob: bytes) -> NDArray[np.float32]:
+    """What `pack` wrote, flat."""
+    return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 
 def checked_label(label: NewLabel) -> NewLabel:
@@ -485,14 +494,14 @@ SHARES = ("lower", "upper", "propensity")
 KINDS = {"action": Action, "predicted": Action, "reason": Reason}
 
 
-def decided_trace(
-    decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool, time: float, part: str | None
-) -> DecidedTrace:
+def checked_decision(
+    decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool, time: float
+) -> StoredDecision:
     """A decision on its way into a store, with a copy of its trace. StoreError for what no database can hold."""
     check_decision(decision)
     if not math.isfinite(time):
         raise StoreError(f"Expected the time of a decision in seconds, got {time}; look at the store's clock.")
-    return DecidedTrace(decision, as_channels(trace), as_hash(content_hash), bool(quarantined), time, as_part(part))
+    return StoredDecision(decision, as_channels(trace), as_hash(content_hash), bool(quarantined), time)
 
 
 def check_decision(decision: Decision) -> None:
@@ -505,6 +514,7 @@ def check_decision(decision: Decision) -> None:
         _must(_is_whole(count), f"{name} as a whole number from 0 to below 2**63", count)
     for name in SHARES:
         _must(_is_share(getattr(decision, name)), f"{name} as a number from 0 to 1", getattr(decision, name))
+    _check_part(decision.part)
     _must(isinstance(decision.audit, bool | np.bool_), "audit as True or False", decision.audit)
     _must(_is_embedding(decision.embedding), "an embedding of numbers, (K, d), or None", decision.embedding)
 

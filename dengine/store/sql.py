@@ -24,7 +24,7 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -35,7 +35,7 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from ..errors import StoreError, shortened
-from ..records import Decision, RetrainReport, Source
+from ..records import Decision, Reason, RetrainReport, Source
 from . import queries as ask
 from .connections import SqlDatabase
 from .journal import Journal, LateEvent, LateLabel, Record, owned_by, owner
@@ -48,7 +48,6 @@ from .records import (
     AddedPoints,
     Change,
     Correction,
-    DecidedTrace,
     Event,
     Evidence,
     Labelled,
@@ -65,11 +64,11 @@ from .records import (
     check_decision,
     check_import,
     check_keep,
-    check_parts,
     check_state,
+    checked_decision,
     checked_label,
-    decided_trace,
     duplicate_id,
+    from_row,
     imported_labels,
     keeps_state,
     mixed_shapes,
@@ -77,8 +76,9 @@ from .records import (
     nothing_to_correct,
     refuse_repeats,
     stack,
-    stored_decision,
+    to_row,
     unknown_decision,
+    unpack,
 )
 from .schema import (
     CHUNK,
@@ -90,14 +90,9 @@ from .schema import (
     TRACE,
     VERSION,
     chunks,
-    event_row,
     from_npz,
     label_row,
     read_decision,
-    read_event,
-    read_evidence,
-    unpack,
-    unpack_trace,
     version_row,
 )
 from .view_queries import SqlViews
@@ -196,7 +191,7 @@ class SqlOwning:
 
         Returns the numbers of the labels by their decisions, and what could not be written, in words.
         """
-        decisions = [record for record in records if isinstance(record, DecidedTrace)]
+        decisions = [record for record in records if isinstance(record, StoredDecision)]
         labels = [record for record in records if isinstance(record, LateLabel)]
         events = [record for record in records if isinstance(record, LateEvent)]
 
@@ -212,7 +207,7 @@ def _write_events(database: SqlDatabase, connection: sa.Connection, events: Sequ
     number = database.next_number(connection, EVENT.c.number)
     for event in events:
         if _is_new(connection, database.cell_id, event):
-            row = event_row(database.cell_id, number, event.time, event.kind, event.text)
+            row = {"cell_id": database.cell_id} | to_row(Event(number, event.time, event.kind, event.text))
             connection.execute(sa.insert(EVENT), row)
             number += 1
 
@@ -365,30 +360,30 @@ class SqlHistory(SqlVersions, ProductShare):
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest `limit` events, oldest first."""
-        return [read_event(row) for row in self._read(ask.event_query(self.cell_id, limit))[::-1]]
+        return [from_row(Event, row._mapping) for row in self._read(ask.event_query(self.cell_id, limit))[::-1]]
 
     # Corrections
 
     def record(self, change: Change) -> int:
         """Commit what a person changed, in one transaction with its event, whose number it returns."""
         now, author = self._clock(), as_text(change.author)
-        said = (now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
+        said = Event(0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         version: dict[str, Any] | None = None
         if change.version is not None:
             report, last_seq, state = change.version
             version = version_row(self.cell_id, report, int(last_seq), now, check_state(report, state))
-        replace = None if change.settings is None else replacing(self.cell_id, change.settings)
+        settle = None if change.settings is None else replacing(self.cell_id, change.settings)
 
         def add(connection: sa.Connection) -> int:
             number = self._database.next_number(connection, EVENT.c.number)
-            connection.execute(sa.insert(EVENT), event_row(self.cell_id, number, *said))
+            connection.execute(sa.insert(EVENT), {"cell_id": self.cell_id} | to_row(said) | {"number": number})
             if change.decisions:
                 self._correct(connection, change, author, number, now)
             if version is not None:
                 self._add_as_numbered(connection, version)
-            if change.settings is not None and replace is not None:
+            if change.settings is not None and settle is not None:
                 self._refuse_disagreement(connection, change.settings)
-                replace(connection)
+                settle(connection)
             return number
 
         return self._database.write(add)
@@ -543,7 +538,7 @@ def sound_traces(rows: Iterable[Any], seqs: Sequence[int]) -> SoundTraces:
             traces, first = np.empty((len(seqs), row.channels, row.samples), dtype=np.float32), False
         if (row.channels, row.samples) != traces.shape[1:]:
             raise mixed_shapes({traces.shape[1:], (row.channels, row.samples)})
-        traces[at[row.seq]], kept[at[row.seq]] = unpack_trace(row), True
+        traces[at[row.seq]], kept[at[row.seq]] = unpack(row.data).reshape(row.channels, row.samples), True
     return SoundTraces(traces if kept.all() else traces[kept[: len(traces)]], kept)
 
 
@@ -639,10 +634,9 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         trace: NDArray[np.float32],
         content_hash: int,
         quarantined: bool,
-        part: str | None = None,
     ) -> None:
         """Queue a decision and its trace for the writer thread."""
-        self._database.put(decided_trace(decision, trace, content_hash, quarantined, self._clock(), part))
+        self._database.put(checked_decision(decision, trace, content_hash, quarantined, self._clock()))
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
@@ -655,7 +649,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         """
         item = self._database.queued(decision_id)
         if item is not None:
-            return stored_decision(item)
+            return replace(item, trace=item.trace.copy())
         rows = self._read(ask.decision_query(self.cell_id, decision_id))
         if not rows:
             return None
@@ -712,11 +706,10 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         hashes: NDArray[np.int64],
         labels: NDArray[np.int8],
         source: Source,
-        parts: Sequence[str | None] | None = None,
     ) -> NDArray[np.int64]:
         """Import labelled traces in one transaction, all or none; returns their sequence numbers."""
         traces, now = check_import(decisions, traces, hashes, labels), self._clock()
-        numbers, given = check_parts(parts, len(decisions)), imported_labels(decisions, labels, source)
+        given = imported_labels(decisions, labels, source)
         for decision in decisions:
             check_decision(decision)
             if self._database.queued(decision.id) is not None:
@@ -726,7 +719,7 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
             first = self._database.next_number(connection, LABEL.c.seq)
             self._refuse_known(connection, [decision.id for decision in decisions])
             for part in chunks(range(len(decisions))):
-                items = [DecidedTrace(decisions[i], traces[i], as_hash(hashes[i]), False, now, numbers[i]) for i in part]
+                items = [StoredDecision(decisions[i], traces[i], as_hash(hashes[i]), False, now) for i in part]
                 self._database.insert(connection, items)
                 rows = [label_row(self.cell_id, given[i], first + i, now, as_hash(hashes[i]), False) for i in part]
                 connection.execute(sa.insert(LABEL), rows)
@@ -752,7 +745,15 @@ class SqlStore(SqlOwning, SqlHistory, SqlTraces, SqlViews):
         A product's other cells are left out: a level that their streams certify says nothing certain of this one's, and
         a watch that counts them would notice too late that this cell has changed.
         """
-        return read_evidence(self._read(ask.evidence_query(self.cell_id, int(seq), int(since_version))))
+        rows = self._read(ask.evidence_query(self.cell_id, int(seq), int(since_version)))
+        return Evidence(
+            seq=np.array([row.seq for row in rows], dtype=np.int64),
+            lower=np.array([row.lower for row in rows], dtype=np.float64),
+            upper=np.array([row.upper for row in rows], dtype=np.float64),
+            success=np.array([row.success for row in rows], dtype=bool),
+            novel=np.array([row.reason == Reason.NOVEL for row in rows], dtype=bool),
+            silent=np.array([row.silent for row in rows], dtype=np.int64),
+        )
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first; what is queued is written first."""

@@ -36,17 +36,15 @@ from .schema import (
     LABEL,
     LEDGER,
     METADATA,
-    MIGRATION,
     PRODUCT_KEY,
-    SCHEMA,
     SCHEMA_KEY,
     SETTING,
     TRACE,
     VERSION,
-    held_schema,
+    check_schema,
 )
 
-TABLES = {name: table for name, table in METADATA.tables.items() if name != MIGRATION.name}  # of cells
+TABLES = METADATA.tables
 CHUNK = 500  # rows fetched at a time
 
 
@@ -65,7 +63,7 @@ def snapshot(url: str) -> Iterator[sa.Connection]:
     try:
         with engine.connect() as connection:  # rolled back at its end: there is nothing to commit
             connection.execution_options(**options)
-            _check(connection, name)
+            check_schema(connection, name)
             yield connection
     except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, UnicodeDecodeError) as error:  # the last of damaged names
         raise StoreError(f"Could not read {name}: {getattr(error, 'orig', None) or error}. {advice(error)}") from error
@@ -76,19 +74,6 @@ def snapshot(url: str) -> Iterator[sa.Connection]:
 def _take_any_text(connection: Any, record: Any) -> None:
     """Read a text of which a byte was damaged too, so that it can be named."""
     connection.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
-
-
-def _check(connection: sa.Connection, name: str) -> None:
-    held = held_schema(connection, set(sa.inspect(connection).get_table_names()))
-    if held != f"schema {SCHEMA}":
-        raise StoreError(
-            f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
-            "open an older one once, as `dengine status` does, to bring it up to date."
-        )
-    for table in TABLES.values():
-        missing = set(table.c.keys()) - {column["name"] for column in sa.inspect(connection).get_columns(table.name)}
-        if missing:
-            raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")
 
 
 def cells_of(connection: sa.Connection) -> list[str]:

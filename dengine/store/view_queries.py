@@ -10,35 +10,21 @@ import sqlalchemy as sa
 from ..records import Action, Reason, RetrainReport, Source
 from . import queries as ask
 from .connections import SqlDatabase
-from .records import FORGOTTEN, as_label
-from .schema import DECISION, LABEL, VERSION, unpack
-from .views import LABELS, HistoryFilter, Key, Kind, PastDecision, PastLabel, PastRetrain, Stretch, Tally, number_or_nan
+from .records import Key, StoredDecision, as_label, unpack
+from .schema import DECISION, LABEL, VERSION, read_decision
+from .views import LABELS, HistoryFilter, Kind, PastLabel, PastRetrain, Stretch, Tally
 
 Query = sa.Select[Any]
 
-OF_DECISION = (
-    "id", "time", "part", "action", "predicted", "lower", "upper", "n_success", "n_failure", "reason", "audit",
-    "propensity", "model_version", "content_hash", "quarantined",
-)  # fmt: skip
 OF_LABEL = (
     "seq", "time", "decision_id", "success", "source", "model_version", "content_hash", "quarantined", "silent",
 )  # fmt: skip
-SAID: sa.ColumnElement[int | None] = sa.func.nullif(
-    ask.counted(), FORGOTTEN
-)  # a label as it counts now: 0, 1, NULL where there is none, or is forgotten
 IN_TIME = (DECISION.c.time, DECISION.c.id)
-
-
-def past_query(cell_id: str) -> Query:
-    """Decisions with their labels, without traces and embeddings."""
-    labels = (SAID.label("success"), LABEL.c.source, LABEL.c.seq.label("label_seq"), LABEL.c.time.label("label_time"))
-    query = sa.select(*DECISION.c[OF_DECISION], *labels).select_from(ask.WITH_LABELS)
-    return query.where(DECISION.c.cell_id == cell_id)
 
 
 def page_query(cell_id: str, where: HistoryFilter, limit: int, beyond: Key | None, newest: bool) -> Query:
     """The newest decisions that are meant, newest first, or the oldest ones, oldest first."""
-    query = past_query(cell_id).where(*_meant(where)).limit(limit)
+    query = ask.past_query(cell_id).where(*_meant(where)).limit(limit)
     if beyond is not None:
         here, there = sa.tuple_(*IN_TIME), sa.tuple_(sa.literal(beyond[0], sa.Double), sa.literal(beyond[1]))
         query = query.where(here < there if newest else here > there)
@@ -55,7 +41,7 @@ def _meant(where: HistoryFilter) -> list[sa.ColumnElement[bool]]:
         found.append(DECISION.c.reason == where.reason.value)
     if where.label is not None:
         meant = LABELS[where.label]
-        found.append(SAID.is_(None) if meant is None else SAID.in_([int(meant)]))
+        found.append(ask.SAID.is_(None) if meant is None else ask.SAID.in_([int(meant)]))
     if where.since is not None:
         found.append(DECISION.c.time >= where.since)
     if where.until is not None:
@@ -80,7 +66,7 @@ def tally_query(cell_id: str, last: int | None) -> Query:
         newest = newest.order_by(*(column.desc() for column in IN_TIME)).limit(last)
     some = newest.subquery("newest")
     of = (LABEL.c.cell_id == some.c.cell_id) & (LABEL.c.decision_id == some.c.id)
-    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], SAID.label("success"))
+    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], ask.SAID.label("success"))
     times = (sa.func.min(some.c.time).label("first"), sa.func.max(some.c.time).label("last"))
     query = sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of))
     return query.group_by(*kind)
@@ -97,7 +83,7 @@ def stretch_query(cell_id: str, length: int) -> Query:
         every.c.action == Action.VERIFY.value,
         every.c.reason == Reason.NOVEL.value,
         accepted,
-        accepted & (SAID == 0),
+        accepted & (ask.SAID == 0),
     )
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
@@ -113,15 +99,15 @@ class SqlViews:
 
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
-    ) -> list[PastDecision]:
+    ) -> list[StoredDecision]:
         """Return the newest (or oldest) `limit` decisions that are meant, oldest first; read along `decision_time`."""
         rows = self._look(page_query(self.cell_id, where, limit, beyond, newest))
-        return [_past(row) for row in (rows[::-1] if newest else rows)]
+        return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
-    def past_decision(self, decision_id: str) -> PastDecision | None:
+    def past_decision(self, decision_id: str) -> StoredDecision | None:
         """Return one decision; None where it is unknown."""
-        rows = self._look(past_query(self.cell_id).where(DECISION.c.id == decision_id))
-        return _past(rows[0]) if rows else None
+        rows = self._look(ask.past_query(self.cell_id).where(DECISION.c.id == decision_id))
+        return read_decision(rows[0]) if rows else None
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
         """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
@@ -156,30 +142,6 @@ class SqlViews:
             return connection.execute(query).all()
 
 
-def _past(row: Any) -> PastDecision:
-    return PastDecision(
-        id=row.id,
-        time=row.time,
-        part=row.part,
-        action=Action(row.action),
-        predicted=Action(row.predicted),
-        lower=number_or_nan(row.lower),
-        upper=number_or_nan(row.upper),
-        n_success=row.n_success,
-        n_failure=row.n_failure,
-        reason=Reason(row.reason),
-        audit=row.audit,
-        propensity=number_or_nan(row.propensity),
-        model_version=row.model_version,
-        content_hash=row.content_hash,
-        quarantined=row.quarantined,
-        success=as_label(row.success),
-        source=None if row.source is None else Source(row.source),
-        label_seq=row.label_seq,
-        label_time=row.label_time,
-    )
-
-
 def _past_label(row: Any) -> PastLabel:
     return PastLabel(
         seq=row.seq,
@@ -193,7 +155,7 @@ def _past_label(row: Any) -> PastLabel:
         silent=row.silent,
         point=None if row.point is None else unpack(row.point),
         decided=row.decided,
-        lower=number_or_nan(row.lower),
-        upper=number_or_nan(row.upper),
+        lower=row.lower,
+        upper=row.upper,
         novel=row.reason == Reason.NOVEL,
     )

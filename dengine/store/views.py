@@ -5,7 +5,6 @@ What people look back on: past decisions, labels, retrains and counts, without t
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .records import FORGOTTEN, Event, Labelled, ModelVersion, Outcomes
+from .records import FORGOTTEN, Event, Key, Labelled, ModelVersion, Outcomes, StoredDecision
 
 
 def count_outcomes(kinds: Iterable[tuple[str, str, bool, int | None, int]]) -> Outcomes:
@@ -85,47 +84,6 @@ def summary(
 
 
 LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
-Key = tuple[float, str]  # of a decision in its history: time and id
-
-
-@dataclass(frozen=True, slots=True)
-class PastDecision:
-    """A decision as it was recorded, and what became of it; fields as in `Decision`.
-
-    time : of the decision, in seconds.  part : its number, where one was given.
-    content_hash, quarantined : as in `StoredDecision`.
-    success, source : the label, None where there is none.  label_seq, label_time : its number, and when it came.
-    """
-
-    id: str
-    time: float
-    part: str | None
-    action: Action
-    predicted: Action
-    lower: float
-    upper: float
-    n_success: int
-    n_failure: int
-    reason: Reason
-    audit: bool
-    propensity: float
-    model_version: int
-    content_hash: int
-    quarantined: bool
-    success: bool | None
-    source: Source | None
-    label_seq: int | None
-    label_time: float | None
-
-    @property
-    def key(self) -> Key:
-        """Its place in the history."""
-        return self.time, self.id
-
-    @property
-    def label(self) -> str:
-        """good, bad or none."""
-        return "none" if self.success is None else "good" if self.success else "bad"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +106,15 @@ class HistoryFilter:
         if self.label is not None and self.label not in LABELS:
             raise StoreError(f"Expected label to be one of {', '.join(LABELS)}, got {self.label!r}.")
 
-    def takes(self, past: PastDecision) -> bool:
+    def takes(self, past: StoredDecision) -> bool:
         """Whether a decision is meant."""
         return (
-            (self.action is None or past.action is self.action)
-            and (self.reason is None or past.reason is self.reason)
+            (self.action is None or past.decision.action is self.action)
+            and (self.reason is None or past.decision.reason is self.reason)
             and (self.label is None or past.label == self.label)
             and (self.since is None or past.time >= self.since)
             and (self.until is None or past.time < self.until)
-            and (self.predicted is None or past.predicted is self.predicted)
+            and (self.predicted is None or past.decision.predicted is self.predicted)
         )
 
 
@@ -196,7 +154,7 @@ class PastRetrain:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """How many decisions of one kind there are; fields as in `PastDecision`."""
+    """How many decisions of one kind there are; fields as in `StoredDecision`."""
 
     action: Action
     predicted: Action
@@ -245,13 +203,13 @@ class StoreViews(Protocol):
 
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
-    ) -> list[PastDecision]:
+    ) -> list[StoredDecision]:
         """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
 
         beyond : only those before (or after) this one: the next page.
         """
 
-    def past_decision(self, decision_id: str) -> PastDecision | None:
+    def past_decision(self, decision_id: str) -> StoredDecision | None:
         """Return one decision; None where it is unknown."""
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
@@ -273,30 +231,32 @@ class StoreViews(Protocol):
         """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
 
 
-def number_or_nan(value: float | None) -> float:
-    """Return a bound; what a database made NULL of was NaN."""
-    return math.nan if value is None else float(value)
-
-
-def stretch_of(decisions: Sequence[PastDecision]) -> Stretch:
+def stretch_of(decisions: Sequence[StoredDecision]) -> Stretch:
     """Count consecutive decisions."""
-    accepted = [past for past in decisions if past.action is Action.ACCEPT]
+    accepted = [past for past in decisions if past.decision.action is Action.ACCEPT]
     return Stretch(
         n=len(decisions),
         last=decisions[-1].time,
-        verified=sum(past.action is Action.VERIFY for past in decisions),
-        novel=sum(past.reason is Reason.NOVEL for past in decisions),
+        verified=sum(past.decision.action is Action.VERIFY for past in decisions),
+        novel=sum(past.decision.reason is Reason.NOVEL for past in decisions),
         accepted=len(accepted),
         bad=sum(past.success is False for past in accepted),
     )
 
 
-def tally_of(decisions: Iterable[PastDecision]) -> Tally:
+def tally_of(decisions: Iterable[StoredDecision]) -> Tally:
     """Count decisions, oldest first."""
     counts: dict[tuple[Action, Action, Reason, bool, bool, bool | None], int] = {}
     times: list[float] = []
     for past in decisions:
-        kind = (past.action, past.predicted, past.reason, past.audit, past.quarantined, past.success)
+        kind = (
+            past.decision.action,
+            past.decision.predicted,
+            past.decision.reason,
+            past.decision.audit,
+            past.quarantined,
+            past.success,
+        )
         counts[kind] = counts.get(kind, 0) + 1
         times.append(past.time)
     kinds = tuple(Kind(*kind, n) for kind, n in counts.items())

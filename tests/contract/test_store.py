@@ -90,8 +90,13 @@ def test_a_decision_is_found_at_once_and_after_the_flush(store: Store) -> None:
     for _ in range(2):
         found = store.get_decision("a")
         assert found is not None
-        assert (found.id, found.action, found.predicted, found.audit) == ("a", Action.VERIFY, Action.ACCEPT, True)
-        assert (found.reason, found.model_version, found.content_hash) == (Reason.AUDIT, 3, -(2**63))
+        assert (found.decision.id, found.decision.action, found.decision.predicted, found.decision.audit) == (
+            "a",
+            Action.VERIFY,
+            Action.ACCEPT,
+            True,
+        )
+        assert (found.decision.reason, found.decision.model_version, found.content_hash) == (Reason.AUDIT, 3, -(2**63))
         assert (found.quarantined, found.success, found.source) == (False, None, None)
         np.testing.assert_array_equal(found.trace, values)
         store.flush()
@@ -135,24 +140,24 @@ def test_an_unsigned_hash_is_refused_before_it_is_queued(store: Store) -> None:
 
 @pytest.mark.parametrize("part", [None, "", "SN-0042", "Stück 7\\0"])
 def test_the_number_of_the_part_returns_before_and_after_the_flush(store: Store, part: str | None) -> None:
-    store.put_decision(decision("a"), trace(), 1, False, part)
+    store.put_decision(replace(decision("a"), part=part), trace(), 1, False)
     for _ in range(2):
-        assert store.get_decision("a").part == part
+        assert store.get_decision("a").decision.part == part
         store.flush()
     store.put_label("a", True, Source.VERIFICATION, 0, None)
-    assert store.get_decision("a").part == part
+    assert store.get_decision("a").decision.part == part
 
 
 def test_a_decision_without_a_part_has_none(store: Store) -> None:
     put(store, "a")
     store.flush()
-    assert store.get_decision("a").part is None
+    assert store.get_decision("a").decision.part is None
 
 
 @pytest.mark.parametrize("part", ["SN\0", "\ud800", 42])
 def test_a_part_that_no_database_holds_is_refused_before_it_is_queued(store: Store, part: object) -> None:
     with pytest.raises(StoreError, match="part's number"):
-        store.put_decision(decision("a"), trace(), 1, False, part)
+        store.put_decision(replace(decision("a"), part=part), trace(), 1, False)
     store.flush()
     assert store.status()["decisions"] == 0
 
@@ -356,19 +361,17 @@ def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quaran
     assert len(store.evidence_since(4).seq) == 0
 
 
-@pytest.mark.parametrize("parts", [None, ["x", None, "z"]])
-def test_an_import_keeps_the_number_of_each_part(store: Store, parts: list[str | None] | None) -> None:
-    traces, hashes, labels = trace(1, (3, C, T)), np.arange(3), np.ones(3, dtype=np.int8)
-    store.put_labelled([decision(name) for name in "abc"], traces, hashes, labels, Source.VERIFICATION, parts)
-    assert [store.get_decision(name).part for name in "abc"] == (parts or [None, None, None])
+def test_an_import_keeps_the_number_of_each_part(store: Store) -> None:
+    parts, traces, hashes, labels = ["x", None, "z"], trace(1, (3, C, T)), np.arange(3), np.ones(3, dtype=np.int8)
+    decisions = [replace(decision(name), part=part) for name, part in zip("abc", parts, strict=True)]
+    store.put_labelled(decisions, traces, hashes, labels, Source.VERIFICATION)
+    assert [store.get_decision(name).decision.part for name in "abc"] == parts
 
 
-@pytest.mark.parametrize(("parts", "said"), [(["x"], "each of 2 traces, got 1"), (["x", "y\0"], "plain text")])
-def test_an_import_with_bad_parts_adds_nothing(store: Store, parts: list[str], said: str) -> None:
-    with pytest.raises(StoreError, match=said):
-        store.put_labelled(
-            [decision("a"), decision("b")], trace(0, (2, C, T)), np.arange(2), np.ones(2), Source.VERIFICATION, parts
-        )
+def test_an_import_with_a_bad_part_adds_nothing(store: Store) -> None:
+    decisions = [replace(decision("a"), part="x"), replace(decision("b"), part="y\0")]
+    with pytest.raises(StoreError, match="plain text"):
+        store.put_labelled(decisions, trace(0, (2, C, T)), np.arange(2), np.ones(2), Source.VERIFICATION)
     assert (store.get_decision("a"), store.status()["decisions"]) == (None, 0)
 
 
@@ -635,7 +638,7 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         store.save_settings({"k": "v"})
         store.put_label("a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
         store.put_version(report(1), 1, {"w": values})
-        store.put_decision(decision("accepted", Action.ACCEPT), trace(), 1, False, "SN-1")
+        store.put_decision(replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False)
         store.put_decision(decision("silent"), trace(), 1, False)
         store.put_label("silent", True, Source.VERIFICATION, 0, None, silent=4)
         store.put_event("started", "for the first time")
@@ -647,7 +650,7 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         assert store.points_since(0, 1).points.tolist() == [[0.5]]
         assert store.get_decision("unreported") is not None
         assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
-        assert store.get_decision("accepted").part == "SN-1"
+        assert store.get_decision("accepted").decision.part == "SN-1"
         assert [event.text for event in store.events()] == ["for the first time"]
         store.put_event("started", "again")
         assert [event.number for event in store.events()] == [1, 2]
@@ -814,7 +817,7 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
     connection.close()  # and the last one to close empties the journal into the file
     before = file.read_bytes()
-    with pytest.raises(StoreError, match="schema 3, found schema 99"):
+    with pytest.raises(StoreError, match="schema 1, found schema 99"):
         SqlStore(str(file), "another cell")
     assert file.read_bytes() == before
 
@@ -825,7 +828,7 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     with sqlite3.connect(file) as connection:
         connection.execute(f"CREATE TABLE {table}")
     before = file.read_bytes()
-    with pytest.raises(StoreError, match="schema 3, found tables of another program"):
+    with pytest.raises(StoreError, match="schema 1, found tables of another program"):
         SqlStore(str(file))
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]

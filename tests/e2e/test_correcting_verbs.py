@@ -38,7 +38,7 @@ def store(used: Path, tmp_path: Path) -> Path:
 def ids(store: Path) -> list[str]:
     """Of the decisions, in the order of their labels."""
     with DataEngine.open(store) as engine:
-        return [past.id for past in sorted(history(engine.store), key=lambda past: past.label_seq)]
+        return [past.decision.id for past in sorted(history(engine.store), key=lambda past: past.label_seq)]
 
 
 def labels(store: Path) -> dict[int, int]:

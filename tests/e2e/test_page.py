@@ -204,7 +204,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watc
     page = watched.page
     with demo.store() as store:
         labelled = next(past for past in store.decisions(HistoryFilter(label="good"), 1, newest=False))
-    opened(page, demo, f"part?id={labelled.id}")
+    opened(page, demo, f"part?id={labelled.decision.id}")
     page.get_by_role("button", name="It was bad").focus()
     page.keyboard.press("Enter")
     expect(page.get_by_label("Your name")).to_be_focused()
@@ -221,7 +221,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watc
     expect(page.locator("#part .story")).to_contain_text(f"corrected from good to bad by {AUTHOR}", timeout=PATIENT)
     assert page.title().startswith("Part")  # what was typed stayed text
     with demo.store() as store:
-        assert store.past_decision(labelled.id).success is False
+        assert store.past_decision(labelled.decision.id).success is False
         assert store.corrections()[-1].author == AUTHOR
 
 
@@ -261,7 +261,7 @@ def test_a_retrain_a_rollback_and_an_export_are_done_and_recorded(watched: Watch
         archive.extractall(tmp_path)
     with demo.store() as store:
         done = {event.kind for event in store.events(20) if event.author == "Robin"}
-        trace = store.get_decision(store.decisions(HistoryFilter(), 1)[0].id).trace
+        trace = store.get_decision(store.decisions(HistoryFilter(), 1)[0].decision.id).trace
     assert done == {"retrain", "rollback", "export"}
     assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
 

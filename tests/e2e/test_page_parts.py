@@ -121,7 +121,7 @@ def test_stops_stand_beside_the_time_that_they_are_not_taken_off(
 ) -> None:
     cell_runs(service, stream, 70)
     (accepted,) = service.reading.decisions(HistoryFilter(action=Action.ACCEPT), 1)
-    asyncio.run(service.report(accepted.id, False))
+    asyncio.run(service.report(accepted.decision.id, False))
     service.reading.flush()
     for view in ("/", "/how"):
         assert "s each; system stops, not taken off: 1</p>" in client.get(view).text

@@ -169,7 +169,7 @@ def test_a_trace_is_the_same_in_every_form(client: Client, service: CellService,
     validate(answer.json(), "Answer", client)
     known = asyncio.run(service.find(f"form {form}"))
     assert np.array_equal(known.trace[0], stream.X[7])
-    assert known.part == "P1"
+    assert known.decision.part == "P1"
 
 
 def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(client: Client, stream: Dataset) -> None:
@@ -546,7 +546,7 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
     assert all(" level=" in line and " message=" in line for line in lines.splitlines()), lines
     assert TOKEN not in out + lines
     with DataEngine.open(tmp_path / "cell.db") as engine:
-        assert engine.find("order-0").action == "verify"
+        assert engine.find("order-0").decision.action == "verify"
 
 
 def test_what_the_verb_does_by_default_is_what_serving_does() -> None:

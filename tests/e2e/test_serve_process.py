@@ -158,7 +158,11 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
             known = engine.find(id_)
-            assert (known.action, known.reason, known.lower) == (answer["action"], answer["reason"], answer["lower"])
+            assert (known.decision.action, known.decision.reason, known.decision.lower) == (
+                answer["action"],
+                answer["reason"],
+                answer["lower"],
+            )
 
 
 class Insertions:

@@ -208,13 +208,13 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: Cell, make_data
     asked = cell.service.submit(lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1])
     found = asked.result(60)
     assert len(found) == len(data)
-    actions = [each.action for each in found]
+    actions = [each.decision.action for each in found]
     assert {Action.VERIFY, Action.ACCEPT} <= set(actions)
     assert robot.checked == [i for i, action in enumerate(actions) if action is Action.VERIFY]
     for i, each in enumerate(found):
-        if each.action is Action.VERIFY:
+        if each.decision.action is Action.VERIFY:
             assert each.success is bool(data.y[i])
-        elif each.action is Action.ACCEPT:
+        elif each.decision.action is Action.ACCEPT:
             assert each.success is (None if data.y[i] else False)  # a stop is told, silence is not
     assert robot.said == []
 

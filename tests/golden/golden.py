@@ -22,7 +22,6 @@ from dengine import Action, DataEngine, Dataset, Recipe, ReplayCell, export_torc
 
 ACTIONS = tuple(Action)
 LEARNED, ASKED = 130, 60  # traces that a kept engine learned from, and that it is asked about afterwards
-STORES = ("pca", "umap")
 
 
 @dataclass(frozen=True)
@@ -65,14 +64,10 @@ def short() -> Dataset:
     return replace(data, X=np.ascontiguousarray(data.X[:, 400:800:2]))
 
 
-def kept_recipe(name: str) -> Recipe:
-    recipe = replace(Recipe.load(name), retrain_every=50, window=200, novelty=0.0)
-    return recipe.with_policy(**LOOSE, audit_rate=0.1)
-
-
-def fill(name: str, url: str | None) -> DataEngine:
+def fill() -> DataEngine:
     """An engine that learned, retrained, and took labels after its last retrain."""
-    engine = DataEngine(recipe=kept_recipe(name), store=url, seed=11, replaying=True)
+    recipe = replace(Recipe.load("conv"), retrain_every=50, window=200, novelty=0.0)
+    engine = DataEngine(recipe=recipe.with_policy(**LOOSE, audit_rate=0.1), seed=11, replaying=True)
     list(engine.run(ReplayCell(short(), np.arange(LEARNED)), LEARNED))
     return engine
 
@@ -100,19 +95,9 @@ def machine() -> dict[str, str]:
 def make(folder: Path) -> None:
     for name, case in REPLAYS.items():
         np.savez_compressed(folder / f"replay-{name}.npz", **case.play())
-    answers: dict[str, Any] = {}
-    with fill("conv", None) as engine:
+    with fill() as engine:
         export_torchscript(engine, folder / "model.ts")
-        answers["model.ts"] = ask(load_exported(folder / "model.ts").decide)
-    for name in STORES:
-        path = folder / f"{name}.sqlite"
-        path.unlink(missing_ok=True)
-        fill(name, str(path)).close()
-        with DataEngine.open(str(path)) as engine:
-            answers[name] = [[engine.version, engine.new_labels], ask(engine.decide)]
-        path.unlink()
-        with fill(name, str(path)):
-            pass  # the kept file is as the engine left it, the questions not in it
+    answers = {"model.ts": ask(load_exported(folder / "model.ts").decide)}
     (folder / "answers.json").write_text(json.dumps({"machine": machine(), "answers": answers}), encoding="utf-8")
 
 

@@ -1,7 +1,6 @@
-"""Decisions as they were before the modules became folders: replays, stores and an exported file, bit for bit."""
+"""Decisions as they were before the modules became folders: replays and an exported file, bit for bit."""
 
 import json
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import DataEngine, load_exported
+from dengine import load_exported
 
 GOLDEN = Path(__file__).parent
 sys.path.insert(0, str(GOLDEN))
-from golden import REPLAYS, STORES, ask, machine  # the very lines that made the fixtures
+from golden import REPLAYS, ask, machine  # the very lines that made the fixtures
 
 KEPT = json.loads((GOLDEN / "answers.json").read_text(encoding="utf-8"))
 # Another processor or another NumPy may add in another order: a reference on a ball's surface then falls on either side.
@@ -41,15 +40,6 @@ def test_a_replay_takes_every_decision_that_it_took(name: str) -> None:
                 np.testing.assert_array_equal(found[key], kept[key], err_msg=key)
         else:
             assert (found["action"] != kept["action"]).mean() <= MOVED
-
-
-@pytest.mark.parametrize("name", STORES)
-def test_a_store_is_opened_and_answers_as_it_did(name: str, tmp_path: Path) -> None:
-    path = shutil.copy(GOLDEN / f"{name}.sqlite", tmp_path / "engine.sqlite")
-    version, kept = KEPT["answers"][name]
-    with DataEngine.open(str(path)) as engine:
-        assert [engine.version, engine.new_labels] == version
-        assert_same(ask(engine.decide), kept)
 
 
 def test_an_exported_file_is_loaded_and_answers_as_it_did() -> None:

@@ -124,7 +124,7 @@ def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, stream: Dat
         assert await plant.value("VerifiedShare") == actions.count(VERIFY) / len(actions)
         assert (await plant.value("SafeMode"), await plant.value("Shadow")) == (False, False)
         known = await plant.service.find("order-7")
-        assert (known.part, np.array_equal(known.trace[0], stream.X[7])) == ("P7", True)
+        assert (known.decision.part, np.array_equal(known.trace[0], stream.X[7])) == ("P7", True)
 
     run(cell())
 

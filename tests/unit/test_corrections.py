@@ -455,7 +455,7 @@ def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bou
     assert (before.action, after.action) == (Action.ACCEPT, Action.VERIFY)
     assert (after.n_success, after.n_failure) == (before.n_success, before.n_failure)
     assert after.lower < before.lower
-    assert engine.store.get_decision(before.id).lower == before.lower
+    assert engine.store.get_decision(before.id).decision.lower == before.lower
     assert said.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
     event = engine.store.events(1)[0]
     assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (0.1, 0.001, "kim")

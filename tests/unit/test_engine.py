@@ -398,7 +398,7 @@ def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(trained: Data
     labels = len(trained.store.labelled().labels)
     trained.report("from-a-lost-process", success=False, trace=good(data))
     stored = trained.store.get_decision("from-a-lost-process")
-    assert (stored.action, stored.success, stored.source) == (Action.ACCEPT, False, Source.STOP)
+    assert (stored.decision.action, stored.success, stored.source) == (Action.ACCEPT, False, Source.STOP)
     np.testing.assert_array_equal(stored.trace[0], good(data))
     assert len(trained.store.labelled().labels) == labels + 1
     with pytest.raises(ReportError, match="reported first"):
@@ -410,7 +410,7 @@ def test_a_lost_stop_is_never_called_an_audit(data: Dataset) -> None:
     for i, x in enumerate(data.X[:20]):
         engine.report(f"lost-{i}", success=False, trace=x)
         stored = engine.store.get_decision(f"lost-{i}")
-        assert (stored.source, stored.audit, stored.reason) == (Source.STOP, False, Reason.CERTAIN)
+        assert (stored.source, stored.decision.audit, stored.decision.reason) == (Source.STOP, False, Reason.CERTAIN)
 
 
 def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(trained: DataEngine, data: Dataset) -> None:

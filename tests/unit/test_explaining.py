@@ -74,14 +74,14 @@ def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
     with played(open_store("sqlite", tmp_path), data, RECIPES[name]) as engine:
         balls, rejected = 0, 0
         for past in list(engine.history())[::3]:
-            found = engine.explain(past.id)
+            found = engine.explain(past.decision.id)
             assert not any("Counted again" in note or "another bound" in note for note in found.notes), (past, found.notes)
             assert found.decision == past
             if found.bound is not None:
                 balls += 1
-                rejected += past.predicted is Action.REJECT
+                rejected += past.decision.predicted is Action.REJECT
                 needed = {Action.ACCEPT: found.bound.successes_needed, Action.REJECT: found.bound.failures_needed}
-                assert (needed.get(past.predicted, 1) == 0) or past.predicted is Action.VERIFY
+                assert (needed.get(past.decision.predicted, 1) == 0) or past.decision.predicted is Action.VERIFY
         assert balls > 30
         assert rejected or name != "two balls"
 
@@ -94,12 +94,12 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
     data = Dataset(np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice")
     with played(open_store(kind, tmp_path), data, RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")
-        found = engine.explain(past.id, neighbours=15)
+        found = engine.explain(past.decision.id, neighbours=15)
         distances = [each.distance for each in found.neighbours]
         assert distances == sorted(distances)
         assert found.radius == pytest.approx(engine.recipe.radius)
         assert [each.inside for each in found.neighbours] == [each <= found.radius for each in distances]
-        own = engine.store.get_decision(past.id)
+        own = engine.store.get_decision(past.decision.id)
         assert own is not None
         for each in found.neighbours:
             assert each.decision_id is not None
@@ -109,7 +109,7 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
             assert stored.content_hash != own.content_hash  # the same part, which came before, has no vote
             np.testing.assert_array_equal(each.trace, stored.trace)
             z = engine.model.predictor.embed(_tensor(stored.trace))[each.space].numpy()
-            assert np.linalg.norm(z - own.embedding[each.space]) == pytest.approx(each.distance, abs=1e-3)
+            assert np.linalg.norm(z - own.decision.embedding[each.space]) == pytest.approx(each.distance, abs=1e-3)
 
 
 def _tensor(trace: np.ndarray) -> Any:
@@ -120,7 +120,7 @@ def _tensor(trace: np.ndarray) -> Any:
 
 def test_a_closed_store_explains_as_its_engine_did(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     with played(open_store("sqlite", tmp_path), make_data(200, samples=60), RECIPES["pooled"]) as engine:
-        shown = {past.id: engine.explain(past.id).record() for past in list(engine.history())[::17]}
+        shown = {past.decision.id: engine.explain(past.decision.id).record() for past in list(engine.history())[::17]}
         cell = engine.store.cell_id
     with SqlStore(str(tmp_path / "engine.db"), cell) as store:
         assert {id_: explain_stored(store, id_).record() for id_ in shown} == shown
@@ -130,13 +130,17 @@ def test_a_version_that_is_not_kept_gives_way_to_the_present_one_and_that_is_sai
     make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
     with played(open_store("sqlite", tmp_path), make_data(260, samples=60), RECIPES["local"]) as engine:
-        old = next(past for past in engine.history() if past.model_version == 1 and past.reason is Reason.UNCERTAIN)
-        first, cell, version = engine.explain(old.id), engine.store.cell_id, engine.version
+        old = next(
+            past
+            for past in engine.history()
+            if past.decision.model_version == 1 and past.decision.reason is Reason.UNCERTAIN
+        )
+        first, cell, version = engine.explain(old.decision.id), engine.store.cell_id, engine.version
         assert first.neighbours_version == 1
     with sqlite3.connect(tmp_path / "engine.db") as connection:
         connection.execute("UPDATE model_version SET state = NULL WHERE version = 1")
     with SqlStore(str(tmp_path / "engine.db"), cell) as store:
-        again = explain_stored(store, old.id)
+        again = explain_stored(store, old.decision.id)
     assert again.neighbours_version == version > 1
     assert f"by version {version}, the present one; version 1, which answered, is not kept any more" in said_of(again)
     assert again.decision == first.decision
@@ -146,10 +150,14 @@ def test_a_version_that_is_not_kept_gives_way_to_the_present_one_and_that_is_sai
 def test_in_memory_too_a_version_that_is_not_kept_gives_way_to_the_present_one(make_data: Callable[..., Dataset]) -> None:
     store = MemoryStore()
     with played(store, make_data(200, samples=60), RECIPES["pooled"]) as engine:
-        old = next(past for past in engine.history() if past.model_version == 1 and past.reason is Reason.UNCERTAIN)
-        assert engine.explain(old.id).neighbours_version == 1
+        old = next(
+            past
+            for past in engine.history()
+            if past.decision.model_version == 1 and past.decision.reason is Reason.UNCERTAIN
+        )
+        assert engine.explain(old.decision.id).neighbours_version == 1
         del store._states[1]
-        found = engine.explain(old.id)
+        found = engine.explain(old.decision.id)
         assert found.neighbours_version == engine.version > 1
         assert found.bound is not None
         assert (found.bound.accept_at, found.bound.reject_at) == (None, None)
@@ -166,7 +174,8 @@ def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable
     policy = found.recipe.policy
     for n_success, n_failure in ((38, 0), (3, 1), (0, 0), (100, 12), (0, 30), (1, 60)):
         lower, upper = policy.bound(n_success, n_failure)
-        counted = replace(past, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper, reason=Reason.UNCERTAIN)
+        made = replace(past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper)
+        counted = replace(past, decision=replace(made, reason=Reason.UNCERTAIN))
         bound = bound_of(counted, found)
         assert bound is not None
         assert bound.successes_needed is not None
@@ -178,7 +187,7 @@ def test_the_bound_says_how_many_more_labels_would_have_done(make_data: Callable
             if needed:
                 assert reached[1][0] < at if of_success else reached[1][1] > at
         assert bound.repeats
-    wrong = bound_of(replace(counted, lower=0.5), found)
+    wrong = bound_of(replace(counted, decision=replace(made, lower=0.5)), found)
     assert wrong is not None
     assert not wrong.repeats
 
@@ -195,10 +204,10 @@ def test_each_reason_is_explained_by_what_it_rests_on(make_data: Callable[..., D
         novel, constant, cut, saturated = (engine.explain(engine.decide(x).id) for x in (bump, dead, torn, loud))
         (audit,) = engine.history(last=1, reason="audit")
         (first,) = list(engine.history())[:1]
-        audited, untrained = engine.explain(audit.id), engine.explain(first.id)
+        audited, untrained = engine.explain(audit.decision.id), engine.explain(first.decision.id)
         engine.report("lost", success=False, trace=data.X[3] + 0.01)
         lost = engine.explain("lost")
-    assert novel.decision.reason is Reason.NOVEL
+    assert novel.decision.decision.reason is Reason.NOVEL
     assert novel.novelty is not None
     assert novel.novelty.is_novel
     assert f"in level {novel.novelty.level:.2f} times the limit" in said_of(novel)
@@ -234,8 +243,8 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         found = engine.explain(usual.id)
         assert "in safe mode, in which every part is: too many traces were novel" in said_of(found)
         assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(found)
-        before = next(past for past in engine.history() if past.reason is Reason.CERTAIN)
-        assert "safe mode" not in said_of(engine.explain(before.id))
+        before = next(past for past in engine.history() if past.decision.reason is Reason.CERTAIN)
+        assert "safe mode" not in said_of(engine.explain(before.decision.id))
 
 
 def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
@@ -262,12 +271,12 @@ def test_a_rival_has_its_own_numbers_and_no_neighbours(make_data: Callable[..., 
         for _ in engine.run(ReplayCell(make_data(60, samples=60)), 60):
             pass
         (past,) = engine.history(last=1, action="accept")
-        found = engine.explain(past.id)
+        found = engine.explain(past.decision.id)
         assert "Mean gives 30 successes, 0 failures, bound 0.800 to 1.000" in said_of(found)
         assert found.neighbours == ()
         assert found.envelope is not None
     with SqlStore(str(tmp_path / "engine.db")) as store:  # without the rival at hand
-        assert explain_stored(store, past.id).record() == found.record()
+        assert explain_stored(store, past.decision.id).record() == found.record()
 
 
 def test_every_reason_has_words() -> None:
@@ -345,6 +354,6 @@ def test_a_trace_is_not_held_against_itself(make_data: Callable[..., Dataset]) -
     with DataEngine("pca") as engine:
         for x in data.X:
             engine.report(engine.decide(x).id, success=True)
-        found = engine.explain(next(engine.history()).id)
+        found = engine.explain(next(engine.history()).decision.id)
         assert found.envelope is not None
         assert found.envelope.n == len(set(content_hash(data.X))) - 1 == 59

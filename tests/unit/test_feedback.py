@@ -255,7 +255,7 @@ def test_a_part_that_comes_often_has_one_vote_and_none_on_itself(stream: Dataset
     near = lambda: x + rng.normal(0, 0.01, x.shape).astype(np.float32)  # noqa: E731
     before = engine.decide(near(), part="other")
     for _ in range(30):
-        engine.report(engine.store.get_decision(_verified(engine, near(), "often")).id, True)
+        engine.report(engine.store.get_decision(_verified(engine, near(), "often")).decision.id, True)
     engine.retrain()
     counted = engine.decide(near(), part="other")
     itself = engine.decide(near(), part="often")

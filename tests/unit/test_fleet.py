@@ -248,7 +248,7 @@ def test_bad_traces_leave_gaps_and_nothing_else(fleet: Fleet, parts: Dataset, pr
 
 
 def labelled_ids(engine: DataEngine) -> list[str]:
-    return [past.id for past in engine.history() if past.success is not None]
+    return [past.decision.id for past in engine.history() if past.success is not None]
 
 
 def test_what_one_cell_puts_right_reaches_its_sisters_and_a_reopened_one(

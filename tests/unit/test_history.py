@@ -1,7 +1,6 @@
 """Looking back: pages, filters and counts of a store, in memory, in SQLite and in PostgreSQL."""
 
 import os
-import sqlite3
 import uuid
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -17,9 +16,9 @@ from dengine.errors import SettingError, StoreError
 from dengine.history.status import beside, history, interleaved
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import MemoryStore, Store
-from dengine.store.records import Event
+from dengine.store.records import Event, StoredDecision
 from dengine.store.view_queries import page_query
-from dengine.store.views import HistoryFilter, PastDecision, PastRetrain, stretch_of, tally_of
+from dengine.store.views import HistoryFilter, PastRetrain, stretch_of, tally_of
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 KINDS = (  # action, predicted, reason, audit
@@ -63,8 +62,10 @@ def store(make: Callable[[Callable[[], float]], Store]) -> Store:
     rng = np.random.default_rng(0)
     for i in range(N):
         action, predicted, reason, audit = KINDS[int(rng.integers(len(KINDS)))]
-        decision = Decision(f"d{i:03d}", action, predicted, 0.2, 0.9, i, 1, ((0.1, 0.2),), i // 10, reason, audit, 0.1)
-        made.put_decision(decision, np.full((1, 5), i, np.float32), i, quarantined=i % 13 == 5, part=f"p{i}")
+        decision = Decision(
+            f"d{i:03d}", action, predicted, 0.2, 0.9, i, 1, ((0.1, 0.2),), i // 10, reason, audit, 0.1, f"p{i}"
+        )
+        made.put_decision(decision, np.full((1, 5), i, np.float32), i, quarantined=i % 13 == 5)
         if action is not Action.REJECT and rng.random() < 0.6:
             source = Source.STOP if action is Action.ACCEPT else Source.AUDIT if audit else Source.VERIFICATION
             made.put_label(decision.id, action is not Action.ACCEPT and i % 3 > 0, source, i // 10, np.ones(2, np.float32))
@@ -75,13 +76,13 @@ def store(make: Callable[[Callable[[], float]], Store]) -> Store:
     return made
 
 
-def everything(store: Store) -> list[PastDecision]:
+def everything(store: Store) -> list[StoredDecision]:
     return list(history(store))
 
 
 def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = everything(store)
-    assert sorted(past.id for past in whole) == [f"d{i:03d}" for i in range(N)]
+    assert sorted(past.decision.id for past in whole) == [f"d{i:03d}" for i in range(N)]
     assert [past.key for past in whole] == sorted(past.key for past in whole)
     monkeypatch.setattr(dengine.history.status, "PAGE", 7)
     assert everything(store) == whole
@@ -93,9 +94,9 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: Store, monkey
     monkeypatch.setattr(dengine.history.status, "PAGE", 4)
     whole = everything(store)
     middle = whole[N // 2].time
-    filters: list[tuple[dict, Callable[[PastDecision], bool]]] = [
-        ({"action": "accept"}, lambda past: past.action is Action.ACCEPT),
-        ({"reason": Reason.NOVEL}, lambda past: past.reason is Reason.NOVEL),
+    filters: list[tuple[dict, Callable[[StoredDecision], bool]]] = [
+        ({"action": "accept"}, lambda past: past.decision.action is Action.ACCEPT),
+        ({"reason": Reason.NOVEL}, lambda past: past.decision.reason is Reason.NOVEL),
         ({"label": "good"}, lambda past: past.success is True),
         ({"label": "bad"}, lambda past: past.success is False),
         ({"label": "none"}, lambda past: past.success is None),
@@ -105,7 +106,7 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: Store, monkey
     ]
     for asked, takes in filters:
         if "action" in asked and "label" in asked:
-            expected = [past for past in whole if past.action is Action.VERIFY and takes(past)]
+            expected = [past for past in whole if past.decision.action is Action.VERIFY and takes(past)]
         else:
             expected = [past for past in whole if takes(past)]
         assert expected, asked
@@ -115,21 +116,11 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(store: Store, monkey
 
 def test_a_past_decision_has_its_part_its_evidence_and_its_label(store: Store) -> None:
     labelled = next(past for past in everything(store) if past.label == "good")
-    stored = store.get_decision(labelled.id)
+    stored = store.get_decision(labelled.decision.id)
     assert stored is not None
-    for name in (
-        "action",
-        "predicted",
-        "reason",
-        "model_version",
-        "content_hash",
-        "quarantined",
-        "success",
-        "source",
-        "part",
-    ):
-        assert getattr(labelled, name) == getattr(stored, name)
-    assert store.past_decision(labelled.id) == labelled
+    assert stored == labelled
+    assert (stored.trace.size, labelled.trace.size) == (5, 0)
+    assert store.past_decision(labelled.decision.id) == labelled
     assert labelled.label_time is not None
     assert labelled.label_time >= labelled.time
     assert store.past_decision("unknown") is None
@@ -188,7 +179,7 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: Stor
     told = [label for label in every if not label.quarantined]
     assert [label.seq for label in told] == known.seq.tolist()
     assert [label.novel for label in told] == known.novel.tolist()
-    by_id = {past.id: past for past in everything(store)}
+    by_id = {past.decision.id: past for past in everything(store)}
     assert all(label.decided == by_id[label.decision_id].time for label in every)
 
 
@@ -221,7 +212,7 @@ def test_retrains_and_events_stand_where_they_happened(store: Store) -> None:
     whole = everything(store)
     merged = list(interleaved(whole, beside(store)))
     assert [each.time for each in merged] == sorted(each.time for each in merged)
-    assert [each for each in merged if isinstance(each, PastDecision)] == whole
+    assert [each for each in merged if isinstance(each, StoredDecision)] == whole
     assert sum(isinstance(each, PastRetrain) for each in merged) == 6
     assert [each.text[:5] for each in merged if isinstance(each, Event)] == ["too m", "fresh"]
     late = beside(store, since=whole[-1].time)
@@ -236,8 +227,8 @@ def test_an_engine_shows_what_it_decided() -> None:
         engine.report(first.id, success=True)
         second = engine.decide(np.arange(30.0)[::-1], part="A-7")
         shown = list(engine.history())
-        assert [past.id for past in shown] == [first.id, second.id]
-        assert (shown[0].label, shown[1].label, shown[1].part) == ("good", "none", "A-7")
+        assert [past.decision.id for past in shown] == [first.id, second.id]
+        assert (shown[0].label, shown[1].label, shown[1].decision.part) == ("good", "none", "A-7")
         assert list(engine.history(label="none")) == shown[1:]
 
 
@@ -254,13 +245,3 @@ def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:
                 plan = [row.detail for row in connection.execute(sa.text(f"EXPLAIN QUERY PLAN {text}"))]
             assert any("decision USING INDEX decision_time" in step for step in plan), plan
             assert not any("TEMP B-TREE" in step for step in plan), plan
-
-
-def test_a_store_that_was_made_without_the_index_gets_it_when_it_is_opened(tmp_path: Path) -> None:
-    path = tmp_path / "engine.db"
-    SqlStore(str(path)).close()
-    with sqlite3.connect(path) as connection:
-        connection.execute("DROP INDEX decision_time")
-    SqlStore(str(path)).close()
-    with sqlite3.connect(path) as connection:
-        assert connection.execute("SELECT name FROM sqlite_master WHERE name = 'decision_time'").fetchall()

@@ -11,6 +11,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +44,7 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     traces = rng.normal(size=(n, 1, T)).astype(np.float32)
     store.save_settings({"recipe": "a = 1", "trace": "{}"})
     for i in range(n):
-        store.put_decision(decision(f"d{i}"), traces[i], i - 3, i == 5, f"SN-{i}")
+        store.put_decision(replace(decision(f"d{i}"), part=f"SN-{i}"), traces[i], i - 3, i == 5)
     store.flush()
     points = rng.normal(size=(n, 2)).astype(np.float32)
     store.put_label("d0", True, Source.VERIFICATION, 1, points[0], silent=2)
@@ -157,9 +158,11 @@ def test_two_stores_on_one_cell_write_one_chain(place: tuple[str, str]) -> None:
 
 
 def test_values_that_databases_hold_in_their_own_way_are_whole(place: tuple[str, str]) -> None:
-    odd = Decision("Ünïcode ✓", Action.VERIFY, Action.VERIFY, -0.0, 1.0, 0, 0, None, 0, Reason.CONSTANT, False, 1.0)
+    odd = Decision(
+        "Ünïcode ✓", Action.VERIFY, Action.VERIFY, -0.0, 1.0, 0, 0, None, 0, Reason.CONSTANT, False, 1.0, "Stück 7\\0"
+    )
     with SqlStore(*place, clock=lambda: 7) as store:
-        store.put_decision(odd, np.array([np.nan, np.inf, -0.0], np.float32), -(2**63), True, "Stück 7\\0")
+        store.put_decision(odd, np.array([np.nan, np.inf, -0.0], np.float32), -(2**63), True)
         store.put_label(np.str_("Ünïcode ✓"), np.bool_(True), Source.VERIFICATION, np.int64(0), np.zeros(2, np.float32))
         assert store.verify().ok
 

@@ -215,7 +215,9 @@ def compare_with_store(kept: Kept, file: Path, store: Path) -> None:
     for each in read(file):
         answer = each.get("answer")
         found = opened.past_decision(each["told"] if "told" in each else answer["id"]) if answer or "told" in each else None
-        if answer and (found is None or (found.action, found.lower) != (answer["action"], answer["lower"])):
+        if answer and (
+            found is None or (found.decision.action, found.decision.lower) != (answer["action"], answer["lower"])
+        ):
             kept.differently.append(answer["id"])
         if "told" in each and (found is None or found.success is not each["success"]):
             kept.lost.append(each["told"])

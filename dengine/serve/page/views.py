@@ -16,8 +16,8 @@ from ...experiments.figures import is_probability
 from ...history.explain import Explanation, Records, as_it_stood, explain
 from ...history.status import Course, Status, Watch, course, status, watch
 from ...records import Action, Reason, Source
-from ...store.records import Correction, Event
-from ...store.views import LABELS, HistoryFilter, Key, PastDecision, PastRetrain
+from ...store.records import Correction, Event, Key, StoredDecision
+from ...store.views import LABELS, HistoryFilter, PastRetrain
 from .charts import Mark, PartMap, TraceView, number
 from .looking import Looking
 
@@ -71,7 +71,7 @@ class PartView:
     corrections: tuple[Correction, ...]
 
     @property
-    def past(self) -> PastDecision:
+    def past(self) -> StoredDecision:
         """The decision as it was recorded."""
         return self.found.decision
 
@@ -86,13 +86,13 @@ class NowView:
     """What happens now.  part : the newest, None before the first.  recent : the newest decisions, newest first."""
 
     part: PartView | None
-    recent: tuple[PastDecision, ...]
+    recent: tuple[StoredDecision, ...]
 
 
 def now_view(looking: Looking) -> NowView:
     """Read what happens now."""
     recent = looking.store.decisions(HistoryFilter(), RECENT)[::-1]
-    return NowView(part_view(looking, recent[0].id) if recent else None, tuple(recent))
+    return NowView(part_view(looking, recent[0].decision.id) if recent else None, tuple(recent))
 
 
 def part_view(looking: Looking, decision_id: str) -> PartView | None:
@@ -122,9 +122,9 @@ def _newest_bads(looking: Looking) -> NDArray[np.float32]:
     return bads
 
 
-def part_name(past: PastDecision) -> str:
+def part_name(past: StoredDecision) -> str:
     """The part's number, or the beginning of its decision's id where it has none."""
-    return past.part if past.part is not None else past.id[:12]
+    return past.decision.part if past.decision.part is not None else past.decision.id[:12]
 
 
 def moment(seconds: float | None) -> str:
@@ -147,8 +147,8 @@ def duration(seconds: float) -> str:
 def story(view: PartView) -> Iterator[tuple[float, str]]:
     """What happened to the part: time, and words."""
     past = view.past
-    by = f" by model {past.model_version}" if past.model_version else ", before the first model"
-    yield past.time, f"{past.action.value.capitalize()} ({WORDS[f'reason.{past.reason.value}']}){by}"
+    by = f" by model {past.decision.model_version}" if past.decision.model_version else ", before the first model"
+    yield past.time, f"{past.decision.action.value.capitalize()} ({WORDS[f'reason.{past.decision.reason.value}']}){by}"
     first = view.corrections[0].was if view.corrections else past.success
     if past.label_time is not None and past.source is not None:
         yield past.label_time, f"known to be {LABEL[first]}, by {SOURCE[past.source]}"
@@ -168,7 +168,7 @@ def map_view(looking: Looking) -> PartMap | None:
     if version == 0:
         return None
     recent = looking.store.decisions(HistoryFilter(), NAMED)
-    names = {past.id: part_name(past) for past in recent}
+    names = {past.decision.id: part_name(past) for past in recent}
     known = looking.kept(
         "known parts", (version, engine.new_labels, len(looking.store.corrections())), lambda: _known(looking, version)
     )
@@ -195,15 +195,15 @@ def _known(looking: Looking, version: int) -> tuple[Mark, ...] | None:
     return tuple(mark for _, mark in sorted(found, key=lambda each: each[0])[-KNOWN:])
 
 
-def _newest(looking: Looking, recent: list[PastDecision], version: int) -> list[Mark]:
+def _newest(looking: Looking, recent: list[StoredDecision], version: int) -> list[Mark]:
     found = []
     for past in recent:
-        stored = looking.store.get_decision(past.id) if past.model_version == version else None
-        if stored is None or stored.embedding is None:
+        stored = looking.store.get_decision(past.decision.id) if past.decision.model_version == version else None
+        if stored is None or stored.decision.embedding is None:
             continue
-        x, y = _plane(np.asarray(stored.embedding).mean(axis=0))
+        x, y = _plane(np.asarray(stored.decision.embedding).mean(axis=0))
         last = past is recent[-1]
-        found.append(Mark(past.id, part_name(past), x, y, past.label, past.action.value, last))
+        found.append(Mark(past.decision.id, part_name(past), x, y, past.label, past.decision.action.value, last))
     return found
 
 
@@ -292,7 +292,7 @@ class HistoryView:
     """A page of decisions, newest first.  older : the query of the next page, "" where there is none."""
 
     query: HistoryQuery
-    decisions: tuple[PastDecision, ...]
+    decisions: tuple[StoredDecision, ...]
     older: str
 
 
@@ -311,7 +311,7 @@ def history_view(looking: Looking, query: HistoryQuery) -> HistoryView:
     page = looking.store.decisions(query.where, PAGE, query.beyond)
     older = ""
     if len(page) == PAGE:
-        older = urlencode([*query.asked, ("before", f"{page[0].time!r},{page[0].id}")])
+        older = urlencode([*query.asked, ("before", f"{page[0].time!r},{page[0].decision.id}")])
     return HistoryView(query, tuple(page[::-1]), older)
 
 

@@ -456,7 +456,7 @@ def test_what_a_journal_is_given_returns_bit_for_bit(stream: Dataset, tmp_path: 
         journal.append([to_bytes(record) for record in (made, label, event)])
         (back, label_back, event_back) = (from_bytes(blob) for _, blob in journal.records())
         journal.clear()
-    assert (back.decision, back.content_hash, back.part, back.quarantined) == (
+    assert (back.decision, back.content_hash, back.decision.part, back.quarantined) == (
         made.decision,
         made.content_hash,
         "part 7",

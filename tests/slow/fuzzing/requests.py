@@ -132,9 +132,9 @@ def decisions(file: Path) -> dict[str, str]:
     try:
         found = {}
         for each in store.decisions(HistoryFilter(), 10**6):
-            known = store.get_decision(each.id)
+            known = store.get_decision(each.decision.id)
             assert known is not None
-            found[each.id] = repr(known) + known.trace.tobytes().hex()
+            found[each.decision.id] = repr(known) + known.trace.tobytes().hex()
         return found
     finally:
         store.close()
