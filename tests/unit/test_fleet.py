@@ -305,7 +305,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
     assert first.store.outcomes() != second.store.outcomes()
-    assert rule(second)["members"] != rule(fleet.engine("c", recipe=POOLED))["members"]
+    assert rule(second)["evidence.members"] != rule(fleet.engine("c", recipe=POOLED))["evidence.members"]
     assert second.store.get_decision("nobody") is None
 
 
