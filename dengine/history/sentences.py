@@ -81,26 +81,26 @@ class Circumstances:
 
 def bound_of(past: StoredDecision, found: Circumstances) -> Bound | None:
     """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
-    if past.decision.reason not in BOUNDED or _was_lost(past):
+    made = past.decision
+    if made.reason not in BOUNDED or _was_lost(past):
         return None
     policy = found.recipe.policy
     accept_at, reject_at, level = _thresholds(found)
-    lower, upper = policy.bound(past.decision.n_success, past.decision.n_failure)
+    lower, upper = policy.bound(made.n_success, made.n_failure)
     return Bound(
         interval=policy.interval,
         alpha=policy.alpha,
-        n_success=past.decision.n_success,
-        n_failure=past.decision.n_failure,
-        lower=past.decision.lower,
-        upper=past.decision.upper,
+        n_success=made.n_success,
+        n_failure=made.n_failure,
+        lower=made.lower,
+        upper=made.upper,
         ball=_ball(past, found),
         accept_at=accept_at,
         reject_at=reject_at,
         level=level,
         successes_needed=None if accept_at is None else _needed(policy, past, accept_at, 1),
         failures_needed=None if reject_at is None else _needed(policy, past, reject_at, 0),
-        repeats=found.model is not None
-        or bool(np.allclose((lower, upper), (past.decision.lower, past.decision.upper), atol=1e-6)),
+        repeats=found.model is not None or bool(np.allclose((lower, upper), (made.lower, made.upper), atol=1e-6)),
     )
 
 

@@ -37,7 +37,7 @@ def test_what_is_decided_and_reported_is_what_the_engine_has(service: CellServic
                 told = await service.report(answer.decision.id, bool(stream.y[i]))
                 assert (told.success, told.repeated) == (bool(stream.y[i]), False)
         known = await service.find("order-7")
-        assert (known.success, known.part) == (bool(stream.y[7]), "P7")
+        assert (known.success, known.decision.part) == (bool(stream.y[7]), "P7")
         assert await service.find("order-1000") is None
 
     asyncio.run(cell())
@@ -79,7 +79,7 @@ def test_who_waits_too_long_is_told_to_verify_and_so_it_is_recorded(service: Cel
         service.deadline = 30.0
         assert (await service.decide(stream.X[1], "order-1")).decision == late.decision
         assert not (await service.report("order-1", bool(stream.y[1]))).repeated
-        assert (await service.find("order-1")).reason is Reason.LATE
+        assert (await service.find("order-1")).decision.reason is Reason.LATE
 
     asyncio.run(cell())
     assert service.late == 2
