@@ -2,13 +2,11 @@
 
     python training/benchmark_cycle.py --replays 30 --out out/
 
-Run it on an idle machine. Prints a table with the median and the worst case of each quantity, writes benchmark_cycle.csv
-and benchmark_cycle.png (latencies of deciding) to --out.
+Run it on an idle machine. Prints a table with the median and the worst case of each quantity, and writes it to --out.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
@@ -17,56 +15,45 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
+from common import POLICY, options
 from rich.console import Console
 from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
 from dengine.cli.output import duration
+from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
 
 BUDGET = 0.45
 WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 
 
-def measure(data: Dataset, args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """Every quantity, in seconds, and the latencies behind those that are shown as a distribution."""
-    recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
-    played = [replay(data, recipe, seed) for seed in range(args.replays)]
-    retrains, slices = (
-        np.concatenate([one.retrain_seconds for one in played]),
-        np.array([one.slice_max_s for one in played]),
-    )
-    whole = retrain_on_all(data, recipe, args.repeats)
-    deciding = {"decide": decide_times(filled_engine(data, recipe), data)}
-    swaps = {}
-    for name, executor in (
-        ("thread", ThreadPoolExecutor(1)),
-        ("process", ProcessPoolExecutor(1, mp_context=get_context("spawn"))),
-    ):
-        deciding[f"decide, retraining in a {name}"], swaps[f"decide and swap, {name}"] = beside(data, recipe, executor)
+def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int) -> list[dict[str, Any]]:
+    """Every quantity, a row each."""
+    played = [replay(data, recipe, seed) for seed in range(replays)]
+    retrains, slices = np.concatenate([one.retrain_seconds for one in played]), [one.slice_max_s for one in played]
+    engine = filled_engine(data, recipe)
+    whole = np.array([engine.retrain().seconds for _ in range(repeats)])  # as the last one of a long run sees it
     rows = [
-        row(f"retrain, all of {args.replays} replays", retrains, BUDGET),
+        row(f"retrain, all of {replays} replays", retrains, BUDGET),
         row("the longest slice of the encoder's training in each", slices, BUDGET),
         row(f"retrain on {len(data)} traces", whole, BUDGET),
-        *(row(name, seconds) for name, seconds in (deciding | swaps).items()),
     ]
-    if args.umap_repeats:
-        umap_fit, umap_transform = umap_times(data, args.umap_repeats)
+    decide = decide_times(filled_engine(data, recipe), data)
+    rows.append(row("decide", decide))
+    spawned = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    for name, executor in (("thread", ThreadPoolExecutor(1)), ("process", spawned)):
+        seconds, swapping = beside(data, recipe, executor)
+        rows += [row(f"decide, retraining in a {name}", seconds), row(f"decide and swap, {name}", swapping)]
+    if umap_repeats:
+        fit, transform = umap_times(data, umap_repeats)
         rows += [
-            row(f"UMAP fit on {len(data)} traces", umap_fit),
-            row("UMAP single transform", umap_transform),
-            ratio("UMAP fit / retrain", umap_fit, whole, 6.0),
-            ratio("UMAP single transform / decide", umap_transform, deciding["decide"], 15.0),
+            row(f"UMAP fit on {len(data)} traces", fit),
+            row("UMAP single transform", transform),
+            ratio("UMAP fit / retrain", fit, whole, 6.0),
+            ratio("UMAP single transform / decide", transform, decide, 15.0),
         ]
-        deciding["UMAP single transform"] = umap_transform
-    return rows, deciding
-
-
-def retrain_on_all(data: Dataset, recipe: Recipe, repeats: int) -> np.ndarray:
-    """Warm retrains on the whole set, as the last one of a long run sees it."""
-    engine = filled_engine(data, recipe)
-    return np.array([engine.retrain().seconds for _ in range(repeats)])
+    return rows
 
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
@@ -148,40 +135,21 @@ def written(value: float | None, unit: str) -> str:
     return duration(value / 1e3) if unit == "ms" else f"{value:.0f} {unit}"
 
 
-def show(rows: list[dict[str, Any]], deciding: dict[str, np.ndarray], out: Path) -> None:
-    """Table on the screen, CSV and picture in `out`."""
-    out.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).to_csv(out / "benchmark_cycle.csv", index=False)
+def main() -> None:
+    """Parse, measure, print, write."""
+    parser = options(__doc__, data="insertion", samples=None, recipe="conv", out=Path("out"))
+    parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
+    parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
+    parser.add_argument("--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each")
+    args = parser.parse_args()
+    recipe = Recipe.load(args.recipe).with_policy(**POLICY)
+    rows = measure(load_dataset(args.data, args.samples), recipe, args.replays, args.repeats, args.umap_repeats)
+    write_csv(pd.DataFrame(rows), args.out / "benchmark_cycle.csv", force=True)
     table = Table("what", "n", "median", "p99", "worst", "target", title="A cycle's times")
     for r in rows:
         numbers = (written(r[key], r["unit"]) for key in ("median", "p99", "worst", "target"))
         table.add_row(r["what"], str(r["n"]), *numbers)
     Console(width=110).print(table)
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
-    for name, seconds in deciding.items():
-        if len(seconds):
-            axes.ecdf(1e3 * seconds, label=name)
-    axes.set(xscale="log", xlabel="wall time of one call (ms)", ylabel="share of calls", title="Deciding on one trace")
-    axes.legend()
-    figure.savefig(out / "benchmark_cycle.png", dpi=150)
-
-
-def main() -> None:
-    """Parse, measure, show."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, or module:Class")
-    parser.add_argument("--replays", type=int, default=30, help="shuffled replays whose retrains are timed")
-    parser.add_argument("--repeats", type=int, default=10, help="warm retrains on the whole set")
-    parser.add_argument(
-        "--umap-repeats", type=int, default=3, help="fits of UMAP on the whole set, some seconds each; 0: none"
-    )
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
-    args = parser.parse_args()
-    data = load_dataset(args.data, args.samples)
-    show(*measure(data, args), args.out)
 
 
 if __name__ == "__main__":

@@ -16,20 +16,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from common import options
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
-from dengine.cli.output import duration, size
 from dengine.datasets.importing import import_labelled, train_until_done
 from dengine.errors import ExportError
+from dengine.experiments.tables import write_csv
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx, load_onnx
 from dengine.records import Action
@@ -40,13 +41,12 @@ BOUND_TOLERANCE = 1e-6
 AUDIT_RATE = 0.1
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One row of the table."""
 
     what: str
     value: float
-    unit: str
+    unit: str = ""
     target: str = ""
 
 
@@ -74,14 +74,16 @@ def random_traces(data: Dataset, n: int, rng: np.random.Generator) -> np.ndarray
     return out
 
 
+def told(decision: Any) -> list[Any]:
+    """Of a decision what must be the same everywhere."""
+    exact = [decision.action, decision.reason, decision.n_success, decision.n_failure]
+    return [*exact, decision.lower, decision.upper]
+
+
 def differing(found: list[Any], expected: list[Any]) -> int:
-    """Decisions that differ: action, reason or counts at all, bounds by more than the tolerance."""
-    return sum(
-        (a.action, a.reason, a.n_success, a.n_failure) != (b.action, b.reason, b.n_success, b.n_failure)
-        or abs(a.lower - b.lower) > BOUND_TOLERANCE
-        or abs(a.upper - b.upper) > BOUND_TOLERANCE
-        for a, b in zip(found, expected, strict=True)
-    )
+    """Decisions (action, reason, counts, bounds) that differ: the bounds by more than the tolerance."""
+    pairs = zip(found, map(told, expected), strict=True)
+    return sum(a[:4] != b[:4] or np.abs(np.subtract(a[4:], b[4:])).max() > BOUND_TOLERANCE for a, b in pairs)
 
 
 def microseconds(decide: Callable[[Any], Any], X: np.ndarray, calls: int) -> np.ndarray:
@@ -101,22 +103,12 @@ def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", ""))
     ]
 
 
-def ask_cell(program: Path, file: Path, X: np.ndarray, expected: list[Any]) -> tuple[int, np.ndarray]:
-    """Decisions of the C++ program that differ, and the microseconds of each call."""
-    return ask([program, file, "--binary"], X.tobytes(), expected)
-
-
 def ask(command: list[Any], stdin: bytes, expected: list[Any]) -> tuple[int, np.ndarray]:
-    """`ask_cell`, by any command."""
+    """Decisions of the C++ program that differ, and the microseconds of each call."""
     done = subprocess.run(command, input=stdin, capture_output=True, check=True)
     lines = [line.split(",") for line in done.stdout.decode().splitlines()]
-    wrong = sum(
-        (w[0], w[1], int(w[4]), int(w[5])) != (d.action, d.reason, d.n_success, d.n_failure)
-        or abs(float(w[2]) - d.lower) > BOUND_TOLERANCE
-        or abs(float(w[3]) - d.upper) > BOUND_TOLERANCE
-        for w, d in zip(lines, expected, strict=True)
-    )
-    return wrong, np.array([float(w[-1]) for w in lines])
+    found = [[w[0], w[1], int(w[4]), int(w[5]), float(w[2]), float(w[3])] for w in lines]
+    return differing(found, expected), np.array([float(w[-1]) for w in lines])
 
 
 def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path, cell: Path | None) -> list[Finding]:
@@ -137,15 +129,15 @@ def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path,
         part = f"P{rng.integers(2 * len(X))}"
         decisions.append(engine.decide(x, part))
         found.append(exported.decide(x, part))
-        told = decisions[-1].action is Action.VERIFY or (decisions[-1].action is Action.ACCEPT and not success)
-        if told:
+        heard = decisions[-1].action is Action.VERIFY or (decisions[-1].action is Action.ACCEPT and not success)
+        if heard:
             engine.report(decisions[-1].id, bool(success))
             exported.learn(x, bool(success), part)
-        lines.append(f"{part},{int(success) if told else ''}," + ",".join(f"{value:.9g}" for value in x.ravel()))
+        lines.append(f"{part},{int(success) if heard else ''}," + ",".join(f"{value:.9g}" for value in x.ravel()))
     rows = [
         Finding("decisions compared while learning", len(X), ""),
         Finding("of them accepted", sum(d.action is Action.ACCEPT for d in decisions), ""),
-        Finding("Python differs while learning in", differing(found, decisions), "", "0"),
+        Finding("Python differs while learning in", differing(list(map(told, found)), decisions), "", "0"),
     ]
     if cell is not None:
         command = [cell, file, "--parts", "--learn", "--journal", folder / "cell.csv"]
@@ -194,43 +186,35 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
     file = export_torchscript(engine, folder / "model.ts")
     exported = load_exported(file)
     first = microseconds(exported.decide, known, 1)[0]
-    audits = sum(d.audit for d in expected)
     rows = [
         Finding("file size", file.stat().st_size / 1e3, "kB", "< 1 MB"),
         Finding("decisions compared", len(X), ""),
         Finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
-        Finding("of them audits", audits, ""),
-        Finding("Python differs in", differing(exported.decide_many(X), expected), "", "0"),
+        Finding("of them audits", sum(d.audit for d in expected)),
+        Finding("Python differs in", differing(list(map(told, exported.decide_many(X))), expected), "", "0"),
         Finding("first call after loading", first, "µs", "<= 1 ms"),
         *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")),
     ]
     if args.cell is not None:
-        wrong, _ = ask_cell(args.cell, file, X, expected)
-        times = 1 + args.calls // len(known)
-        _, taken = ask_cell(args.cell, file, np.concatenate([known] * times), expected[: len(known)] * times)
+        times, command = 1 + args.calls // len(known), [args.cell, file, "--binary"]
+        wrong, _ = ask(command, X.tobytes(), expected)
+        _, taken = ask(command, known.tobytes() * times, expected[: len(known)] * times)
         rows += [Finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
         model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
         new = X[len(known) :]  # a reference that is asked about itself has a vote in ONNX
-        rows.append(Finding("onnxruntime differs in", differing(runtime.decide_many(new), model.decide_many(new)), ""))
+        found = list(map(told, runtime.decide_many(new)))
+        rows.append(Finding("onnxruntime differs in", differing(found, model.decide_many(new))))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
     rows += compare_learning(data, Recipe.load(args.reducer), args.retrains, folder, args.cell)
     not_refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
     return [*rows, Finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
 
 
-def written(row: Finding) -> tuple[str, str]:
-    """Value and unit as a person writes them."""
-    text = {"µs": lambda v: duration(v / 1e6), "kB": lambda v: size(1e3 * v)}.get(row.unit, "{:,.0f}".format)(row.value)
-    value, _, unit = text.partition(" ")
-    return value, unit
-
-
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
+    parser = options(__doc__, data="insertion", out=Path("out"))
     parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
     parser.add_argument("--retrains", type=int, default=3, help="at most, each within the recipe's budget")
     parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
@@ -238,16 +222,14 @@ def main() -> None:
     parser.add_argument("--damaged", type=int, default=500, help="damaged files tried")
     parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")
     parser.add_argument("--no-onnx", dest="onnx", action="store_false", help="leave onnxruntime out")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "damaged").mkdir()
         rows = measure(args, Path(folder))
-    args.out.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).to_csv(args.out / "benchmark_export.csv", index=False)
+    write_csv(pd.DataFrame(rows), args.out / "benchmark_export.csv", force=True)
     table = Table("what", "value", "unit", "target", title=f"Exported decision: {args.reducer} on {args.data}")
     for row in rows:
-        table.add_row(row.what, *written(row), row.target)
+        table.add_row(row.what, f"{row.value:,.0f}", row.unit, row.target)
     Console(width=None if sys.stdout.isatty() else 100).print(table)
     sys.exit(any(row.target == "0" and row.value > 0 for row in rows))
 

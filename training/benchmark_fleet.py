@@ -11,7 +11,6 @@ cell's rows, and traces of another product among those that an engine learned fr
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import tempfile
 import time
@@ -23,15 +22,24 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from common import POLICY, options
 from rich.console import Console
 from rich.table import Table
 
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore, load_dataset
 from dengine.cli.output import duration
+from dengine.experiments.tables import write_csv
 
 STEP = 1.0 / 16.0  # N a digit of a mark: exact in float32, and small beside an insertion
 DIGITS = 5  # of a mark: the cell, and the cycle in base 100
-POLICY = {"alpha": 0.1, "lower_bound": 0.9}
+
+
+CALLS = {
+    "decide": "decide",
+    "report": "report",
+    "report that retrains": "retraining",
+    "settle, with news of peers": "settle",
+}
 
 
 @dataclass(frozen=True)
@@ -106,26 +114,25 @@ def work(plan: Plan, cell: int, data: Dataset, ready: Any, done: Any) -> None:
             time.sleep(plan.pause)
         engine.flush()
         worked.version = engine.version
-        seen = engine._versions.retrainer.window.snapshot().traces
+        seen = engine.store.labelled().traces
         worked.others = sum(plan.product(read_mark(x)[0]) != plan.product(cell) for x in seen) if plan.products else 0
     done.put(asdict(worked))  # plain: who reads it may have been started in another way
 
 
 def one_cycle(engine: DataEngine, worked: Worked, cycle: int, x: np.ndarray, good: bool) -> None:
     """Decide, report, settle; each timed."""
-    clock = time.perf_counter
-    begin = clock()
+    begin = time.perf_counter()
     decision = engine.decide(x)
-    worked.decide.append(clock() - begin)
+    worked.decide.append(time.perf_counter() - begin)
     worked.certain += decision.action is not Action.VERIFY
     if decision.action is Action.VERIFY:
-        begin = clock()
+        begin = time.perf_counter()
         retrain = engine.report(decision.id, good)
-        (worked.report if retrain is None else worked.retraining).append(clock() - begin)
+        (worked.report if retrain is None else worked.retraining).append(time.perf_counter() - begin)
         worked.sent[decision.id] = cycle, good
-    begin = clock()
+    begin = time.perf_counter()
     engine.settle()
-    worked.settle.append(clock() - begin)
+    worked.settle.append(time.perf_counter() - begin)
 
 
 def run(plan: Plan, data: Dataset) -> list[Worked]:
@@ -148,7 +155,7 @@ def run(plan: Plan, data: Dataset) -> list[Worked]:
     return sorted(worked, key=lambda each: each.cell)
 
 
-def check(plan: Plan, worked: Worked) -> dict[str, int]:
+def check(plan: Plan, worked: Worked) -> dict[str, Any]:
     """A cell's rows against what it was told."""
     lost = wrong = mixed = 0
     with plan.store(worked.cell) as store:
@@ -159,63 +166,42 @@ def check(plan: Plan, worked: Worked) -> dict[str, int]:
             wrong += known is not None and known.success is not None and known.success != good
             mixed += known is not None and read_mark(known.trace) != (worked.cell, cycle)
         mixed += sum(read_mark(x)[0] != worked.cell for x in store.own_labelled().traces)
-    counted = {"sent": len(worked.sent), "stored": stored, "lost": lost, "wrong": wrong}
-    return counted | {"mixed": mixed + worked.others}
-
-
-def times(worked: list[Worked]) -> list[dict[str, Any]]:
-    """Calls over all cells, in seconds."""
-    rows = []
-    for name, about in (
-        ("decide", "decide"),
-        ("report", "report"),
-        ("retraining", "report that retrains"),
-        ("settle", "settle, with news of sisters"),
-    ):
-        seconds = np.concatenate([getattr(each, name) for each in worked])
-        p50, p99, worst = np.quantile(seconds, [0.5, 0.99, 1.0]) if len(seconds) else np.full(3, np.nan)
-        rows.append({"call": about, "n": len(seconds), "p50_s": p50, "p99_s": p99, "worst_s": worst})
-    return rows
+    about = {"cell": worked.cell, "version": worked.version, "certain": worked.certain, "sent": len(worked.sent)}
+    return about | {"stored": stored, "lost": lost, "wrong": wrong, "mixed": mixed + worked.others}
 
 
 def show(plan: Plan, worked: list[Worked], out: Path) -> bool:
     """Tables on the screen and as CSV; whether nothing was lost, wrong or mixed."""
-    rows, counted = times(worked), [check(plan, each) for each in worked]
-    out.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows).to_csv(out / "benchmark_fleet.csv", index=False)
-    cells = [{"cell": each.cell, "version": each.version, "certain": each.certain} for each in worked]
-    pd.DataFrame([a | b for a, b in zip(cells, counted, strict=True)]).to_csv(
-        out / "benchmark_fleet_cells.csv", index=False
-    )
-    kind = "PostgreSQL" if plan.url.startswith("postgres") else "SQLite"
+    kind, rows = "PostgreSQL" if plan.url.startswith("postgres") else "SQLite", []
     table = Table("call", "n", "p50", "p99", "worst", title=f"{plan.cells} cells on one {kind}, {plan.seconds:g} s")
-    for row in rows:
-        said = ("-" if np.isnan(row[key]) else duration(row[key]) for key in ("p50_s", "p99_s", "worst_s"))
-        table.add_row(row["call"], f"{row['n']:,}", *said)
-    total = {key: sum(each[key] for each in counted) for key in counted[0]}
-    console, decided = Console(width=110), sum(len(each.decide) for each in worked)
+    for about, name in CALLS.items():
+        seconds = np.concatenate([getattr(each, name) for each in worked])
+        found = np.quantile(seconds, [0.5, 0.99, 1.0]) if len(seconds) else np.full(3, np.nan)
+        rows.append({"call": about, "n": len(seconds), **dict(zip(("p50_s", "p99_s", "worst_s"), found, strict=True))})
+        table.add_row(about, f"{len(seconds):,}", *("-" if np.isnan(each) else duration(each) for each in found))
+    write_csv(pd.DataFrame(rows), out / "benchmark_fleet.csv", force=True)
+    counted = pd.DataFrame([check(plan, each) for each in worked])
+    write_csv(counted, out / "benchmark_fleet_cells.csv", force=True)
+    total, decided = counted.sum(), sum(len(each.decide) for each in worked)
+    console = Console(width=110)
     console.print(table)
     console.print(
-        f"{decided / plan.seconds:.0f} decisions a second. Labels sent {total['sent']:,}, stored {total['stored']:,}, "
-        f"lost {total['lost']}, wrong {total['wrong']}; traces mixed {total['mixed']}. "
-        f"Versions {', '.join(str(each.version) for each in worked)}.",
+        f"{decided / plan.seconds:.0f} decisions a second. Labels sent {total.sent:,}, stored {total.stored:,}, "
+        f"lost {total.lost}, wrong {total.wrong}; traces mixed {total.mixed}. "
+        f"Versions {', '.join(map(str, counted.version))}.",
         highlight=False,
     )
-    return total["sent"] == total["stored"] and not (total["lost"] or total["wrong"] or total["mixed"])
+    return bool(total.sent == total.stored and not (total.lost or total.wrong or total.mixed))
 
 
 def main() -> None:
     """Parse, run, check, show."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__, data="insertion", samples=None, recipe="pca", out=Path("out"))
     parser.add_argument("--cells", type=int, default=16, help="processes, each with an engine of its own")
     parser.add_argument("--minutes", type=float, default=5.0, help="of running, once all engines are open")
     parser.add_argument("--store", help="a PostgreSQL or SQLite URL, or a file; a temporary SQLite file by default")
     parser.add_argument("--products", type=int, default=2, help="so many among the cells; 0: no cell shares anything")
     parser.add_argument("--pause", type=float, default=0.0, help="seconds between two cycles of a cell")
-    parser.add_argument("--recipe", default="pca", help="a recipe's name or TOML file")
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSVs")
     args = parser.parse_args()
     recipe, data = Recipe.load(args.recipe).with_policy(**POLICY), load_dataset(args.data, args.samples)
     with tempfile.TemporaryDirectory() as folder:

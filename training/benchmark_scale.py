@@ -13,7 +13,6 @@ window is smaller and larger.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
+from common import POLICY, options
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -40,11 +39,11 @@ from dengine import (
     make_reducer,
 )
 from dengine.cli.output import duration, size
+from dengine.experiments.tables import write_csv
 from dengine.folds import content_hash
 from dengine.traces import as_traces
 
 CHUNK = 5000
-BUDGET = 0.45
 
 
 def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -68,11 +67,11 @@ def _verified(name: str) -> Decision:
     return Decision(name, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
 
 
-def wall_time(call: Callable[[], Any]) -> float:
-    """Seconds until a call returns."""
+def wall_time(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+    """Seconds until a call returns, and what it returns."""
     begin = time.perf_counter()
-    call()
-    return time.perf_counter() - begin
+    found = call(*given)
+    return time.perf_counter() - begin, found
 
 
 def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: Path) -> dict[str, Any]:
@@ -80,20 +79,14 @@ def measure_store(data: Dataset, recipe: Recipe, n: int, repeats: int, folder: P
     path = folder / f"{n}.db"
     with DataEngine.from_recipe(recipe, store=path) as engine:
         fill(engine, data, n)
-    begin = time.perf_counter()
-    engine = DataEngine.open(path)
-    opened = time.perf_counter() - begin
-    retrains = [wall_time(engine.retrain) for _ in range(repeats)]
-    fresh, _ = noisy(data, 300, np.random.default_rng(1))
+    opened, engine = wall_time(DataEngine.open, path)
+    retrains = [wall_time(engine.retrain)[0] for _ in range(repeats)]
     decide, report = [], []
-    for x in fresh:
-        begin = time.perf_counter()
-        decision = engine.decide(x)
-        decide.append(time.perf_counter() - begin)
+    for x in noisy(data, 300, np.random.default_rng(1))[0]:
+        seconds, decision = wall_time(engine.decide, x)
+        decide.append(seconds)
         if decision.action is Action.VERIFY:
-            begin = time.perf_counter()
-            engine.report(decision.id, True)
-            report.append(time.perf_counter() - begin)
+            report.append(wall_time(engine.report, decision.id, True)[0])
     engine.close()
     size = path.stat().st_size / 1e9
     path.unlink()
@@ -115,13 +108,7 @@ def measure_umap(data: Dataset, sizes: list[int]) -> dict[int, float]:
         return {}
     rng = np.random.default_rng(0)
     make_reducer("umap").fit(noisy(data, 200, rng)[0].reshape(200, -1))
-    seconds = {}
-    for n in sizes:
-        X = noisy(data, n, rng)[0].reshape(n, -1)
-        begin = time.perf_counter()
-        make_reducer("umap").fit(X)
-        seconds[n] = time.perf_counter() - begin
-    return seconds
+    return {n: wall_time(make_reducer("umap").fit, noisy(data, n, rng)[0].reshape(n, -1))[0] for n in sizes}
 
 
 def measure_certainty(data: Dataset, recipe: Recipe, windows: list[int], seed: int = 0) -> list[dict[str, Any]]:
@@ -147,17 +134,15 @@ def measure_certainty(data: Dataset, recipe: Recipe, windows: list[int], seed: i
 
 
 HEADINGS = {
-    "traces": "labelled traces",
     "store_gb": "store",
     "open_s": "opening",
     "retrain_p50_s": "retrain, median",
     "retrain_max_s": "retrain, worst",
+    "umap_fit_s": "UMAP's fit",
     "decide_p50_ms": "decide, p50",
     "decide_p99_ms": "decide, p99",
     "report_p50_ms": "report, p50",
-    "window": "window",
     "certain_fraction": "certain",
-    "accepted": "accepted parts",
     "wrong_fraction": "wrong, of certain",
 }
 
@@ -177,51 +162,30 @@ def written(name: str, value: float) -> str:
     return f"{value:,}"
 
 
-def show(stores: pd.DataFrame, umap: dict[int, float], certainty: pd.DataFrame, out: Path) -> None:
-    """Tables on the screen, CSVs and picture in `out`."""
-    out.mkdir(parents=True, exist_ok=True)
-    stores.assign(umap_fit_s=stores["traces"].map(umap)).to_csv(out / "benchmark_scale.csv", index=False)
-    certainty.to_csv(out / "benchmark_scale_certainty.csv", index=False)
-    for frame, title in ((stores, "Times against store size"), (certainty, "Certainty against window")):
-        table = Table(*(HEADINGS[name] for name in frame.columns), title=title)
-        for values in frame.itertuples(index=False):
-            table.add_row(*(written(name, value) for name, value in zip(frame.columns, values, strict=True)))
-        Console(width=120).print(table)
-    figure = Figure(figsize=(8, 4.5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot(stores["traces"], stores["retrain_max_s"], "o-", label="conv retrain, worst")
-    axes.plot(stores["traces"], stores["retrain_p50_s"], "o:", label="conv retrain, median")
-    if umap:
-        axes.plot(list(umap), list(umap.values()), "s--", label="UMAP fit")
-    axes.axhline(BUDGET, color="0.4", linewidth=1, label="budget 0.45 s")
-    axes.set(xscale="log", yscale="log", xlabel="labelled traces in the store", ylabel="wall time (s)")
-    axes.set_title("A retrain does not grow with the store")
-    axes.legend()
-    figure.savefig(out / "benchmark_scale.png", dpi=150)
-
-
 def main() -> None:
-    """Parse, measure, show."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, or module:Class")
+    """Parse, measure, print, write."""
+    parser = options(__doc__, data="insertion", samples=None, recipe="conv", folder=None, out=Path("out"))
     parser.add_argument("--sizes", default="1503,10000,100000,1000000", help="labelled traces in a store; 4 kB each")
     parser.add_argument("--umap-most", type=int, default=4000, help="UMAP is fitted on stores of at most so many traces")
     parser.add_argument("--windows", default="1000,2500,5000,10000,20000", help="references of the models of fresh parts")
     parser.add_argument("--repeats", type=int, default=5, help="retrains at each size")
-    parser.add_argument("--folder", type=Path, help="where the stores are built; a temporary one by default")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSVs and the picture")
     args = parser.parse_args()
-    data = load_dataset(args.data, args.samples)
-    recipe = Recipe.load(args.recipe).with_policy(alpha=0.1, lower_bound=0.9)
+    data, recipe = load_dataset(args.data, args.samples), Recipe.load(args.recipe).with_policy(**POLICY)
     sizes = [int(n) for n in args.sizes.split(",")]
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
-        stores = [measure_store(data, recipe, n, args.repeats, Path(folder)) for n in sizes]
-    small = [n for n in sizes if n <= args.umap_most]
-    umap = measure_umap(data, small) if small else {}
-    certainty = measure_certainty(data, recipe, [int(n) for n in args.windows.split(",")])
-    show(pd.DataFrame(stores), umap, pd.DataFrame(certainty), args.out)
+        stores = pd.DataFrame([measure_store(data, recipe, n, args.repeats, Path(folder)) for n in sizes])
+    umap = measure_umap(data, [n for n in sizes if n <= args.umap_most])
+    stores["umap_fit_s"] = stores["traces"].map(umap).astype(float)
+    certainty = pd.DataFrame(measure_certainty(data, recipe, [int(n) for n in args.windows.split(",")]))
+    for frame, name, title in (
+        (stores, "benchmark_scale", "Times against store size"),
+        (certainty, "benchmark_scale_certainty", "Certainty against window"),
+    ):
+        write_csv(frame, args.out / f"{name}.csv", force=True)
+        table = Table(*(HEADINGS.get(column, column) for column in frame.columns), title=title)
+        for values in frame.itertuples(index=False):
+            table.add_row(*(written(column, value) for column, value in zip(frame.columns, values, strict=True)))
+        Console(width=120).print(table)
 
 
 if __name__ == "__main__":

@@ -12,14 +12,15 @@ and drift.png.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from common import options
 from joblib import Parallel, delayed
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -44,8 +45,7 @@ METHODS = {
 }
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(NamedTuple):
     """One method over one scenario's stream."""
 
     scenario: str
@@ -113,6 +113,19 @@ def seconds_saved(log: Replay) -> float:
     return cell.verify_s * (total["accepted"] + total["rejected"]) - lost
 
 
+CELLS = {
+    "accepted": lambda r: str(r["accepted"]),
+    "bad": lambda r: str(r["false_positive"]),
+    "bad/1000\nbefore / after": lambda r: f"{r['escapes_before']:.1f} / {r['escapes_after']:.1f}",
+    "verified\nbefore / after": lambda r: f"{r['verified_before']:.0%} / {r['verified_after']:.0%}",
+    "novel\nbefore / after": lambda r: f"{r['novel_before']} / {r['novel_after']}",
+    "alarms\nbefore / after": lambda r: f"{r['alarms_before']} / {r['alarms_after']}",
+    "alarm": lambda r: "-" if r["alarm"] is None else str(r["alarm"]),
+    "lasts": lambda r: "-" if r["alarm"] is None else "open" if r["back"] is None else str(r["back"]),
+    "saved s": lambda r: f"{r['saved_s']:.0f}",
+}
+
+
 def table_of(rows: Sequence[dict[str, object]]) -> Table:
     """The rows for a screen."""
     caption = (
@@ -121,35 +134,12 @@ def table_of(rows: Sequence[dict[str, object]]) -> Table:
         "verifying every part, what stops and good parts sent back cost taken off. dengine's guarantee is pooled, and it "
         "takes accepted parts that no stop follows for good; that of the others is local, and they know stops alone."
     )
-    table = Table(title="simulated cell, (alpha, LB) = (0.1, 90 %)", caption=caption, caption_justify="left")
-    table.add_column("scenario")
-    table.add_column("method")
+    table = Table("scenario", "method", title="simulated cell, (alpha, LB) = (0.1, 90 %)", caption=caption)
     for name in CELLS:
         table.add_column(name, justify="right")
-    for i, row in enumerate(rows):
-        new = i == 0 or row["scenario"] != rows[i - 1]["scenario"]
-        if new and i:
-            table.add_section()
-        table.add_row(str(row["scenario"]) if new else "", str(row["method"]), *(show(row) for show in CELLS.values()))
+    for row in rows:
+        table.add_row(str(row["scenario"]), str(row["method"]), *(show(row) for show in CELLS.values()))
     return table
-
-
-def share(row: dict[str, object], name: str) -> str:
-    """Before and after, in percent."""
-    return " / ".join(f"{100 * row[f'{name}_{when}']:.0f} %" for when in ("before", "after"))
-
-
-CELLS = {
-    "accepted": lambda r: str(r["accepted"]),
-    "bad": lambda r: str(r["false_positive"]),
-    "bad/1000\nbefore / after": lambda r: f"{r['escapes_before']:.1f} / {r['escapes_after']:.1f}",
-    "verified\nbefore / after": lambda r: share(r, "verified"),
-    "novel\nbefore / after": lambda r: f"{r['novel_before']} / {r['novel_after']}",
-    "alarms\nbefore / after": lambda r: f"{r['alarms_before']} / {r['alarms_after']}",
-    "alarm": lambda r: "-" if r["alarm"] is None else str(r["alarm"]),
-    "lasts": lambda r: "-" if r["alarm"] is None else "open" if r["back"] is None else str(r["back"]),
-    "saved s": lambda r: f"{r['saved_s']:.0f}",
-}
 
 
 def picture(runs: Sequence[Run]) -> Figure:
@@ -159,10 +149,12 @@ def picture(runs: Sequence[Run]) -> Figure:
     grid = figure.subplots(2, len(scenarios), sharex=True, sharey="row", squeeze=False)
     colours = dict(zip(METHODS, RECIPES, strict=False))
     for (top, bottom), scenario in zip(grid.T, scenarios, strict=True):
-        for run in runs:
-            if run.scenario == scenario:
-                draw(top, bottom, run, colours[run.method])
-        draw_change(top, bottom, scenario, max(len(run.log) for run in runs))
+        for run in (run for run in runs if run.scenario == scenario):
+            draw(top, bottom, run, colours[run.method])
+        if (change := first_change(scenario, max(len(run.log) for run in runs))) is not None:
+            for axes in (top, bottom):
+                axes.axvline(change, **LIMIT)
+            top.text(change, 1.01, CHANGES[scenario], transform=top.get_xaxis_transform(), fontsize=SMALL, va="bottom")
         top.set_title(scenario, pad=18)
         bottom.set(xlabel="cycle", ylim=(0, None))
     for axes in grid.flat:
@@ -188,25 +180,13 @@ def draw(top: Axes, bottom: Axes, run: Run, colour: str) -> None:
         top.fill_between(x, 0, 104, where=log.safe_mode, step="pre", **shade)
 
 
-def draw_change(top: Axes, bottom: Axes, scenario: str, cycles: int) -> None:
-    """The moment from which on the cell is another one, in both panels."""
-    cycle = first_change(scenario, cycles)
-    if cycle is None:
-        return
-    for axes in (top, bottom):
-        axes.axvline(cycle, **LIMIT)
-    top.text(cycle, 1.01, CHANGES[scenario], transform=top.get_xaxis_transform(), fontsize=SMALL, va="bottom")
-
-
 def main() -> None:
     """Parse, simulate, replay, draw, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cycles", type=int, default=3000, help="parts in each stream (default: 3000)")
-    parser.add_argument("--scenarios", default=",".join(CHANGES), help="with commas between (default: all that change)")
-    parser.add_argument("--methods", default=",".join(METHODS), help="likewise (default: all)")
-    parser.add_argument("--seed", type=int, default=100, help="of the cell and of the engines (default: 100)")
-    parser.add_argument("--n-jobs", type=int, default=2, help="processes (default: 2)")
-    parser.add_argument("--out", type=Path, default=Path("out/drift"), help="folder for all files (default: out/drift)")
+    parser = options(__doc__, n_jobs=2, out=Path("out/drift"))
+    parser.add_argument("--cycles", type=int, default=3000, help="parts in each stream")
+    parser.add_argument("--scenarios", default=",".join(CHANGES), help="with commas between; all that change by default")
+    parser.add_argument("--methods", default=",".join(METHODS), help="likewise")
+    parser.add_argument("--seed", type=int, default=100, help="of the cell and of the engines")
     parser.add_argument("--docs", action="store_true", help="write the picture to docs/drift.png too")
     args = parser.parse_args()
     methods, scenarios = args.methods.split(","), args.scenarios.split(",")

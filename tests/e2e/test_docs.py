@@ -50,7 +50,6 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
     "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",
     "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100 --ur-rtde 0",
-    "python training/show_scenarios.py": "--cycles 12 --n-jobs 1",
     "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/check_cost_choice.py": "--data small.npz --parts 40 --repeats 2 --escapes 60 --n-jobs 1",
     "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",

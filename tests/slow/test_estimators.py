@@ -1,9 +1,7 @@
 """Every public estimator keeps scikit-learn's habits: its own checks, and what they do not ask of traces."""
 
 import pickle
-import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +14,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV, cross_val_score
+from sklearn.neighbors import NeighborhoodComponentsAnalysis
 from sklearn.pipeline import make_pipeline
 from sklearn.utils.estimator_checks import estimator_checks_generator, parametrize_with_checks
 
@@ -25,8 +24,44 @@ from dengine.reducers.base import Reducer
 from dengine.reducers.cross_fitting import LabelFree
 from dengine.reducers.umap import _Contained
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "training"))
-from check_estimators import ESTIMATORS, EXCLUDED, excluded, faults, page  # the list that the page is of
+ESTIMATORS = (
+    WilsonRadiusClassifier(),
+    WilsonRadiusClassifier(fraction=0.1, reject_fraction=0.05),
+    WilsonRadiusClassifier(interval="jeffreys"),
+    ConvReducer(),
+    RocketReducer(),
+    PcaReducer(),
+    UmapReducer(n_neighbors=5, n_epochs=20),  # some checks have 20 rows, or 12: UMAP wants more than n_neighbors
+    CrossFitted(LinearDiscriminantAnalysis(), 2),
+    CrossFitted(NeighborhoodComponentsAnalysis(n_components=2, max_iter=20, random_state=0), 2),
+)
+
+BATCH = (
+    "UMAP lays the rows of a batch out together, with random repulsion drawn row after row from one stream, so a row's "
+    "place depends on those beside it. Laying out each row alone would mend this and break "
+    "`fit_transform(X) == fit(X).transform(X)`: the fit's own rows would move by up to a quarter of the map. An engine "
+    "asks for one trace at a time, and references keep the place that the fit gave them."
+)
+# By estimator, by check: why it is right that it fails.
+EXCLUDED: dict[type, dict[str, str]] = {
+    UmapReducer: {
+        "check_methods_sample_order_invariance": BATCH,
+        "check_methods_subset_invariance": BATCH,
+    },
+    CrossFitted: {
+        "check_fit2d_1feature": (
+            "Ten rows of one feature: outside one of the two folds, which are dealt by content, there are three rows, all "
+            "of one class. That is refused, and named as what is wrong; the check wants to read of the number of features, "
+            "which is not."
+        ),
+    },
+}
+
+
+def excluded(estimator: Any) -> dict[str, str]:
+    """Check -> reason of its exclusion."""
+    return EXCLUDED.get(type(estimator), {})
+
 
 SMALL: dict[str, Reducer] = {
     "conv": ConvReducer(),
@@ -64,28 +99,10 @@ def frame(X: np.ndarray) -> pd.DataFrame:
 # ------------------------------------------------------------------------------------------------- the list itself
 
 
-def test_an_exclusion_that_names_no_check_passes_or_is_missing_is_a_fault() -> None:
-    umap = next(e for e in ESTIMATORS if isinstance(e, UmapReducer))
-    checks = list(EXCLUDED[UmapReducer])
-    kept = [{"check_name": name, "status": "xfail"} for name in checks]
-    assert faults(umap, kept) == []
-    assert "did not fail" in faults(umap, kept[1:])[0]
-    assert "did not fail" in faults(umap, [*kept[1:], {"check_name": checks[0], "status": "passed"}])[0]
-    assert faults(umap, [*kept, {"check_name": "check_x", "status": "failed"}])[0].endswith("check_x fails")
-
-
 def test_every_exclusion_names_a_check_that_is_run() -> None:
     for estimator in ESTIMATORS:
         names = {getattr(check, "func", check).__name__ for _, check in estimator_checks_generator(estimator)}
         assert set(excluded(estimator)) <= names
-
-
-def test_the_written_page_is_of_these_estimators_and_exclusions(repo: Path) -> None:
-    written = (repo / "docs" / "estimator_checks.md").read_text(encoding="utf-8").splitlines()
-    expected = page([(estimator, []) for estimator in ESTIMATORS]).splitlines()
-    named = [line.split(" | ")[0] for line in expected if line.startswith("| `")]
-    assert [line.split(" | ")[0] for line in written if line.startswith("| `")] == named
-    assert [line for line in written if line.startswith("- ")] == [line for line in expected if line.startswith("- ")]
 
 
 # ------------------------------------------------------------------------------------------------------------ fit

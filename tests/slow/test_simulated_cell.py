@@ -57,12 +57,6 @@ def test_a_part_beside_the_hole_rests_on_the_rim_at_the_force_limit() -> None:
     assert pushed.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
 
 
-def test_a_weak_grip_slips_at_its_own_force() -> None:
-    pushed = push(good(fault="weak_grip", grip_n=12.0, offset_x_mm=5.0))
-    assert pushed.slip_mm > 1
-    assert np.median(pushed.wrench[400:500, 2]) == pytest.approx(12.0, abs=3.0)
-
-
 def test_a_trace_depends_on_seed_and_cycle_only() -> None:
     few, many = simulate(3, seed=9, n_jobs=1), simulate(6, seed=9, n_jobs=2)
     np.testing.assert_array_equal(few.X, many.X[:3])
@@ -97,17 +91,6 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
     report = cell.report()
     assert (report.cycles, report.finished, report.verifications, report.stops) == (2, 0, 1, 1)
     assert report.seconds_saved == 5 - 120
-
-
-@pytest.mark.parametrize(("confirm_share", "outcome"), [(0.0, Outcome.UNKNOWN), (1.0, Outcome.CONFIRMED)])
-def test_a_good_part_passed_on_is_silent_unless_confirmed(confirm_share: float, outcome: Outcome) -> None:
-    cell = SimulatedCell(replace(ALWAYS_GOOD, confirm_share=confirm_share))
-    cell.insert()
-    assert cell.proceed() is outcome
-    report = cell.report()
-    assert report.finished == 1
-    assert report.seconds_saved == 5
-    assert report.parts_per_hour == pytest.approx(3600 / 47)
 
 
 def test_a_good_part_sent_back_costs_a_further_cycle() -> None:
