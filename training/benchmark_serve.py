@@ -367,7 +367,7 @@ def compare_with_store(file: Path, store: Path, differently: set[str], lost: set
     for each in read(file):
         if answer := each.get("answer"):
             found = opened.past_decision(answer["id"])
-            if found is None or (found.action, found.lower) != (answer["action"], answer["lower"]):
+            if found is None or (found.decision.action, found.decision.lower) != (answer["action"], answer["lower"]):
                 differently.add(answer["id"])
         if "told" in each:
             found = opened.past_decision(each["told"])
