@@ -29,6 +29,10 @@ from .records import NewLabel, StoredDecision
 LENGTH = struct.Struct("<I")  # of the JSON text, before it; a trace's samples follow it
 
 
+class JournalError(StoreError):
+    """The journal's own file cannot be written or read, whatever becomes of the store."""
+
+
 @dataclass(frozen=True, slots=True)
 class LateLabel:
     """A label that the store has not taken yet; time : when it was reported, in seconds."""
@@ -78,7 +82,7 @@ def from_bytes(blob: bytes) -> Record:
         about = json.loads(blob[LENGTH.size : text_end])
         return _READERS[about["kind"]](about, blob[text_end:])
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(
+        raise JournalError(
             f"Expected a record of a journal, got what cannot be read ({error}); "
             "open the store with the dengine that wrote it."
         ) from error
@@ -184,7 +188,7 @@ class Journal:
         length, crc = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))
         record = os.pread(self._fd, length, offset + FRAME.size)
         if zlib.crc32(record) != crc:
-            raise StoreError(f"Expected the record that was written to {self.path} at byte {offset}, found another.")
+            raise JournalError(f"Expected the record that was written to {self.path} at byte {offset}, found another.")
         return record
 
     def records(self, begin: int = HEADER) -> Iterator[tuple[int, bytes]]:
@@ -251,10 +255,7 @@ class Journal:
     def _reserve(self) -> None:
         try:
             os.posix_fallocate(self._fd, 0, HEADER + RESERVE)
-        except (
-            AttributeError,
-            OSError,
-        ):  # no room, or no way to reserve it: then without, as far as it goes
+        except (AttributeError, OSError):  # no room, or no way to reserve it: then without, as far as it goes
             os.ftruncate(self._fd, max(self._end, HEADER))
 
 
@@ -307,5 +308,5 @@ def owned_by(holder: str, name: str) -> StoreError:
     )
 
 
-def _unusable(path: Path, error: OSError) -> StoreError:
-    return StoreError(f"Could not use the journal {path}: {error}; free some space there, or make its folder writable.")
+def _unusable(path: Path, error: OSError) -> JournalError:
+    return JournalError(f"Could not use the journal {path}: {error}; free some space there, or make its folder writable.")

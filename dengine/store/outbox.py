@@ -2,12 +2,6 @@
 
 Where the store fails or does not answer in time, decisions and labels go to the journal beside it, which survives a killed
 process; a thread tries the store every second, and plays the journal back. A store without a journal is called directly.
-
-A call of a store, made in the keeper's thread, that whoever waits for it may give up.
-
-What a store has not taken yet: decisions in memory, and what its journal holds until it can be played back.
-
-The newest decisions of a cell, and their labels: what a report finds without asking the store.
 """
 
 from __future__ import annotations
@@ -22,6 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from enum import Enum, auto
 from hashlib import blake2b
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -31,11 +26,30 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..records import RetrainReport
 from .base import Store
-from .journal import HEADER, RESERVE, Journal, LateEvent, LateLabel, Record, from_bytes, to_bytes
+from .journal import HEADER, RESERVE, Journal, JournalError, LateEvent, LateLabel, Record, from_bytes, to_bytes
 from .records import NewLabel, StoredDecision, already_reported
 
 T = TypeVar("T")
 Committing = Callable[[Callable[[], bool]], AbstractContextManager[None]]
+
+
+class SlowStoreError(StoreError):
+    """The store did not answer in time."""
+
+
+class Fault(Enum):
+    """Why a store cannot be written."""
+
+    STORE = auto()
+    SLOW = auto()  # it did not answer in time
+    RETURNING = auto()  # it is there again, and is to take what its journal holds
+    JOURNAL = auto()  # the journal cannot be written either
+
+    @classmethod
+    def of(cls, error: Exception) -> Fault:
+        """The kind of what a store, or its journal, raised."""
+        kinds = ((JournalError, cls.JOURNAL), (SlowStoreError, cls.SLOW))
+        return next((kind for raised, kind in kinds if isinstance(error, raised)), cls.STORE)
 
 
 class Asked(Generic[T]):
@@ -96,7 +110,7 @@ class Asked(Generic[T]):
             late = error
         if not self._future.cancel() and more > 0.0:
             return self._result(more, 0.0)
-        raise StoreError(f"no answer from the store within {self._wait:g} s.") from late
+        raise SlowStoreError(f"no answer from the store within {self._wait:g} s.") from late
 
     def _wanted(self) -> bool:
         future = self._future
@@ -320,7 +334,6 @@ log = logging.getLogger("dengine")
 GRACE = 2.0  # seconds in which a store may be slow before its cell verifies everything
 BEAT = 1.0  # seconds between two tries, and between two looks at whether the store is there
 CLOSE = 5.0  # seconds that closing may take
-BACK = "it is there again, and is to take what its journal holds."
 
 
 class Keeper:
@@ -334,6 +347,7 @@ class Keeper:
     def __init__(self, store: Store, owning: bool = True, patient: bool = False) -> None:
         self.store = store
         self.fault = ""
+        self._kind = Fault.STORE
         self._fault_began = 0.0
         self._beat_began: float | None = None
         self.recent = RecentDecisions()
@@ -369,9 +383,9 @@ class Keeper:
 
         A store on a server may be away while the journal on this machine takes everything: then the cell goes on deciding.
         """
-        if not self.fault or self._backlog is None or (self._backlog.store.remote and "journal" not in self.fault):
+        if not self.fault or self._backlog is None or (self._backlog.store.remote and self._kind is not Fault.JOURNAL):
             return ""
-        slow = self.fault.startswith(("no answer", BACK)) and time.monotonic() - self._fault_began < self._grace
+        slow = self._kind in (Fault.SLOW, Fault.RETURNING) and time.monotonic() - self._fault_began < self._grace
         return "" if slow else self.fault
 
     @property
@@ -400,16 +414,16 @@ class Keeper:
             self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
             return
         self._look_at_the_beat()
-        fault = self.fault
+        fault, kind = self.fault, self._kind
         try:
             if not fault:
                 self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
         except StoreError as error:
-            fault = str(error)
+            fault, kind = str(error), Fault.of(error)
         with backlog.lock:  # what is here when the fault ends is played back
             backlog.add(replace(item, time=time.time()))
             if fault:
-                self._note(fault)
+                self._note(fault, kind)
                 self._spill(backlog)
 
     def find(self, decision_id: str) -> StoredDecision | None:
@@ -499,14 +513,15 @@ class Keeper:
             except StoreError as error:
                 if self._backlog is None:
                     raise
-                self._note(str(error))
+                self._note(str(error), Fault.of(error))
         with self._backlog.lock:
             try:
                 self._backlog.write(late)
             except StoreError as error:
-                self._note(str(error))
+                self._note(str(error), Fault.of(error))
                 raise
-            self._note(self.fault or BACK)
+            if not self.fault:
+                self._note("it is there again, and is to take what its journal holds.", Fault.RETURNING)
         self._jobs.put(Asked(lambda: None))  # so that the store is tried now, not at the next beat
         return None
 
@@ -519,22 +534,22 @@ class Keeper:
         backlog, before = self._backlog, self._backlog.unsafe
         return self._put(work, more, lambda: backlog.committed(before))
 
-    def _note(self, fault: str) -> None:
+    def _note(self, fault: str, kind: Fault) -> None:
         if not self.fault:
             self._fault_began = time.monotonic()
             log.warning("labels wait in the journal beside the store: %s", fault)
-        self.fault = fault
+        self.fault, self._kind = fault, kind
 
     def _look_at_the_beat(self) -> None:
         began = self._beat_began
         if not self.fault and began is not None and time.monotonic() - began > self._grace and not self._patient:
-            self._note(f"no answer from the store for {self._grace:g} s.")
+            self._note(f"no answer from the store for {self._grace:g} s.", Fault.SLOW)
 
     def _spill(self, backlog: Backlog, beyond: int = WAITING) -> None:
         try:
             backlog.write_beyond(beyond)
         except StoreError as error:  # they wait in memory
-            self._note(str(error))
+            self._note(str(error), Fault.of(error))
 
     # The keeper's thread
 
@@ -566,7 +581,7 @@ class Keeper:
             if well:  # what the journal held then are decisions, which the store was given as well
                 backlog.stored_upto(end)
         except Exception as error:  # whatever it is, the cell goes on, and this thread too
-            self._note(str(error))
+            self._note(str(error), Fault.of(error))
         finally:
             self._beat_began = None
 
