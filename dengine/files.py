@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from .errors import DataError, OutputError
 
 MOST = 8 * 2**30  # bytes
-SHARE = 0.5  # of the machine's memory
 NPY: Any = np.lib.format  # untyped
 HEADERS = {(1, 0): NPY.read_array_header_1_0, (2, 0): NPY.read_array_header_2_0}
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
@@ -34,18 +33,12 @@ NO_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
 MANIFEST = "manifest.json"
 
 
-def memory_limit() -> int:
-    """Bytes that the arrays of one file may take, unpacked: 8 GB, or half of the machine's memory where that is less."""
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # a system that does not tell
-        return MOST
-    return min(MOST, int(SHARE * memory)) if memory > 0 else MOST
-
-
 def must_fit(size: float, what: object, limit: int | None = None) -> None:
-    """DataError where so many bytes of arrays are more than `limit`, by default `memory_limit()`."""
-    most = memory_limit() if limit is None else limit
+    """DataError for more bytes of arrays than `limit`; None: 8 GB, or half of the machine's memory where that is less."""
+    most = MOST if limit is None else limit
+    with suppress(AttributeError, ValueError, OSError):  # of a system that does not tell
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        most = min(MOST, memory // 2) if limit is None and memory > 0 else most
     if size > most:
         raise DataError(
             f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; split it, or read it where there is "
@@ -67,7 +60,7 @@ def read_archive(
     """The arrays of an .npz by name, and the names of all that it holds.
 
     source : a file, or its content.  names : of the arrays that are wanted; None: all.  name : for errors.
-    limit : bytes that the wanted arrays may take together; None: `memory_limit()`.
+    limit : bytes that the wanted arrays may take together; None: as `must_fit`.
     DataError for what is no archive, is damaged, holds Python objects, or claims too much: nothing is unpacked then.
     """
     called = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
@@ -129,9 +122,7 @@ def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
         if is_database(target):
             raise OutputError(f"{target} is a database, as a store is, and was left as it was; name another file.")
         if not force:
-            raise OutputError(
-                f"{target} exists, and was left as it was; name another file, or replace it with --force (force=True)."
-            )
+            raise OutputError(f"{target} exists, and was left as it was; name another file, or replace it with --force.")
 
 
 def write_output(path: str | os.PathLike[str], content: bytes, force: bool = False, *, make_folder: bool = False) -> Path:
@@ -179,6 +170,5 @@ def _told(target: Path) -> Iterator[None]:
         yield
     except (OSError, ValueError) as error:  # the latter for a name with a NUL
         said = getattr(error, "strerror", None) or error
-        raise OutputError(
-            f"Cannot write {target}: {said}; choose a folder that exists, is writable and has room."
-        ) from error
+        do = "choose a folder that exists, is writable and has room"
+        raise OutputError(f"Cannot write {target}: {said}; {do}.") from error

@@ -75,9 +75,8 @@ class Recipe:
         for name, (least, most) in WHOLE.items():
             value = getattr(self, name)
             if not (is_whole(value, least, most) or (name == "max_steps" and value is None)):
-                raise SettingError(
-                    f"Expected {name} to be an integer of at least {least}, got {shortened(value)}; at most {most:,}."
-                )
+                got = shortened(value)
+                raise SettingError(f"Expected {name} to be an integer of at least {least}, got {got}; at most {most:,}.")
         if not (is_number(self.budget) and self.budget > 0.0):
             raise SettingError(f"Expected budget > 0 seconds, got {shortened(self.budget)}.")
         if not (is_number(self.encoder_budget) and 0.0 <= self.encoder_budget < float("inf")):
@@ -98,10 +97,8 @@ class Recipe:
             raise SettingError(f"Expected params to be a table of the reducer's settings, got {shortened(self.params)}.")
         for name, value in self.params.items():
             if not (value is None or isinstance(value, PLAIN)) or not BARE.fullmatch(str(name)):
-                raise SettingError(
-                    f"Expected params of plain names and values, got {shortened(name)}: "
-                    f"{shortened(value)}; hand an object in."
-                )
+                got = f"{shortened(name)}: {shortened(value)}"
+                raise SettingError(f"Expected params of plain names and values, got {got}; hand an object in.")
 
     @property
     def name(self) -> str:

@@ -14,15 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import (
-    DataError,
-    ReportConflictError,
-    ReportError,
-    SettingError,
-    StoreError,
-    shortened,
-    without_password,
-)
+from .errors import DataError, ReportConflictError, ReportError, SettingError, StoreError, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -123,17 +115,13 @@ class TraceSpec:
                 f"samples, {shortened(self.channels)} channels, {shortened(self.rate_hz)} Hz."
             )
         if not (isinstance(self.unit, str) and all(isinstance(name, str) for name in self.columns)):
-            raise SettingError(
-                f"Expected a unit and columns of text, got {shortened(self.unit)}, {shortened(self.columns)}."
-            )
+            raise SettingError(f"Expected unit and columns of text, got {shortened(self.unit)}, {shortened(self.columns)}.")
         if self.limit is not None and not (is_number(self.limit) and self.limit > 0):
             raise SettingError(f"Expected a limit above 0 in the trace's unit, or None, got {shortened(self.limit)}.")
         if self.fit not in FITS:
             raise SettingError(f"Expected fit to be one of {', '.join(FITS)}, got {shortened(self.fit)}.")
         if self.columns and len(set(self.columns)) != self.channels:
-            raise SettingError(
-                f"Expected {self.channels} different columns, a name a channel, got {', '.join(self.columns)}."
-            )
+            raise SettingError(f"Expected {self.channels} different columns, one a channel, got {', '.join(self.columns)}.")
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
@@ -143,10 +131,8 @@ def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
     try:
         return TraceSpec(**json.loads(known["trace"]))
     except (ValueError, TypeError, RecursionError) as error:
-        raise StoreError(
-            f"Expected the contract of traces in the store's settings, got {shortened(known['trace'])}: {error}; restore "
-            "the store from a copy."
-        ) from error
+        got = shortened(known["trace"])
+        raise StoreError(f"Expected a trace's contract in the settings, got {got}: {error}; restore the store.") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,9 +243,7 @@ def as_outcome(value: Any, of: str = "") -> Outcome:
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
     """Where a label on a decision comes from; ReportError for a rejected part, which went back to the bin."""
     if action is Action.REJECT:
-        raise ReportConflictError(
-            f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label to report."
-        )
+        raise ReportConflictError(f"Decision {decision_id!r} was a reject; the part went back to the bin and has no label.")
     if action is Action.VERIFY:
         return Source.AUDIT if audit else Source.VERIFICATION
     return Source.CONFIRMED if success else Source.STOP
@@ -314,9 +298,7 @@ def find_class(where: str) -> type:
     try:
         found = getattr(import_module(module), name)
     except Exception as error:  # whatever a module of the user's raises while it is imported
-        raise SettingError(
-            f"Expected module:Class of something that can be imported here, got {shortened(where)}: {error}."
-        ) from error
+        raise SettingError(f"Expected module:Class that can be imported here, got {shortened(where)}: {error}.") from error
     if not isinstance(found, type):
         raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
     return found

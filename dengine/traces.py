@@ -146,10 +146,7 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
     channels, samples = x.shape[-2:]
     if channels != spec.channels:
         turned = "; it looks transposed: pass trace.T" if (samples, channels) == (spec.channels, spec.samples) else ""
-        raise TraceError(
-            f"Expected {spec.channels} channel(s), got {channels}; pass (channels, samples), all channels of the "
-            f"contract{turned}."
-        )
+        raise TraceError(f"Expected {spec.channels} channel(s), got {channels}; pass (channels, samples){turned}.")
     if samples == spec.samples:
         return x
     if spec.fit == "strict":
@@ -157,9 +154,7 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
         raise TraceError(
             f"Expected {spec.samples} samples, got {samples}; resample the trace to {spec.rate_hz:g} Hz x {seconds:g} s."
         )
-    whole = torch.from_numpy(np.array(x, order="C"))
-    values: NDArray[np.float32] = fitted(whole, spec.samples, FITS.index(spec.fit)).numpy()
-    return values
+    return np.asarray(fitted(torch.from_numpy(np.array(x, order="C")), spec.samples, FITS.index(spec.fit)))
 
 
 class TraceGate(nn.Module):

@@ -15,7 +15,7 @@ from ..traces import as_trace, is_time, spec_of
 from .dataset import Asked, Dataset, Fault, UnreadableError, make_dataset
 from .folders import FORCE, leave_out_other_rates
 from .labels import label_of
-from .lengths import Collected, as_dataset, refit
+from .lengths import Collected, Recorded, as_dataset, refit
 from .text import rate_of, seconds_of
 
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")
@@ -44,17 +44,13 @@ def read_hdf5(path: Path, name: str, asked: Asked) -> Dataset:
             file.visititems(lambda key, item: have.append(key) if isinstance(item, h5py.Dataset) else None)
             wanted = [key for key in have if key in (*USED, asked.part)]
             must_fit(sum(float(file[key].nbytes) for key in wanted), path)
-            found = {key: _plain(file[key]) for key in wanted}
+            texts = {key for key in wanted if file[key].dtype.kind == "O"}
+            found = {key: np.asarray(file[key].asstr()[()], np.str_) if key in texts else file[key][()] for key in wanted}
             return _from_arrays(found, have, path, name, asked)
     except UNREADABLE as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"Cannot read {path} as an HDF5 file: {error}.") from error
-
-
-def _plain(dataset: Any) -> Any:
-    texts = dataset.dtype.kind == "O"
-    return np.asarray(dataset.asstr()[()] if texts else dataset[()]).astype(np.str_ if texts else dataset.dtype)
 
 
 def _from_arrays(found: Mapping[str, Any], have: Sequence[str], path: Path, name: str, asked: Asked) -> Dataset:
@@ -86,9 +82,7 @@ def _labels(y: Any) -> Any:
     try:
         words = np.asarray(y)
     except (ValueError, TypeError) as error:
-        raise DataError(
-            f"Expected a label for each trace, 1 (success) or 0 (failure), got something else: {error}."
-        ) from error
+        raise DataError(f"Expected a label for each trace, 1 (success) or 0 (failure), got others: {error}.") from error
     if words.dtype.kind not in "OUS" or words.ndim != 1:
         return words
     text = words.astype(np.str_) if words.dtype.kind == "S" else words
@@ -107,15 +101,13 @@ def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:
         try:
             picked = _picked(trace, found.channels)
             x, label, rate = as_trace(picked, None), label_of(word), None if asked.rate_hz else _rate(trace)
-            if found.traces and len(x) != len(found.traces[0]):
-                raise UnreadableError(f"Expected {len(found.traces[0])} channel(s), as the first one has, got {len(x)}")
+            if found.read and len(x) != len(found.read[0].trace):
+                raise UnreadableError(f"Expected {len(found.read[0].trace)} channel(s), as the first has, got {len(x)}")
         except (TraceError, UnreadableError) as error:
             found.faults.append(Fault("data", number, str(error).rstrip(".")))
             continue
         found.channels = found.channels or spec_of(x, picked).columns
-        found.add(x, label, f"trace {number}", None, rate)
-    if found.traces and len(found.channels) not in (0, len(found.traces[0])):
-        raise DataError(f"Expected a name for each of {len(found.traces[0])} channels, got {', '.join(found.channels)}.")
+        found.read.append(Recorded(x, label, f"trace {number}", None, rate))
     leave_out_other_rates(found)
     return as_dataset(found, asked)
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from ..files import UNREADABLE, must_fit
 from .cutting import Insertion, cut_stream, usual_step
 from .dataset import Asked, Dataset, Fault, UnreadableError
 from .folders import natural
-from .labels import Listed, label_of, listed
+from .labels import Listed, collect, label_of, listed
 from .lengths import Collected, as_dataset
 from .triggers import Trigger, as_trigger
 
@@ -36,7 +37,6 @@ WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 AXES = ("FX", "FY", "FZ", "MX", "MY", "MZ")  # in the frame that the topic is in
 ALIASES = dict(zip(("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base"), AXES, strict=True))
 SIZE = 8 * (len(AXES) + 4)  # bytes of one message, read
-SECONDS = 2.0  # of an insertion, where no number of samples was asked for
 
 
 @dataclass
@@ -52,7 +52,6 @@ class Messages:
     others: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
 
     def add(self, message: Any, logged: int) -> None:
-        """One more wrench."""
         header, wrench = getattr(message, "header", None), getattr(message, "wrench", message)
         self.stamped.append(0 if header is None else header.stamp.sec * BILLION + header.stamp.nanosec)
         self.logged.append(logged)
@@ -144,9 +143,7 @@ def _messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Mess
                     found.add(message, logged)
                 if topic in found.others:
                     if not hasattr(message, "data"):
-                        raise DataError(
-                            f"Expected messages with a field data on {topic}, as those of std_msgs, got others."
-                        )
+                        raise DataError(f"Expected messages with a field data on {topic}, as of std_msgs, got others.")
                     found.others[topic].append((logged, message.data))
     return found
 
@@ -156,18 +153,14 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
     if find_spec("mcap") is None or find_spec("mcap_ros2") is None:
         raise DataError('Expected mcap for MCAP files, it is not installed: pip install "dengine[mcap]".')
     if asked.trigger is None:
-        raise DataError(
-            f"Expected a trigger that cuts {path} into insertions, as trigger='contact=5' or 'register@/phase', got none."
-        )
+        raise DataError(f"Expected a trigger that cuts {path} into insertions, as 'contact=5' or 'register@/phase'.")
     trigger, channels = as_trigger(asked.trigger), asked.channels or ("FZ",)
     for channel in channels:
         if axis_of(channel) is None:
             raise DataError(f"Expected a channel among {', '.join(AXES)} of a wrench, got {channel}.")
     files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
     if not files:
-        raise DataError(
-            f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of another storage (.db3)."
-        )
+        raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
     have = _topics(files)
     wrench = _wrench(have, path, asked.topic)
     topics = [signal for signal in trigger.signals if axis_of(signal) is None] + ([asked.label] if asked.label else [])
@@ -185,37 +178,17 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     values, places = np.array(messages.wrench), {signal: axis_of(signal) for signal in trigger.signals}
     active = trigger.active({n: messages.held(n) if axis is None else values[:, axis] for n, axis in places.items()})
     rate = asked.rate_hz or float(f"{1.0 / usual_step(messages.times):.4g}")
-    samples = asked.samples or round(SECONDS * rate)
+    samples = asked.samples or round(2.0 * rate)  # two seconds
     cuts = list(cut_stream(messages.times, values[:, axes], active, samples, trigger.quiet_s, asked.rate_hz))
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]
     labels, faults = _labels(messages, cuts, names, asked)
     found = Collected(name, channels, faults)
-    _collect(cuts, names, labels, found, None if asked.rate_hz else rate)
-    if isinstance(labels, Listed):
-        found.faults.extend(labels.unused())
+    found.faults.extend(Fault(source, 0, cut.fault) for source, cut in zip(names, cuts, strict=True) if cut.fault)
+    traces = [None if cut.fault else cut.trace for cut in cuts]
+    collect(zip(names, traces, repeat(None if asked.rate_hz else rate), strict=False), labels, found)
     return as_dataset(found, asked)
-
-
-def _collect(
-    cuts: Sequence[Insertion], names: Sequence[str], labels: Told | Listed, found: Collected, rate: float | None
-) -> None:
-    """Insertions with their labels; what is no trace, or has no label, is a fault."""
-    unlabelled = 0
-    for insertion, source in zip(cuts, names, strict=True):
-        try:
-            label, part = labels.label(source)
-        except UnreadableError as error:
-            unlabelled += 1
-            found.faults.append(error.fault(source))
-            continue
-        if insertion.fault:
-            found.faults.append(Fault(source, 0, insertion.fault))
-        else:
-            found.add(insertion.trace, label, source, part, rate)
-    if unlabelled > len(cuts) / 2:
-        raise DataError(f"Expected a label for each insertion, {unlabelled} of {len(cuts)} have none; {labels.advice()}.")
 
 
 @dataclass(frozen=True)
@@ -226,13 +199,11 @@ class Told:
     words: dict[str, Any]
 
     def label(self, name: str) -> tuple[int, str | None]:
-        """Of the insertion with this name; a topic tells no part's number."""
         if name not in self.words:
             raise UnreadableError(f"Expected a message of {self.topic} before the next insertion begins, found none")
         return label_of(self.words[name]), None
 
     def advice(self) -> str:
-        """What to do where most insertions have no label."""
         return f"give the topic that tells them, {self.topic} does not, or a file of labels"
 
 

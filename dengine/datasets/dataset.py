@@ -130,15 +130,16 @@ def _real(X: ArrayLike) -> NDArray[np.float32]:
     raise DataError(f"Expected X of real numbers, got dtype {array.dtype}.")
 
 
-def _must_fit(X: NDArray[np.float32], rate_hz: float = 500.0, channels: tuple[str, ...] = ()) -> None:
-    if not 0 < rate_hz < np.inf:
-        raise DataError(f"Expected a rate above 0 Hz, got {rate_hz}.")
-    n_channels = 1 if X.ndim == 2 else X.shape[1]
-    if channels and len(channels) != n_channels:
-        raise DataError(f"Expected a name for each of {n_channels} channels, got {', '.join(channels)}.")
-
-
-def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
+def make_dataset(
+    X: ArrayLike,
+    y: ArrayLike,
+    *,
+    rate_hz: float = 500.0,
+    channels: tuple[str, ...] = (),
+    part: Any = None,
+    cause: Any = None,
+    **about: Any,
+) -> Dataset:
     """A `Dataset` from arrays; DataError where they do not fit together."""
     X, y = _real(X), np.asarray(y)
     if X.ndim not in (2, 3) or y.shape != (len(X),):
@@ -152,8 +153,11 @@ def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
         )
     if not np.isin(y, (0, 1)).all():
         raise DataError(f"Expected labels 1 (success) and 0 (failure), got {sorted(set(map(str, y.tolist())))[:5]}.")
-    _must_fit(X, **{name: about[name] for name in ("rate_hz", "channels") if name in about})
-    part, cause = (about.pop(name, None) for name in ("part", "cause"))
+    if not 0 < rate_hz < np.inf:
+        raise DataError(f"Expected a rate above 0 Hz, got {rate_hz}.")
+    n_channels = 1 if X.ndim == 2 else X.shape[1]
+    if channels and len(channels) != n_channels:
+        raise DataError(f"Expected a name for each of {n_channels} channels, got {', '.join(channels)}.")
     if part is not None:
         part = np.asarray(part)
         if part.shape != y.shape or part.dtype.kind not in "iuUS":
@@ -161,7 +165,7 @@ def make_dataset(X: ArrayLike, y: ArrayLike, **about: Any) -> Dataset:
         part = part.astype(np.str_)
     if cause is not None and np.shape(cause) != y.shape:
         raise DataError(f"Expected {len(y)} causes, one a trace, got {np.shape(cause)}.")
-    return Dataset(X, y.astype(np.int8), part=part, cause=cause, **about)
+    return Dataset(X, y.astype(np.int8), rate_hz=rate_hz, channels=channels, part=part, cause=cause, **about)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,9 +184,7 @@ class Asked:
 
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
-            raise DataError(
-                "Expected a pattern for the labels (label) or a file of them (labels), got both; leave one out."
-            )
+            raise DataError("Expected a pattern of the labels (label) or a file of them (labels), got both; leave one out.")
         if self.fit is not None and self.fit not in FITS:
             raise DataError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
         if self.rate_hz is not None and not self.rate_hz > 0:
@@ -192,17 +194,11 @@ class Asked:
         if len(set(self.channels)) != len(self.channels):
             raise DataError(f"Expected each channel once, got {', '.join(self.channels)}.")
 
-    def refuse_cutting(self, what: str) -> None:
-        """DataError for options that cut a stream, where what is read is no stream."""
-        idle = [name for name in ("trigger", "topic") if getattr(self, name) is not None]
-        if idle:
-            raise DataError(f"Expected no {' or '.join(idle)} for {what}: it is cut into insertions already; leave it out.")
-
-    def refuse(self, what: str, *names: str) -> None:
+    def refuse(self, what: str, *names: str, why: str = "it has its labels") -> None:
         """DataError for options that say nothing to what is read."""
         idle = [name for name in names if getattr(self, name) is not None]
         if idle:
-            raise DataError(f"Expected no {' or '.join(idle)} for {what}: it has its labels; leave it out.")
+            raise DataError(f"Expected no {' or '.join(idle)} for {what}: {why}; leave it out.")
 
 
 def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from ..errors import DataError
 from ..traces import is_time
 from .dataset import Asked, Dataset, Fault, UnreadableError
-from .labels import Listed, Named, listed, named
+from .labels import Named, collect, listed
 from .lengths import Collected, as_dataset
-from .text import Recording, read_header, read_recording
+from .text import read_header, read_recording
 
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
 NEAR = 0.03  # of the others' rate
@@ -29,11 +31,9 @@ def read_folder(folder: Path, asked: Asked) -> Dataset:
     ordered = {name: names[name] for name in sorted(names, key=natural)}
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
-    labels, faults = (named(asked.label), []) if asked.labels is None else listed(asked.labels, asked.part, list(names))
+    labels, faults = (Named(asked.label), []) if asked.labels is None else listed(asked.labels, asked.part, list(names))
     found = Collected(folder.resolve().name, _channels(ordered, asked, folder), faults)
-    _read_all(ordered, labels, found, asked)
-    if isinstance(labels, Listed):
-        found.faults.extend(labels.unused())
+    collect(_read(ordered, found, timed=asked.rate_hz is None), labels, found)
     leave_out_other_rates(found)
     return as_dataset(found, asked)
 
@@ -59,35 +59,18 @@ def _channels(paths: dict[str, Path], asked: Asked, folder: Path) -> tuple[str, 
     return usual
 
 
-def _read_all(paths: dict[str, Path], labels: Named | Listed, found: Collected, asked: Asked) -> None:
-    unlabelled = 0
+def _read(paths: dict[str, Path], found: Collected, timed: bool) -> Iterator[tuple[str, Any, float | None]]:
     for name, path in paths.items():
         try:
-            recording: Recording | None = read_recording(path, found.channels, timed=asked.rate_hz is None)
+            yield name, *read_recording(path, found.channels, timed)
         except (OSError, UnreadableError) as error:
-            recording = None
             found.faults.append(Fault(name, getattr(error, "line", 0), str(error)))
-        try:
-            label, part = labels.label(name)
-        except UnreadableError as error:
-            unlabelled += 1
-            if recording is not None:  # one reason a file is enough
-                found.faults.append(error.fault(name))
-                recording = None
-        if recording is not None:
-            found.add(recording.values, label, name, part, recording.rate_hz)
-    if unlabelled > len(paths) / 2:
-        raise DataError(
-            f"Expected a label for each recording, {unlabelled} of {len(paths)} have none, {found.faults[-1].source} for "
-            f"one; {labels.advice()}."
-        )
+            yield name, None, None
 
 
 def leave_out_other_rates(found: Collected) -> None:
     """A recording at another rate is another trace of the same insertion: it is a fault."""
-    known = [rate for rate in found.rates if rate is not None]
-    if not known:
-        return
-    usual = max(known, key=lambda rate: sum(abs(other - rate) <= NEAR * rate for other in known))
-    off = [i for i, rate in enumerate(found.rates) if rate is not None and abs(rate - usual) > NEAR * usual]
-    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {found.rates[i]:g} Hz" for i in off})
+    known = {i: each.rate_hz for i, each in enumerate(found.read) if each.rate_hz is not None}
+    usual = max(known.values(), key=lambda one: sum(abs(rate - one) <= NEAR * one for rate in known.values()), default=0.0)
+    off = {i: rate for i, rate in known.items() if abs(rate - usual) > NEAR * usual}
+    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {r:g} Hz" for i, r in off.items()})

@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,14 +30,14 @@ from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
 from .loading import TABLES
 
+CHUNK = 500  # traces committed together
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
 def form_in(store: str | os.PathLike[str] | Store, source: Any) -> dict[str, Any]:
-    """The `samples` and `fit` with which `load_dataset` gives recordings the form that those in a store have.
+    """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
 
-    Files that are added change the median that lengths are padded to; without this the others would come out changed, and
-    count again. Empty for a new store, and for what has one length.
+    Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
     """
     if not isinstance(source, str | os.PathLike):
         return {}
@@ -50,9 +50,7 @@ def form_in(store: str | os.PathLike[str] | Store, source: Any) -> dict[str, Any
                 opened.close()
     except StoreError:
         return {}  # a new one; what else is wrong is found when it is opened to write
-    if agreed is None:
-        return {}
-    return {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}
+    return {} if agreed is None else {"samples": agreed.samples, "fit": None if agreed.fit == "strict" else agreed.fit}
 
 
 def must_agree(data: Dataset, agreed: TraceSpec) -> None:
@@ -68,9 +66,6 @@ def must_agree(data: Dataset, agreed: TraceSpec) -> None:
         raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
     if data.channels and agreed.columns and data.channels != agreed.columns:
         raise TraceError(f"Expected the channels {', '.join(agreed.columns)}, got {', '.join(data.channels)}.")
-
-
-CHUNK = 500  # traces committed together
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,17 +101,22 @@ def import_labelled(
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
     data = load_dataset(dataset, **form_in(store, dataset))
-    spec = data.spec
     engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe)
+    counts = np.zeros(3, dtype=np.int64)
     try:
-        agreed = engine.agree_on(spec)
+        agreed = engine.agree_on(data.spec)
         must_agree(data, agreed)
-        traces = as_traces(data.X, agreed)
-        counts = [_import_chunk(engine.store, *part, agreed, on_traces) for part in _chunks(traces, data)]
+        gate, traces = TraceGate(agreed), as_traces(data.X, agreed)
+        arrivals = _arrivals(traces, data)
+        for start in range(0, len(data), CHUNK):
+            part = slice(start, start + CHUNK)
+            counts += _import_chunk(engine.store, gate, traces[part], data.y[part], arrivals[part])
+            if on_traces is not None:
+                on_traces(len(arrivals[part]))
     finally:
         if not isinstance(store, Store):
             engine.close()
-    imported, quarantined, known = (sum(column) for column in zip(*counts, strict=True))
+    imported, quarantined, known = counts.tolist()
     return ImportReport(imported, quarantined, known, engine.resumed)
 
 
@@ -137,54 +137,41 @@ def train_until_done(
     return reports
 
 
-Part = tuple[NDArray[np.float32], NDArray[np.int8], NDArray[np.int64], list[str], list[str | None]]
+class _Arrival(NamedTuple):
+    id: str
+    part: str | None
+    hash: int  # that it goes by
 
 
-def _chunks(traces: NDArray[np.float32], data: Dataset) -> Iterator[Part]:
-    hashes = content_hash(traces)
-    ids = _ids(hashes)
-    for start in range(0, len(data), CHUNK):
-        part = slice(start, start + CHUNK)
-        numbers = [None] * len(ids[part]) if data.part is None else data.part[part].tolist()
-        yield traces[part], data.y[part], hashes[part], ids[part], numbers
-
-
-def _ids(hashes: NDArray[np.int64]) -> list[str]:
-    """The ids of traces with these content hashes, (n,), in the order of their file."""
-    ids, times = [], Counter[int]()
-    for hash_ in hashes.tolist():  # equal traces within one file are events of their own
-        ids.append(f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}")
+def _arrivals(traces: NDArray[np.float32], data: Dataset) -> list[_Arrival]:
+    """The ids, part's numbers and hashes of traces (n, C, T), in the order of their file."""
+    times, arrivals = Counter[int](), []
+    parts = [None] * len(data) if data.part is None else data.part.tolist()
+    for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
+        id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
         times[hash_] += 1
-    return ids
+        arrivals.append(_Arrival(id_, part, own_hash(hash_, part)))
+    return arrivals
 
 
 def _import_chunk(
-    store: Store,
-    traces: NDArray[np.float32],
-    labels: NDArray[np.int8],
-    hashes: NDArray[np.int64],
-    ids: list[str],
-    parts: list[str | None],
-    spec: TraceSpec,
-    on_traces: Callable[[int], None] | None,
+    store: Store, gate: TraceGate, traces: NDArray[np.float32], labels: NDArray[np.int8], arrivals: list[_Arrival]
 ) -> tuple[int, int, int]:
-    gate = TraceGate(spec)
-    own = np.array([own_hash(*each) for each in zip(hashes.tolist(), parts, strict=True)], dtype=np.int64)
-    new = [i for i, id_ in enumerate(ids) if store.get_decision(id_) is None]
+    """Numbers of traces imported, quarantined and known."""
+    new = [i for i, each in enumerate(arrivals) if store.get_decision(each.id) is None]
     faults = {i: gate(torch.from_numpy(traces[i]))[0] for i in new}
     good = [i for i in new if not faults[i]]
     if good:
-        decisions = [_verified(ids[i], Reason.NO_MODEL, parts[i]) for i in good]
-        store.put_labelled(decisions, traces[good], own[good], labels[good], Source.VERIFICATION)
+        decisions = [_verified(arrivals[i], Reason.NO_MODEL) for i in good]
+        own = np.array([arrivals[i].hash for i in good], dtype=np.int64)
+        store.put_labelled(decisions, traces[good], own, labels[good], Source.VERIFICATION)
     bad = [i for i in new if faults[i]]
     for i in bad:  # kept, but never given to training
-        decision = _verified(ids[i], REASONS[faults[i]], parts[i])
-        store.put_decision(decision, traces[i], int(own[i]), quarantined=True)
-        store.put_label(ids[i], bool(labels[i]), Source.VERIFICATION, 0, None)
-    if on_traces is not None:
-        on_traces(len(ids))
-    return len(good), len(bad), len(ids) - len(new)
+        each = arrivals[i]
+        store.put_decision(_verified(each, REASONS[faults[i]]), traces[i], each.hash, quarantined=True)
+        store.put_label(each.id, bool(labels[i]), Source.VERIFICATION, 0, None)
+    return len(good), len(bad), len(arrivals) - len(new)
 
 
-def _verified(id_: str, reason: Reason, part: str | None) -> Decision:
-    return Decision(id_, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, reason, False, 1.0, part)
+def _verified(each: _Arrival, reason: Reason) -> Decision:
+    return Decision(each.id, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, reason, False, 1.0, each.part)

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from .dataset import Fault, UnreadableError
+from .lengths import Collected, Recorded
 from .text import read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
@@ -37,11 +39,19 @@ def label_of(word: Any) -> int:
     return int((found[2] in GOOD) != bool(found[1]))
 
 
-@dataclass(frozen=True)
 class Named:
-    """A label in the name: at the end of the file's, or as its folder's; or what a pattern's group finds in the path."""
+    """A label in the name: at the end of the file's, or as its folder's; or what a pattern's group finds in the path.
 
-    pattern: re.Pattern[str] | None = None
+    DataError for a pattern that is no regular expression with one group.
+    """
+
+    def __init__(self, pattern: str | None = None) -> None:
+        try:
+            self.pattern = None if pattern is None else re.compile(pattern)
+        except re.error as error:
+            raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
+        if self.pattern is not None and self.pattern.groups != 1:
+            raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
 
     def label(self, name: str) -> tuple[int, str | None]:
         """Of the file with this path, seen from the folder; and its part's number, which a name does not tell."""
@@ -53,7 +63,6 @@ class Named:
         return label_of(match[1]), None
 
     def advice(self) -> str:
-        """What to do where most recordings have no label."""
         return "give the pattern of it in the path (label='_(OK|NOK)'), or a file of labels"
 
 
@@ -72,36 +81,26 @@ def _usual(path: PurePosixPath) -> int:
     return by_name
 
 
-def named(pattern: str | None) -> Named:
-    """DataError for a pattern that is no regular expression with one group."""
-    if pattern is None:
-        return Named()
-    try:
-        compiled = re.compile(pattern)
-    except re.error as error:
-        raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
-    if compiled.groups != 1:
-        raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
-    return Named(compiled)
-
-
-@dataclass
 class Listed:
-    """Labels, and parts' numbers, from a file: a row a recording."""
+    """Labels, and parts' numbers, from a file. rows : line, file, word and part of each.  names : of all recordings."""
 
-    source: str
-    rows: list[tuple[int, str, str, str | None]]  # line, file, word, part
-    names: Sequence[str]  # of all recordings
-    used: set[int] = field(default_factory=set)  # lines
+    def __init__(self, source: str, rows: Iterable[tuple[int, str, str, str | None]], names: Sequence[str]) -> None:
+        self.source, self.rows, self.used = source, list(rows), set[int]()
+        self._rows: dict[str, list[tuple[int, str, str, str | None]]] = {}
+        self._names: dict[str, list[str]] = {}
+        for row in self.rows:
+            self._rows.setdefault(_words(row[1])[-1], []).append(row)
+        for name in names:
+            self._names.setdefault(_words(name)[-1], []).append(name)
 
     def label(self, name: str) -> tuple[int, str | None]:
         """Of the file with this path, listed by its path, its end, or longer by a folder; without suffix, in any case."""
-        rows = [row for row in self._rows_by_file.get(_words(name)[-1], ()) if _alike(row[1], name)]
+        rows = [row for row in self._rows.get(_words(name)[-1], ()) if _alike(row[1], name)]
         if not rows:
             raise UnreadableError(f"Expected a row of {self.source} that names it, found none")
         self.used.update(line for line, *_ in rows)
         line, file, word, part = max(rows, key=lambda row: (_words(row[1]) == _words(name), len(_words(row[1]))))
-        others = [other for other in self._names_by_file[_words(name)[-1]] if other != name and _alike(file, other)]
+        others = [other for other in self._names[_words(name)[-1]] if other != name and _alike(file, other)]
         if others and _words(file) != _words(name):
             raise UnreadableError(f"Expected its folder in {self.source}, line {line}, which names {others[0]} too")
         try:
@@ -109,29 +108,9 @@ class Listed:
         except UnreadableError as error:
             raise UnreadableError(f"{error.what} in {self.source}, line {line}") from error
 
-    def unused(self) -> list[Fault]:
-        """Rows that name no recording."""
-        lost = [(line, file) for line, file, *_ in self.rows if line not in self.used]
-        return [Fault(self.source, line, f"Expected the name of a recording, found no file {file}") for line, file in lost]
-
     def advice(self) -> str:
-        """What to do where most recordings have no label."""
         files = ", ".join(file for _, file, *_ in self.rows[:3])
         return f"{self.source} names {files or 'no files'}: call its columns file and label, and the files as they are"
-
-    @cached_property
-    def _rows_by_file(self) -> dict[str, list[tuple[int, str, str, str | None]]]:
-        found: dict[str, list[tuple[int, str, str, str | None]]] = {}
-        for row in self.rows:
-            found.setdefault(_words(row[1])[-1], []).append(row)
-        return found
-
-    @cached_property
-    def _names_by_file(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
-        for name in self.names:
-            found.setdefault(_words(name)[-1], []).append(name)
-        return found
 
 
 def _words(path: str) -> list[str]:
@@ -172,7 +151,7 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> tup
             table.faults.append(Fault(source, number, f"Expected each file once, {words[of_file]} came before"))
         else:
             rows[key] = number, words[of_file], words[of_label], None if of_part is None else words[of_part] or None
-    return Listed(source, list(rows.values()), names), table.faults
+    return Listed(source, rows.values(), names), table.faults
 
 
 def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -190,3 +169,35 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
 def _place(header: Sequence[str], known: Sequence[str]) -> int | None:
     lower = [name.lower() for name in header]
     return next((lower.index(name) for name in known if name in lower), None)
+
+
+class Labels(Protocol):
+    """Where the labels of recordings come from."""
+
+    def label(self, name: str) -> tuple[int, str | None]: ...  # and the part's number; UnreadableError where there is none
+
+    def advice(self) -> str: ...  # what to do where most recordings have no label
+
+
+def collect(read: Iterable[tuple[str, NDArray[np.float32] | None, float | None]], labels: Labels, found: Collected) -> None:
+    """Add recordings with their labels: of each its name, (C, T) and rate; a trace of None is a fault already."""
+    total = unlabelled = 0
+    for name, trace, rate in read:
+        total += 1
+        try:
+            label, part = labels.label(name)
+        except UnreadableError as error:
+            unlabelled += 1
+            if trace is not None:  # one reason a file is enough
+                found.faults.append(error.fault(name))
+            continue
+        if trace is not None:
+            found.read.append(Recorded(trace, label, name, part, rate))
+    if unlabelled > total / 2:
+        raise DataError(
+            f"Expected a label for each recording, {unlabelled} of {total} have none, {found.faults[-1].source} for one; "
+            f"{labels.advice()}."
+        )
+    for line, file, *_ in labels.rows if isinstance(labels, Listed) else ():
+        if line not in labels.used:
+            found.faults.append(Fault(labels.source, line, f"Expected the name of a recording, found no file {file}"))

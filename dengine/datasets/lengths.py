@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,61 +16,60 @@ from ..records import FITS
 from ..traces import fits, fitted
 from .dataset import Asked, Dataset, Fault, make_dataset
 
-Lengths = NDArray[np.int64]
+
+class Recorded(NamedTuple):
+    """One recording as it was read. trace : (C, T) float32.  rate_hz : by its own timestamps, where it has any."""
+
+    trace: NDArray[np.float32]
+    label: int
+    source: str
+    part: str | None
+    rate_hz: float | None
 
 
 @dataclass
 class Collected:
-    """Recordings as they were read, in order, and what could not be."""
+    """Recordings, in order, and what could not be read."""
 
     name: str
     channels: tuple[str, ...]
     faults: list[Fault]
-    traces: list[NDArray[np.float32]] = field(default_factory=list)  # (C, T) each
-    labels: list[int] = field(default_factory=list)
-    sources: list[str] = field(default_factory=list)
-    parts: list[str | None] = field(default_factory=list)
-    rates: list[float | None] = field(default_factory=list)
-
-    def add(self, trace: NDArray[np.float32], label: int, source: str, part: str | None, rate_hz: float | None) -> None:
-        """One that could be read."""
-        for column, value in zip(self._columns(), (trace, label, source, part, rate_hz), strict=True):
-            column.append(value)
+    read: list[Recorded] = field(default_factory=list)
 
     def leave_out(self, why: Mapping[int, str]) -> None:
         """Make faults of those at these places."""
-        self.faults.extend(Fault(self.sources[i], 0, what) for i, what in why.items())
-        for column in self._columns():
-            column[:] = [value for i, value in enumerate(column) if i not in why]
-
-    def _columns(self) -> tuple[list, ...]:  # type: ignore[type-arg]  # of five kinds
-        return self.traces, self.labels, self.sources, self.parts, self.rates
+        self.faults.extend(Fault(self.read[i].source, 0, what) for i, what in why.items())
+        self.read = [each for i, each in enumerate(self.read) if i not in why]
 
 
 def as_dataset(found: Collected, asked: Asked) -> Dataset:
     """One data set of all that can be fitted; DataError where nothing can."""
     _must_have_some(found)
-    lengths = np.array([x.shape[1] for x in found.traces], dtype=np.int64)
+    lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
     fit, samples = form_of(lengths, asked.fit, asked.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
     unfit = [i for i, have in enumerate(lengths.tolist()) if not _fits(have, samples, fit)]
     found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
     _must_have_some(found)
-    block = np.stack([_fitted(x, samples, fit) for x in found.traces])
-    rates = np.array([np.nan if rate is None else rate for rate in found.rates])
+    block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
+    rates = np.array([np.nan if each.rate_hz is None else each.rate_hz for each in found.read])
     timed = np.isfinite(rates).any()
     rate = asked.rate_hz or (float(np.nanmedian(rates)) if timed else 500.0)
+    # A recording without a part's number is of a part of its own.
+    parts = [each.source if each.part is None else each.part for each in found.read]
     about = {
-        "part": None if all(part is None for part in found.parts) else _numbers(found),
+        "part": np.array(parts) if any(each.part is not None for each in found.read) else None,
         "faults": tuple(found.faults),
         "channels": found.channels,
         "unit": unit_of(found.channels),
-        "source": np.array(found.sources),
+        "source": np.array([each.source for each in found.read]),
         "lengths": np.delete(lengths, unfit),
         "rates": rates if timed else None,
     }
     X = block[:, 0] if block.shape[1] == 1 else block
-    return make_dataset(X, found.labels, name=found.name, rate_hz=float(f"{rate * stretch:.4g}"), fit=fit, **about)
+    return make_dataset(
+        X, [each.label for each in found.read], name=found.name, rate_hz=float(f"{rate * stretch:.4g}"), fit=fit, **about
+    )
 
 
 def unit_of(channels: Sequence[str]) -> str:
@@ -78,7 +78,7 @@ def unit_of(channels: Sequence[str]) -> str:
     return units.pop() if len(units) == 1 else "mixed units"
 
 
-def form_of(lengths: Lengths, fit: str | None, samples: int | None) -> tuple[str, int]:
+def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) -> tuple[str, int]:
     """The fit and the samples that lengths (n,) are brought to, where they were not both asked for.
 
     Of one length: strict. With `samples` that all have: cut. Else pad to the median: what was measured stays as it was, at
@@ -90,9 +90,8 @@ def form_of(lengths: Lengths, fit: str | None, samples: int | None) -> tuple[str
         alike = low == high and samples in (None, low)
         fit = "strict" if alike else "cut" if samples is not None and samples <= low else "pad"
     if fit == "strict" and low != high:
-        raise DataError(
-            f"Expected recordings of one length, got {low} to {high} samples; choose fit='pad', 'cut' or 'resample'."
-        )
+        choose = "choose fit='pad', 'cut' or 'resample'"
+        raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
     if fit == "strict" and samples not in (None, low):
         raise DataError(f"Expected {low} samples, as recorded, with fit='strict', got {samples}; choose fit='cut'.")
     if samples is None:
@@ -116,16 +115,11 @@ def refit(data: Dataset, asked: Asked) -> Dataset:
 
 
 def _must_have_some(found: Collected) -> None:
-    if not found.traces and not found.faults:
+    if not found.read and not found.faults:
         raise DataError(f"Expected at least one trace in {found.name}, got none.")
-    if not found.traces:
+    if not found.read:
         few = "; ".join(map(str, found.faults[:3]))
         raise DataError(f"Expected recordings that can be read in {found.name}, found none of {len(found.faults)}: {few}.")
-
-
-def _numbers(found: Collected) -> NDArray[np.str_]:
-    """Parts' numbers; a recording without one is of a part of its own."""
-    return np.array([source if part is None else part for source, part in zip(found.sources, found.parts, strict=True)])
 
 
 def _fits(have: int, samples: int, fit: str) -> bool:

@@ -24,14 +24,8 @@ from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 Reader = Callable[[Path, str, Asked], Dataset]
-READERS: dict[str, Reader] = {  # by suffix; other zip files are read as .npz
-    ".csv": read_csv,
-    ".parquet": read_parquet,
-    ".pq": read_parquet,
-    ".h5": read_hdf5,
-    ".hdf5": read_hdf5,
-}
-TABLES = (".csv", ".parquet", ".pq")
+TABLES: dict[str, Reader] = {".csv": read_csv, ".parquet": read_parquet, ".pq": read_parquet}
+READERS: dict[str, Reader] = {**TABLES, ".h5": read_hdf5, ".hdf5": read_hdf5}  # other zip files are read as .npz
 
 
 def load_dataset(
@@ -74,7 +68,7 @@ def load_dataset(
     """
     asked = Asked(samples, part, names_of(channel), label, labels, fit, rate_hz, trigger, topic)
     if not is_stream(source):
-        asked.refuse_cutting("what is no .mcap file, nor a bag")
+        asked.refuse("what is no .mcap file, nor a bag", "trigger", "topic", why="it is cut into insertions already")
     if isinstance(source, Dataset):
         asked.refuse("a Dataset", "label", "labels")
         return refit(source, asked)
@@ -104,20 +98,15 @@ def _read(path: Path, asked: Asked) -> Dataset:
     suffix = path.suffix.lower()
     if is_database(path):
         asked.refuse("a store", "label", "labels")
-        return read_store(path, path.stem, asked)
+        return _read_store(path, asked)
     if suffix not in (".npz", *READERS) and not zipfile.is_zipfile(path):
         raise DataError(f"Expected a file .npz, .csv, .parquet, .h5 or .mcap, got {path}; save it as one of these.")
     asked.refuse(f"a file {suffix}", "labels", *([] if suffix in TABLES else ["label"]))
     return READERS.get(suffix, read_npz)(path, path.stem, asked)
 
 
-def read_store(path: Path, name: str, asked: Asked) -> Dataset:
-    """Every labelled trace of a store, in the order of the labels, as they count now, without bad and forgotten ones.
-
-    Where everything was verified these are all parts. Where the model decided they are a choice of its own: those that it
-    was not certain of, audits, and what became known of accepted ones.
-    DataError for a store without a label.
-    """
+def _read_store(path: Path, asked: Asked) -> Dataset:
+    """Every labelled trace of a store, in the order of the labels, as they count now, without bad and forgotten ones."""
     from ..store.base import open_store
 
     store = open_store(path, must_exist=True)
@@ -126,15 +115,12 @@ def read_store(path: Path, name: str, asked: Asked) -> Dataset:
     finally:
         store.close()
     if spec is None or not len(held.labels):
-        raise DataError(
-            f"Expected a store with labelled traces, {path} has none; record some first, as in the shadow mode."
-        )
-    again = len(np.unique(held.hashes)) < len(held.hashes)
+        raise DataError(f"Expected a store with labelled traces, {path} has none; record some first, as in shadow mode.")
     about = {"rate_hz": spec.rate_hz, "unit": spec.unit, "channels": tuple(spec.columns), "fit": spec.fit}
     X = held.traces[:, 0] if spec.channels == 1 else held.traces
-    # By the hash that is counted with: a part that came again has one vote there too.
-    part = held.hashes.astype(np.str_) if again else None
-    return refit(make_dataset(X, held.labels, part=part, name=name, **about), asked)
+    again = len(np.unique(held.hashes)) < len(held.hashes)
+    part = held.hashes.astype(np.str_) if again else None  # as they count: a part that came again has one vote
+    return refit(make_dataset(X, held.labels, part=part, name=path.stem, **about), asked)
 
 
 def _refuse(source: Any) -> Dataset:

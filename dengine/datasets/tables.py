@@ -22,7 +22,7 @@ from ..traces import is_time
 from .dataset import Asked, Dataset, Fault, UnreadableError
 from .folders import FORCE
 from .labels import LABEL_COLUMNS, label_of
-from .lengths import Collected, as_dataset
+from .lengths import Collected, Recorded, as_dataset
 from .text import is_number, numbers, read_table
 
 if TYPE_CHECKING:
@@ -53,23 +53,18 @@ def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
 
     if find_spec("pyarrow") is None:
         raise DataError('Expected pyarrow for Parquet files, it is not installed: pip install "dengine[files]".')
+    parquet: Any = import_module("pyarrow.parquet")  # untyped
     try:
-        _must_fit(path)
+        with parquet.ParquetFile(path) as file:
+            about = file.metadata
+        groups = (about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+        must_fit(max(float(sum(groups)), 8.0 * about.num_rows * about.num_columns), path)  # as claimed, or the cells alone
         frame = pd.read_parquet(path)
     except UNREADABLE as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"Cannot read {path} as a Parquet file: {error}.") from error
     return from_frame(frame, asked, name, path.name)
-
-
-def _must_fit(path: Path) -> None:
-    """DataError for a Parquet file that claims, or whose cells alone are, more than memory holds."""
-    parquet: Any = import_module("pyarrow.parquet")  # untyped
-    with parquet.ParquetFile(path) as file:
-        about = file.metadata
-    groups = (about.row_group(i).total_byte_size for i in range(about.num_row_groups))
-    must_fit(max(float(sum(groups)), 8.0 * about.num_rows * about.num_columns), path)
 
 
 def from_frame(
@@ -85,7 +80,8 @@ def from_frame(
     An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
     a shorter trace. A row with text in it, or no label, is a fault.
     """
-    frame = frame.set_axis([_name_of(each) for each in frame.columns], axis=1)
+    levels = [each if isinstance(each, tuple) else (each,) for each in frame.columns]  # FZ and 0 are FZ_0
+    frame = frame.set_axis(["_".join(str(word) for word in words if word != "") for words in levels], axis=1)
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
         raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
@@ -99,13 +95,8 @@ def from_frame(
     left_out = [Fault(source, lines[i], what) for i, what in sorted(wrong.items())]
     found = Collected(name, tuple(n for n in channels if n), [*(faults or []), *left_out])
     for i in (i for i in range(len(frame)) if i not in wrong):
-        found.add(traces[i], int(y[i]), f"{source}, line {lines[i]}", parts[i], None)
+        found.read.append(Recorded(traces[i], int(y[i]), f"{source}, line {lines[i]}", parts[i], None))
     return as_dataset(found, asked)
-
-
-def _name_of(column: Any) -> str:
-    """A column's name; FZ_0 of one in two levels, FZ and 0."""
-    return "_".join(str(word) for word in column if word != "") if isinstance(column, tuple) else str(column)
 
 
 def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[tuple[str, ...], list[NDArray[np.float32]]]:
@@ -154,9 +145,7 @@ def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
         if known in lower:
             return str(lower[known])
     if any(is_time(c) for c in frame.columns):
-        raise DataError(
-            f"Expected a row an insertion, found {listed(frame.columns)}, as in one recording; give its folder."
-        )
+        raise DataError(f"Expected a row an insertion, got {listed(frame.columns)}, as in one recording; give its folder.")
     raise DataError(f"Expected a column of labels, y or label, found {listed(frame.columns)}; name it: label='...'.")
 
 

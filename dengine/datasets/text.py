@@ -107,9 +107,8 @@ def read_table(path: Path) -> Table:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise UnreadableError(
-            f"Expected UTF-8 text, got the byte 0x{raw[error.start]:02x}; save it as UTF-8", line
-        ) from None
+        byte = f"0x{raw[error.start]:02x}"
+        raise UnreadableError(f"Expected UTF-8 text, got the byte {byte}; save it as UTF-8", line) from None
     (_, head), *below = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
     header, delimiter = header_of(head)
     if not header:
@@ -144,16 +143,8 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
         return block.astype(np.float32), wrong
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
-    """values : (C, T) float32.  rate_hz : from its timestamps; None where it has none, or they were not asked for."""
-
-    values: NDArray[np.float32]
-    rate_hz: float | None
-
-
-def read_recording(path: Path, channels: Sequence[str], timed: bool) -> Recording:
-    """The channels of one file; UnreadableError names the line that cannot be read.
+def read_recording(path: Path, channels: Sequence[str], timed: bool) -> tuple[NDArray[np.float32], float | None]:
+    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault.
 
     An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
     """
@@ -169,7 +160,7 @@ def read_recording(path: Path, channels: Sequence[str], timed: bool) -> Recordin
     if wrong:
         raise UnreadableError(wrong[min(wrong)], table.lines[min(wrong)])
     rate = None if clock is None else rate_of(seconds_of(frame[clock], table.header[clock]))
-    return Recording(np.ascontiguousarray(values.T), rate)
+    return np.ascontiguousarray(values.T), rate
 
 
 def place_of(name: str, header: Sequence[str]) -> int:

@@ -26,18 +26,12 @@ class Trigger(Protocol):
     """When an insertion begins."""
 
     @property
-    def signals(self) -> tuple[str, ...]:
-        """The names of the signals that it looks at."""
-        ...
+    def signals(self) -> tuple[str, ...]: ...  # the names of those that it looks at
 
     @property
-    def quiet_s(self) -> float:
-        """Seconds that it must have been off before it counts as going on."""
-        ...
+    def quiet_s(self) -> float: ...  # seconds that it must have been off before it counts as going on
 
-    def active(self, signals: Signals) -> Active:
-        """(n,) whether it is on, of signals (n,) each; a NaN in them is off."""
-        ...
+    def active(self, signals: Signals) -> Active: ...  # (n,) whether it is on; a NaN in a signal is off
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +48,9 @@ class BitTrigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The word that the bit is of."""
         return (self.signal,)
 
     def active(self, signals: Signals) -> Active:
-        """(n,) the bit is set."""
         word = np.nan_to_num(signals[self.signal]).astype(np.uint64)
         return np.asarray((word >> np.uint64(self.bit)) & np.uint64(1), dtype=np.bool_)
 
@@ -73,11 +65,9 @@ class RegisterTrigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The register."""
         return (self.signal,)
 
     def active(self, signals: Signals) -> Active:
-        """(n,) it holds the value."""
         held = np.nan_to_num(signals[self.signal])
         return np.asarray(held != 0 if self.value is None else held == self.value)
 
@@ -99,11 +89,9 @@ class ContactTrigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The force."""
         return (self.signal,)
 
     def active(self, signals: Signals) -> Active:
-        """(n,) in contact."""
         return np.asarray(np.abs(np.nan_to_num(signals[self.signal])) >= self.newtons)
 
 
@@ -121,11 +109,9 @@ class MotionTrigger:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """Its three directions."""
         return tuple(f"{self.signal}[{i}]" for i in range(3))
 
     def active(self, signals: Signals) -> Active:
-        """(n,) in motion."""
         each = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
         return np.asarray(np.linalg.norm(each, axis=0) > self.speed)
 

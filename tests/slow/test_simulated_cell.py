@@ -11,15 +11,7 @@ import pytest
 pytest.importorskip("mujoco")
 
 from dengine.cells.simulation.cell import SimulatedCell, insert_once
-from dengine.cells.simulation.conditions import (
-    JUMP_N,
-    SCENARIOS,
-    WEAR_FRICTION,
-    CellParameters,
-    Conditions,
-    draw_conditions,
-    find_scenario,
-)
+from dengine.cells.simulation.conditions import SCENARIOS, CellParameters, Conditions, draw_conditions, find_scenario
 from dengine.cells.simulation.generate import save_traces, simulate, simulate_balanced
 from dengine.cells.simulation.world import push
 from dengine.errors import DengineError, SettingError
@@ -132,7 +124,7 @@ def test_scenarios_change_what_they_say_and_nothing_else() -> None:
         "variant": {"part_mass_kg", "clearance_mm", "chamfer_mm"},
         "bias_jump": {"bias_offset_n"},
     }
-    assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + WEAR_FRICTION)
+    assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + 0.35)
     for name in ("variant", "bias_jump"):
         assert SCENARIOS[name](base, 49, 100) == base
 
@@ -141,7 +133,7 @@ def test_a_bias_jump_shifts_the_force_and_keeps_the_truth() -> None:
     before, after = simulate(4, seed=1, n_jobs=1), simulate(4, seed=1, n_jobs=1, scenario="bias_jump")
     np.testing.assert_array_equal(before.height_mm, after.height_mm)
     np.testing.assert_array_equal(before.X[:2], after.X[:2])
-    np.testing.assert_allclose(after.X[2:].mean(axis=1) - before.X[2:].mean(axis=1), JUMP_N, atol=0.2)
+    np.testing.assert_allclose(after.X[2:].mean(axis=1) - before.X[2:].mean(axis=1), 8.0, atol=0.2)
 
 
 def test_the_sensor_draw_does_not_touch_the_world() -> None:

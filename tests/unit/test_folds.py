@@ -21,9 +21,6 @@ def noise(n: int, samples: int = 50, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, 10, (n, samples)).astype(np.float32)
 
 
-# ----------------------------------------------------------------------------------------------------- golden
-
-
 def golden_traces() -> dict[str, np.ndarray]:
     ramp = np.arange(1000, dtype=np.float32) / 8
     odd = np.array([0.5, np.nan, -np.inf, np.inf, -1.25, 3e38, -3e38, 1e-20, -0.0], dtype=np.float32)
@@ -45,6 +42,9 @@ GOLDEN_WEIGHTS = [-2152535657050944081, 7960286522194355701]
 def test_the_hash_of_a_trace_never_changes(name: str) -> None:
     h = content_hash(golden_traces()[name][None])
     assert (int(h[0]), int(toss(h)[0]), int(fold_of(h, 2)[0]), int(fold_of(h, 5)[0])) == GOLDEN[name]
+    x = np.atleast_2d(golden_traces()[name])
+    gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
+    assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
 
 
 def test_the_weights_never_change_and_are_odd() -> None:
@@ -53,9 +53,6 @@ def test_the_weights_never_change_and_are_odd() -> None:
     assert len(np.unique(weights)) == 4000
     assert weights[:2].tolist() == GOLDEN_WEIGHTS
     np.testing.assert_array_equal(hash_weights(152), weights[:152])
-
-
-# -------------------------------------------------------------------------------------------- content, nothing else
 
 
 @given(st.randoms(use_true_random=False))
@@ -69,11 +66,8 @@ def test_a_hash_depends_neither_on_order_nor_on_company(random) -> None:
 
 def test_dtype_and_layout_do_not_change_a_hash() -> None:
     X = np.round(noise(20)).astype(np.int16)
-    expected = content_hash(X.astype(np.float32))
-    np.testing.assert_array_equal(content_hash(X), expected)
-    np.testing.assert_array_equal(content_hash(X.astype(np.float64)), expected)
-    np.testing.assert_array_equal(content_hash(np.asfortranarray(X)), expected)
-    np.testing.assert_array_equal(content_hash(X[:, None, :]), expected)
+    for same in (X, X.astype(np.float64), np.asfortranarray(X), X[:, None, :]):
+        np.testing.assert_array_equal(content_hash(same), content_hash(X.astype(np.float32)))
 
 
 def test_one_sample_more_or_less_or_moved_is_another_hash() -> None:
@@ -84,23 +78,10 @@ def test_one_sample_more_or_less_or_moved_is_another_hash() -> None:
     assert len(hashes) == 4
 
 
-# -------------------------------------------------------------------------------------------------- TorchScript
-
-
 @given(traces)
 def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> None:
     gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0]))
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
-
-
-@pytest.mark.parametrize("name", golden_traces())
-def test_the_compiled_gate_hashes_as_numpy_does(name: str) -> None:
-    x = np.atleast_2d(golden_traces()[name])
-    gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
-    assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
-
-
-# ------------------------------------------------------------------------------------------------ fair and separate
 
 
 @pytest.mark.parametrize("folds", [2, 3, 5, 10])

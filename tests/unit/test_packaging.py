@@ -6,7 +6,6 @@ import sysconfig
 import tomllib
 import zipfile
 from pathlib import Path
-from statistics import median
 
 import pytest
 
@@ -20,11 +19,6 @@ def fresh(code: str, **options) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
-
-
-def test_importing_dengine_takes_less_than_three_tenths_of_a_second() -> None:
-    code = "import time; begin = time.perf_counter(); import dengine; print(time.perf_counter() - begin)"
-    assert median(float(fresh(code)) for _ in range(3)) < 0.3
 
 
 def test_importing_dengine_loads_nothing_but_the_standard_library_and_its_lazy_loader() -> None:
@@ -66,13 +60,9 @@ def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def test_the_wheel_has_dengine_and_no_other_top_level_name(wheel: Path) -> None:
-    tops = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert tops == {"dengine", f"dengine-{dengine.__version__}.dist-info"}
-
-
-def test_the_wheel_has_every_module_the_types_and_the_bundled_data(wheel: Path, repo: Path) -> None:
+def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, repo: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
+    assert {name.split("/")[0] for name in names} == {"dengine", f"dengine-{dengine.__version__}.dist-info"}
     modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
     assert modules <= names
     assert {"dengine/py.typed", "dengine/data/insertion.npz"} <= names

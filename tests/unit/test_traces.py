@@ -24,7 +24,6 @@ from dengine.decision.rule import script
 from dengine.records import FITS
 from dengine.traces import REASONS, TraceGate, as_trace, fits, fitted, spec_of
 
-LENGTHS, CHANNELS = (152, 800, 1000), (1, 2, 3, 6)
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
 
 
@@ -35,9 +34,6 @@ def ramp(samples: int = 100, channels: int = 1) -> np.ndarray:
 def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False) -> Reason:
     gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0], limit=limit))
     return REASONS[(script(gate) if compiled else gate)(torch.from_numpy(x))[0]]
-
-
-# --------------------------------------------------------------------------------------------- shapes and types
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", ">f8", "i1", "i2", ">i2", "i4", "i8", "u2", "?"])
@@ -59,11 +55,9 @@ AGREED = TraceSpec(samples=100, channels=6)
         *((np.array(bad), None, "Expected real numbers, got dtype") for bad in (["a", "b"], [1 + 2j], [None, 1], "force")),
         (np.ones(998), TraceSpec(1000), r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s\.$"),
         (np.ones(100), AGREED, r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"),
-        *(
-            (np.ones(shape), TraceSpec(100, fit=fit), "Expected")
-            for fit in FITS[1:]
-            for shape in ((1, 0), (2, 90), (90, 1))
-        ),
+        *((np.ones(shape), TraceSpec(100, fit="pad"), "Expected") for shape in ((1, 0), (2, 90), (90, 1))),
+        (np.ones((1000, 2)), None, r"got 1000 channels of 2 samples, which looks transposed; pass trace\.T"),
+        (np.ones((1000, 2)), TraceSpec(1000, channels=2), r"looks transposed: pass trace\.T"),
     ],
 )
 def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(trace, spec, message: str) -> None:
@@ -71,12 +65,8 @@ def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(trace
         as_trace(trace, spec)
 
 
-# -------------------------------------------------------------------------------------------------- the world
-
-
 @pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("where", [0, 57, 99])
+@pytest.mark.parametrize(("channels", "where"), [(1, 0), (3, 57), (3, 99)])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_one_sample_that_is_not_finite_is_found_anywhere(value, where, channels, compiled) -> None:
     x = ramp(100, channels)
@@ -102,15 +92,13 @@ def test_dead_and_saturated_sensors_are_found_and_a_plateau_or_one_quiet_channel
     assert reason_of(np.asarray(x, dtype=np.float32), limit) is reason
 
 
-# ------------------------------------------------------------------------------------------------------ other lengths
-
 SAMPLES = 100
 
 
 def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
     x = ramp(160)[0]
-    np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="cut"))[0], x[:SAMPLES])
-    np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="pad"))[0], x[:SAMPLES])
+    for fit in ("cut", "pad"):
+        np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit=fit))[0], x[:SAMPLES])
     padded = as_trace(x[:60], TraceSpec(SAMPLES, fit="pad"))[0]
     np.testing.assert_array_equal(padded[:60], x[:60])
     assert (padded[60:] == x[59]).all()
@@ -201,9 +189,6 @@ def test_a_trace_that_cannot_be_fitted_is_verified_kept_and_never_learned_from(l
     assert engine.decide(np.linspace(0, 9, SAMPLES)).reason is not Reason.NOT_FINITE
 
 
-# --------------------------------------------------------------------------------------------------------- the contract
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -218,9 +203,6 @@ def test_a_trace_that_cannot_be_fitted_is_verified_kept_and_never_learned_from(l
 def test_a_contract_that_no_trace_can_keep_is_refused(settings: dict, message: str) -> None:
     with pytest.raises(DengineError, match=message):
         TraceSpec(**settings)
-
-
-# --------------------------------------------------------------------------------------------------------- DataFrames
 
 
 def recording(samples: int = 60) -> pd.DataFrame:
@@ -248,11 +230,7 @@ def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
         as_trace(recording()[["Timestamp"]], None)
 
 
-def test_a_first_array_with_more_channels_than_samples_looks_transposed() -> None:
-    with pytest.raises(TraceError, match=r"got 1000 channels of 2 samples, which looks transposed; pass trace\.T"):
-        DataEngine("pca").decide(np.ones((1000, 2)))
-    with pytest.raises(TraceError, match=r"looks transposed: pass trace\.T"):
-        as_trace(np.ones((1000, 2)), TraceSpec(1000, channels=2))
+def test_more_channels_than_samples_are_taken_where_they_are_agreed_on() -> None:
     assert as_trace(np.ones((5, 2)), TraceSpec(2, channels=5)).shape == (5, 2)
 
 

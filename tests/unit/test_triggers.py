@@ -58,24 +58,14 @@ def test_what_is_no_trigger_is_refused_with_examples(text: object) -> None:
         as_trigger(text)
 
 
-def starts(active: str, quiet_s: float = 0.0) -> list[float]:
-    finder = StartFinder(STEP, quiet_s)
+@pytest.mark.parametrize(
+    ("active", "quiet", "starts"),
+    [("..xx..xx", 0, [2, 6]), ("xxx..x", 0, [5]), ("..x.x....x", 4, [9]), ("....x.x", 4, [4])],
+)
+def test_an_insertion_begins_where_the_trigger_goes_on_after_it_was_quiet(active: str, quiet: int, starts: list) -> None:
+    finder = StartFinder(STEP, quiet * STEP)
     found = [finder.feed(i * STEP, each == "x") for i, each in enumerate(active)]
-    assert all(each.seen for each in found if each is not None)
-    return [round(each.time / STEP, 6) for each in found if each is not None]
-
-
-def test_an_insertion_begins_where_the_trigger_goes_on() -> None:
-    assert starts("..xx..xx") == [2, 6]
-
-
-def test_what_is_on_from_the_first_sample_is_no_start() -> None:
-    assert starts("xxx..x") == [5]
-
-
-def test_a_trigger_must_have_been_quiet_for_as_long_as_it_says() -> None:
-    assert starts("..x.x....x", quiet_s=4 * STEP) == [9]
-    assert starts("....x.x", quiet_s=4 * STEP) == [4]
+    assert [(round(each.time / STEP, 6), each.seen) for each in found if each is not None] == [(i, True) for i in starts]
 
 
 def test_a_start_in_a_gap_is_known_to_be_unseen() -> None:

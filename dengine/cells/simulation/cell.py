@@ -140,7 +140,8 @@ class SimulatedCell:
         self.last: Insertion | None = None  # the truth about the part in the cell: for reports, never for an engine
         self._change = find_scenario(scenario)
         self._waiting = False
-        self._done = self._finished = self._verifications = self._stops = self._escapes = self._sent_back = 0
+        self._done = 0
+        self._counts = dict.fromkeys(("finished", "verifications", "stops", "escapes", "sent_back"), 0)
 
     @property
     def truth(self) -> bool:
@@ -164,8 +165,8 @@ class SimulatedCell:
         """Check the height; a good part goes on, a bad one back to the bin."""
         success = self._take("verify").success
         self.clock += self.parameters.verify_s
-        self._verifications += 1
-        self._finished += success
+        self._counts["verifications"] += 1
+        self._counts["finished"] += success
         return success
 
     def proceed(self) -> Outcome:
@@ -173,35 +174,26 @@ class SimulatedCell:
         success = self._take("proceed").success
         chance = float(streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
         if success:
-            self._finished += 1
+            self._counts["finished"] += 1
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
         if chance < self.parameters.silent_share:
-            self._escapes += 1
+            self._counts["escapes"] += 1
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s
-        self._stops += 1
+        self._counts["stops"] += 1
         return Outcome.STOPPED
 
     def reject(self) -> None:
         """Send the part back to the bin unverified; a good one has to be picked and inserted once more."""
-        self._sent_back += self._take("reject").success
+        self._counts["sent_back"] += self._take("reject").success
 
     def report(self) -> CellReport:
         """Where the run stands, truth included."""
-        p = self.parameters
-        left_out = self._done - self._waiting - self._verifications
-        lost = p.stop_s * self._stops + (p.cycle_s + p.verify_s) * self._sent_back
-        return CellReport(
-            cycles=self._done,
-            clock_s=self.clock,
-            finished=self._finished,
-            verifications=self._verifications,
-            stops=self._stops,
-            escapes=self._escapes,
-            sent_back=self._sent_back,
-            parts_per_hour=3600 * self._finished / self.clock if self.clock else 0.0,
-            seconds_saved=p.verify_s * left_out - lost,
-        )
+        p, n = self.parameters, self._counts
+        left_out = self._done - self._waiting - n["verifications"]
+        lost = p.stop_s * n["stops"] + (p.cycle_s + p.verify_s) * n["sent_back"]
+        per_hour = 3600 * n["finished"] / self.clock if self.clock else 0.0
+        return CellReport(self._done, self.clock, parts_per_hour=per_hour, seconds_saved=p.verify_s * left_out - lost, **n)
 
     def _take(self, call: str) -> Insertion:
         """The part in the fixture; each can be taken once."""

@@ -13,6 +13,9 @@ Range = tuple[float, float]  # (low, high) of a uniform draw
 
 SAMPLES = 1000
 RATE_HZ = 500.0
+FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
+_PROBABILITIES = {"silent_share", "confirm_share", *FAULTS}
+_SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
 CHANNELS = {"z": 1, "all": 6}  # z-force alone, or force x, y, z in newtons and torque x, y, z in newton metres
 
 
@@ -101,27 +104,17 @@ class CellParameters:
     bias_offset_n: float = 0.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            _check(field.name, getattr(self, field.name))
+        for name in (each.name for each in fields(self)):
+            value = getattr(self, name)
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if not low <= high:
+                raise SettingError(f"Expected {name} as (low, high) with low <= high, got {value}; swap them.")
+            if name in _PROBABILITIES and not 0 <= low <= 1:
+                raise SettingError(f"Expected {name} as a probability from 0 to 1, got {value}; give a share of 1.")
+            if name not in _SIGNED and low < 0:
+                raise SettingError(f"Expected {name} to be at least 0, got {value}; the unit is in its name.")
         if (faults := self.missed_grasp + self.weak_grip + self.debris + self.wrong_part) > 1:
             raise SettingError(f"Expected fault probabilities that sum to at most 1, got {faults:g}; lower one.")
-
-
-_PROBABILITIES = {"silent_share", "confirm_share", "missed_grasp", "weak_grip", "debris", "wrong_part"}
-_SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
-
-
-def _check(name: str, value: float | Range) -> None:
-    low, high = value if isinstance(value, tuple) else (value, value)
-    if not low <= high:
-        raise SettingError(f"Expected {name} as (low, high) with low <= high, got {value}; swap them.")
-    if name in _PROBABILITIES and not 0 <= low <= 1:
-        raise SettingError(f"Expected {name} as a probability from 0 to 1, got {value}; give a share of 1.")
-    if name not in _SIGNED and low < 0:
-        raise SettingError(f"Expected {name} to be at least 0, got {value}; the unit is in its name.")
-
-
-FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,23 +188,17 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     extra_length_mm = drawn("extra_length_mm") * float(rng.choice((-1, 1)))
     extra_width_mm = drawn("extra_width_mm") * float(rng.choice((-1, 1)))
     changes: dict[str, dict[str, float]] = {
-        "none": {},
-        "missed_grasp": {},
         "weak_grip": {"grip_n": weak_grip_n},
         "debris": {"debris_mm": debris_mm},
         "wrong_part": {"extra_length_mm": extra_length_mm, "extra_width_mm": extra_width_mm},
     }
     shares = [p.missed_grasp, p.weak_grip, p.debris, p.wrong_part]
     fault = str(rng.choice(["none", *FAULTS], p=[1 - sum(shares), *shares]))
-    return replace(right, fault=fault, **changes[fault])
+    return replace(right, fault=fault, **changes.get(fault, {}))
 
 
 # (parameters, cycle, cycles) -> the parameters of that cycle
 Scenario = Callable[[CellParameters, int, int], CellParameters]
-
-WEAR_FRICTION = 0.35  # added to the friction by the last cycle
-VARIANT_MASS_FACTOR, VARIANT_CLEARANCE_MM, VARIANT_CHAMFER_MM = 2.5, (0.04, 0.16), (0.5, 1.0)
-JUMP_N = 8.0
 
 
 def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
@@ -220,9 +207,9 @@ def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """The tool wears: friction grows in proportion to the cycles done."""
+    """The tool wears: friction grows in proportion to the cycles done, by 0.35 in all."""
     low, high = parameters.friction
-    grown = WEAR_FRICTION * min(1.0, cycle / max(1, cycles - 1))
+    grown = 0.35 * min(1.0, cycle / max(1, cycles - 1))
     return replace(parameters, friction=(low + grown, high + grown))
 
 
@@ -231,17 +218,12 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
     if cycle < cycles // 2:
         return parameters
     low, high = parameters.part_mass_kg
-    return replace(
-        parameters,
-        part_mass_kg=(low * VARIANT_MASS_FACTOR, high * VARIANT_MASS_FACTOR),
-        clearance_mm=VARIANT_CLEARANCE_MM,
-        chamfer_mm=VARIANT_CHAMFER_MM,
-    )
+    return replace(parameters, part_mass_kg=(2.5 * low, 2.5 * high), clearance_mm=(0.04, 0.16), chamfer_mm=(0.5, 1.0))
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Half way the force sensor's offset jumps and stays; the world is as it was."""
-    return parameters if cycle < cycles // 2 else replace(parameters, bias_offset_n=parameters.bias_offset_n + JUMP_N)
+    """Half way the force sensor's offset jumps by 8 N and stays; the world is as it was."""
+    return parameters if cycle < cycles // 2 else replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)
 
 
 SCENARIOS: dict[str, Scenario] = {"nominal": nominal, "wear": wear, "variant": variant, "bias_jump": bias_jump}

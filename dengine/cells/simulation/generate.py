@@ -139,8 +139,13 @@ def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) 
     OutputError where a file is there, without `force`.
     """
     buffer = BytesIO()
-    scale = _scale(traces.X)
-    names, conditions = _draws(traces.insertions)
+    # Value of one integer step: 0.01 N, or as much more as the largest sample needs; torques have their own.
+    if traces.X.ndim == 2:
+        scale = np.asarray(max(0.01, float(np.abs(traces.X).max()) / 32000))
+    else:
+        scale = np.maximum(np.array([0.01] * 3 + [0.0003] * 3), np.abs(traces.X).max(axis=(0, 2)) / 32000)[:, None]
+    rows = [asdict(insertion.conditions) | asdict(insertion.sensor) for insertion in traces.insertions]
+    names = [name for name in rows[0] if name != "fault"]
     np.savez_compressed(
         buffer,
         X=np.round(traces.X / scale).astype(np.int16),
@@ -149,8 +154,8 @@ def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) 
         cause=traces.cause,
         height_mm=traces.height_mm,
         cycle=traces.cycle,
-        conditions=conditions,
-        condition_names=names,
+        conditions=np.array([[row[name] for name in names] for row in rows], dtype=np.float32),
+        condition_names=np.array(names),
         rate_hz=np.float32(RATE_HZ),
         unit=np.array("N" if traces.X.ndim == 2 else "N, N·m"),
         seed=np.int64(traces.seed),
@@ -158,18 +163,3 @@ def save_traces(path: str | Path, traces: SimulatedTraces, force: bool = False) 
         simulated=np.array(True),
     )
     return write_output(path, buffer.getvalue(), force, make_folder=True)
-
-
-def _scale(X: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Value of one integer step: 0.01 N, or as much more as the largest sample needs; torques have their own."""
-    if X.ndim == 2:
-        return np.asarray(max(0.01, float(np.abs(X).max()) / 32000))
-    smallest = np.array([0.01] * 3 + [0.0003] * 3)
-    return np.asarray(np.maximum(smallest, np.abs(X).max(axis=(0, 2)) / 32000)[:, None])
-
-
-def _draws(insertions: Sequence[Insertion]) -> tuple[NDArray[np.str_], NDArray[np.float32]]:
-    """Numeric draws of every insertion, physical and of the sensor."""
-    rows = [asdict(insertion.conditions) | asdict(insertion.sensor) for insertion in insertions]
-    names = [name for name in rows[0] if name != "fault"]
-    return np.array(names), np.array([[row[name] for name in names] for row in rows], dtype=np.float32)

@@ -45,10 +45,22 @@ class Push:
 
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     """Lower the gripper at its speed until the target or the force limit holds it; record at 500 Hz for 2 s."""
-    mujoco, steps = _mujoco(), round(1 / RATE_HZ / time_step_s)
+    try:
+        import mujoco
+    except ImportError as error:
+        raise DengineError(
+            "Expected MuJoCo for the simulated cell, found none; install it with: pip install dengine[sim]"
+        ) from error
+    steps = round(1 / RATE_HZ / time_step_s)
     if not math.isclose(steps * time_step_s, 1 / RATE_HZ):
         raise SettingError(f"Expected a time step that divides 2 ms, got {time_step_s} s; take 0.0005 or half of it.")
-    model = _build(mujoco, fixture_xml(conditions, time_step_s))
+    try:
+        model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
+    except ValueError as error:
+        raise SettingError(
+            f"Expected sizes, masses and springs above zero in the cell's parameters, got a world that MuJoCo refuses "
+            f"({error}); raise the one that is zero."
+        ) from error
     data = mujoco.MjData(model)
     wrench = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":
@@ -169,23 +181,3 @@ def _debris(c: Conditions, depth: float) -> str:
     half, soft = c.debris_mm / 2000, f"{c.debris_softness_s} 1"
     position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + half}"
     return f'<geom type="box" size="0.003 0.003 {half}" pos="{position}" solref="{soft}" priority="1"/>'
-
-
-def _build(mujoco: Any, xml: str) -> Any:
-    try:
-        return mujoco.MjModel.from_xml_string(xml)
-    except ValueError as error:
-        raise SettingError(
-            f"Expected sizes, masses and springs above zero in the cell's parameters, got a world that MuJoCo refuses "
-            f"({error}); raise the one that is zero."
-        ) from error
-
-
-def _mujoco() -> Any:
-    try:
-        import mujoco
-    except ImportError as error:
-        raise DengineError(
-            "Expected MuJoCo for the simulated cell, found none; install it with: pip install dengine[sim]"
-        ) from error
-    return mujoco

@@ -56,20 +56,18 @@ class Answer(IntEnum):
 
 
 class Runtime(IntEnum):
-    """A controller's `runtime_state`."""
+    """A controller's `runtime_state`, as far as it matters here."""
 
     STOPPING = 0
     STOPPED = 1
-    PLAYING = 2
-    PAUSING = 3
-    PAUSED = 4
-    RESUMING = 5
+    PLAYING = 2  # then PAUSING, PAUSED and RESUMING, which end by themselves
 
 
+OUTCOMES = {Answer[outcome.name]: outcome for outcome in Outcome}
 ANSWERS = {
     Verb.INSERT: (Answer.DONE,),
     Verb.VERIFY: (Answer.GOOD, Answer.BAD),
-    Verb.PROCEED: (Answer.UNKNOWN, Answer.CONFIRMED, Answer.STOPPED),
+    Verb.PROCEED: tuple(OUTCOMES),
     Verb.REJECT: (Answer.DONE,),
 }
 
@@ -84,11 +82,6 @@ def after(number: int) -> int:
     return number % MOST + 1
 
 
-OUTCOMES = {
-    Answer.UNKNOWN: Outcome.UNKNOWN,
-    Answer.CONFIRMED: Outcome.CONFIRMED,
-    Answer.STOPPED: Outcome.STOPPED,
-}
 REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED): "it says that it failed"}
 
 
@@ -135,7 +128,6 @@ class UrCell:
         return self
 
     def close(self) -> None:
-        """Hang up; the robot waits for its next order."""
         self.recorder.close()
 
     def __enter__(self) -> UrCell:
@@ -193,12 +185,10 @@ class UrCell:
                 return rows
         if spare:
             return []
-        raise CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {self._why()}.")
-
-    def _why(self) -> str:
+        why = "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
         if self.recorder.stream.trouble:
-            return f"there is no connection: {self.recorder.stream.trouble}"
-        return "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
+            why = f"there is no connection: {self.recorder.stream.trouble}"
+        raise CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {why}.")
 
     def _answered(self, row: Row, verb: Verb) -> Answer | None:
         """The answer to the order under way, if this package holds it; CellError for one that is no success."""
@@ -211,9 +201,7 @@ class UrCell:
             said = REFUSALS.get(what, f"it answered {what}")
             raise CellError(f"Expected the robot to carry out {about}, {said}; look at the part, then begin again.")
         if state in (Runtime.STOPPING, Runtime.STOPPED):
-            raise CellError(
-                f"Expected the robot to carry out {about}, its program has stopped; start it, then begin again."
-            )
+            raise CellError(f"Expected the robot to carry out {about}, its program has stopped; start it, begin again.")
         return None
 
     def _take_over(self) -> int:

@@ -33,15 +33,10 @@ class Connection:
     def __init__(self, sock: socket.socket) -> None:
         self.socket = sock
         self.output: Recipe | None = None
-        self.every = 1
+        self.every = 1  # cycles
         self.inputs: dict[int, Recipe] = {}
         self.started = False
         self.held: list[bytes] = []
-
-    @property
-    def writes(self) -> set[str]:
-        """The input fields that are its own."""
-        return {name for recipe in self.inputs.values() for name in recipe.names}
 
     def send(self, data: bytes) -> bool:
         """Whether the socket took it."""
@@ -63,40 +58,24 @@ def named(payload: bytes) -> list[str]:
     return payload.decode().rstrip(",").split(",")
 
 
-def packed(recipe: Recipe, values: Mapping[str, float]) -> bytes:
-    """A data package; what nobody set is zero."""
-    letters = [TYPES[kind] for kind in recipe.types]
-    whole = [letter != "d" for letter, n in letters for _ in range(n)]
-    row = [values.get(name, 0.0) for name in recipe.columns]
-    return recipe.pack([int(value) if is_whole else value for value, is_whole in zip(row, whole, strict=True)])
-
-
+CHECK, REST = 5, 2  # control cycles of a height check, and of standstill before an insertion is answered
 Values = dict[str, float]
 
 
 class RobotProgram:
     """Inserts the traces of a labelled data set, one an order, and behaves as `ReplayCell` does: accepted failures stop.
 
-    dataset : anything that `load_dataset` takes.  channel : what its one channel is; several have their own names.
-    confirm : whether an accepted good part is confirmed.  approach, check : cycles before an insertion, and of a check.
-    after : cycles of standstill after an insertion, before it is answered.
+    dataset : anything that `load_dataset` takes; a single channel is FZ_Base.  confirm : whether an accepted good part is
+    confirmed.  approach : cycles before an insertion.
     `played` : the parts inserted, by their place in the data set.  `place` : part and sample of this cycle, None outside.
     """
 
-    def __init__(
-        self,
-        dataset: Any,
-        channel: str = "FZ_Base",
-        confirm: bool = False,
-        approach: int = 5,
-        check: int = 5,
-        after: int = 2,
-    ) -> None:
+    def __init__(self, dataset: Any, confirm: bool = False, approach: int = 5) -> None:
         self.data = load_dataset(dataset)
-        self.confirm, self.approach, self.check, self.after = confirm, approach, check, after
+        self.confirm, self.approach = confirm, approach
         X = self.data.X if self.data.X.ndim == 3 else self.data.X[:, None]
         names = self.data.channels if len(self.data.channels) == X.shape[1] > 1 else tuple(CHANNELS)[: X.shape[1]]
-        self._columns = [column_of(name) for name in ((channel,) if X.shape[1] == 1 else names)]
+        self._columns = [column_of(name) for name in (("FZ_Base",) if X.shape[1] == 1 else names)]
         self._traces: NDArray[np.float64] = X.astype(np.float64)
         self.played: list[int] = []
         self.place: tuple[int, int] | None = None
@@ -114,15 +93,12 @@ class RobotProgram:
         """Start it anew: what was ordered is void."""
         self._run = self._cycles()
 
-    def _order(self) -> int:
-        return int(self._inputs.get(ORDER, 0))
-
     def _cycles(self) -> Iterator[None]:
         """The program; each yield ends a control cycle."""
-        self.place, last = None, self._order() // 10
+        self.place, last = None, int(self._inputs.get(ORDER, 0)) // 10
         self.outputs.update({PHASE: 0, ANSWER: word(last, Answer.VOID)})
         while True:
-            number, verb = divmod(self._order(), 10)
+            number, verb = divmod(int(self._inputs.get(ORDER, 0)), 10)
             if number != last:
                 answer = yield from self._carry_out(number, verb)
                 self.outputs[ANSWER] = word(number, answer)
@@ -136,7 +112,7 @@ class RobotProgram:
             return Answer.FAILED
         good = bool(self.data.y[self.played[-1]])
         if verb == Verb.VERIFY:
-            yield from self._wait(self.check)
+            yield from self._wait(CHECK)
             return Answer.GOOD if good else Answer.BAD
         yield from self._wait(1)
         if verb == Verb.REJECT:
@@ -156,7 +132,7 @@ class RobotProgram:
             yield
         self.place = None
         self.outputs.update({PHASE: 0, **dict.fromkeys(self._columns, 0.0)})
-        yield from self._wait(self.after)
+        yield from self._wait(REST)
         return Answer.DONE
 
     def _wait(self, cycles: int) -> Iterator[None]:
@@ -168,6 +144,8 @@ CYCLE_S = 0.002
 IDLE_S = 0.0002  # of a cycle at no set speed, while nobody listens
 STATE = {"robot_mode": 7.0, "safety_mode": 1.0, "speed_scaling": 1.0, RUNTIME: float(Runtime.PLAYING)}
 FOREIGN = (OSError, CellError, struct.error, ValueError, KeyError)  # of a client that is gone, or speaks otherwise
+PATIENCE = struct.pack("ll", 5, 0)  # seconds, a timeval: a client that does not read is hung up on
+VERSION_HERE = struct.pack(">4I", 5, 11, 0, 0)  # of the controller's software
 GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
 TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
 
@@ -177,9 +155,7 @@ class Program(Protocol):
 
     place: tuple[int, int] | None
 
-    def step(self, inputs: dict[str, float]) -> Mapping[str, float]:
-        """One control cycle: outputs by column, from inputs by field."""
-        ...
+    def step(self, inputs: dict[str, float]) -> Mapping[str, float]: ...  # a control cycle: outputs by column
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,8 +182,7 @@ class FakeController:
 
     speed : cycles against real time; None: as fast as clients read.  troubles : what goes wrong, and when.
     held : input fields that another client holds.  unknown : output fields that it does not have.
-    refuses : requests that it says no to, Kind.VERSION or Kind.START.  version : of its software.
-    patience : seconds after which it hangs up on a client that does not read, as real ones do when their buffer is full.
+    refuses : requests that it says no to, Kind.VERSION or Kind.START.
     `lost` : part and sample of every package of an insertion that no client was sent.  `said` : texts that clients sent.
     """
 
@@ -221,15 +196,11 @@ class FakeController:
         held: Collection[str] = (),
         unknown: Collection[str] = (),
         refuses: Collection[Kind] = (),
-        version: tuple[int, int, int, int] = (5, 11, 0, 0),
-        patience: float = 5.0,
     ) -> None:
         self.program, self.host, self.speed = program, host, speed
-        self.held, self.unknown, self.refuses, self.version = set(held), set(unknown), set(refuses), version
-        self.patience = struct.pack("ll", int(patience), int(patience % 1 * 10**6))  # a timeval
+        self.held, self.unknown, self.refuses = set(held), set(unknown), set(refuses)
         self.lost: set[tuple[int, int]] = set()
         self.said: list[str] = []
-        self.connections_made = 0
         self.runtime: int | None = None  # another state than the program's, if any
         self._troubles = {(each.part, each.sample): each for each in troubles}
         self._server = socket.create_server((host, port))
@@ -276,10 +247,9 @@ class FakeController:
     def say(self, text: str) -> None:
         """Send every client a text message, as of an error."""
         words = text.encode()
-        payload = bytes([len(words)]) + words + b"\x04fake\x01"
         with self._lock:
             for each in self._connections:
-                each.send(Package(Kind.TEXT, payload).bytes)
+                each.send(Package(Kind.TEXT, bytes([len(words)]) + words + b"\x04fake\x01").bytes)
 
     # The server's side of a connection.
 
@@ -290,7 +260,7 @@ class FakeController:
             except OSError:  # closed
                 return
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, self.patience)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, PATIENCE)
             thread = threading.Thread(target=self._serve, args=(Connection(sock),), daemon=True)
             self._threads.append(thread)
             thread.start()
@@ -298,7 +268,6 @@ class FakeController:
     def _serve(self, connection: Connection) -> None:
         with self._lock:
             self._connections.append(connection)
-            self.connections_made += 1
         packages = Packages()
         with connection.socket, suppress(*FOREIGN):
             while piece := connection.socket.recv(65536):
@@ -324,7 +293,7 @@ class FakeController:
         return bytes([struct.unpack(">H", payload)[0] == VERSION and Kind.VERSION not in self.refuses])
 
     def _on_controller(self, connection: Connection, payload: bytes) -> bytes:
-        return struct.pack(">4I", *self.version)
+        return VERSION_HERE
 
     def _on_outputs(self, connection: Connection, payload: bytes) -> bytes:
         (rate,) = struct.unpack_from(">d", payload)
@@ -337,7 +306,8 @@ class FakeController:
 
     def _on_inputs(self, connection: Connection, payload: bytes) -> bytes:
         names = named(payload)
-        taken = self.held.union(*(each.writes for each in self._connections if each is not connection))
+        others = [recipe for each in self._connections if each is not connection for recipe in each.inputs.values()]
+        taken = self.held.union(*(recipe.names for recipe in others))
         types = [IN_USE if name in taken else type_of(name) for name in names]
         number = 0 if {IN_USE, NOT_FOUND} & set(types) else len(connection.inputs) + 1
         if number:
@@ -370,39 +340,33 @@ class FakeController:
             values[RUNTIME] = self.runtime
         place = self.program.place if self.program else None
         trouble = self._troubles.pop(place, None) if place else None
-        if trouble is not None:
-            self._begin_trouble(trouble)
+        kind, cycles = (trouble.kind, trouble.cycles) if trouble else ("", 0)
+        self._drop, self._hold = max(self._drop, cycles * (kind == "drop")), max(self._hold, cycles * (kind == "hold"))
+        self._begin = self._cycle if kind == "reset" else self._begin
+        for each in self._connections if kind == "close" else ():
+            each.hang_up()
         values["timestamp"] = (self._cycle - self._begin) * CYCLE_S
         started = [each for each in self._connections if each.started and self._cycle % each.every == 0]
-        sent = [self._send(each, values, trouble) for each in started]
+        sent = [self._send(each, values, kind) for each in started]
         if place is not None and not any(sent):
             self.lost.add(place)
         self._drop, self._hold, self._cycle = max(self._drop - 1, 0), max(self._hold - 1, 0), self._cycle + 1
         return bool(started)
 
-    def _begin_trouble(self, trouble: Trouble) -> None:
-        if trouble.kind == "drop":
-            self._drop = trouble.cycles
-        elif trouble.kind == "hold":
-            self._hold = trouble.cycles
-        elif trouble.kind == "reset":
-            self._begin = self._cycle
-        elif trouble.kind == "close":
-            for each in self._connections:
-                each.hang_up()
-
-    def _send(self, each: Connection, values: Mapping[str, float], trouble: Trouble | None) -> bool:
+    def _send(self, each: Connection, values: Mapping[str, float], trouble: str) -> bool:
         """Whether the package of this cycle is on its way, now or later."""
         if self._drop or each.output is None:
             return False
-        data = packed(each.output, values)
-        if trouble is not None and trouble.kind in ("half", "garbage"):
-            each.send(data[: len(data) // 2] if trouble.kind == "half" else GARBAGE)
+        row = [values.get(name, 0.0) for name in each.output.columns]
+        whole = [letter != "d" for letter, n in map(TYPES.__getitem__, each.output.types) for _ in range(n)]
+        data = each.output.pack([int(value) if is_whole else value for value, is_whole in zip(row, whole, strict=True)])
+        if trouble in ("half", "garbage"):
+            each.send(data[: len(data) // 2] if trouble == "half" else GARBAGE)
             each.hang_up()
             return False
         if self._hold:
             each.held.append(data)
             return True
-        data = b"".join(each.held) + data * (2 if trouble is not None and trouble.kind == "repeat" else 1)
+        data = b"".join(each.held) + data * (2 if trouble == "repeat" else 1)
         each.held.clear()
         return each.send(data)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 
-from ...datasets.triggers import Trigger
 from ...errors import CellError, SettingError
 
 PORT = 30004
@@ -140,12 +139,6 @@ def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
     return Recipe(payload[0], tuple(names), types)
 
 
-def text_of(payload: bytes) -> str:
-    """What a text message says."""
-    length = payload[0] if payload else 0
-    return payload[1 : 1 + length].decode("utf-8", errors="replace")
-
-
 INDEXED = re.compile(r"(input|output)_(bit|int|double)_register_(\d+)")
 FIELDS: Mapping[str, str] = {  # of the guide, those that a controller gives out; registers with a number: `type_of`
     name: kind
@@ -211,10 +204,3 @@ def column_of(name: str) -> str:
             f"output_double_register_24, got {name!r}."
         )
     return column
-
-
-def fields_of(channels: tuple[str, ...], trigger: Trigger, also: tuple[str, ...] = ()) -> tuple[str, ...]:
-    """The fields to ask the controller for, each once, `timestamp` first."""
-    columns = [column_of(name) for name in (*channels, *trigger.signals)]
-    fields = [column.partition("[")[0] for column in columns]
-    return tuple(dict.fromkeys(("timestamp", *fields, *also)))

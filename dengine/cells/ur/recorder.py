@@ -19,7 +19,7 @@ from ...datasets.cutting import Gaps, Start, StartFinder, place
 from ...datasets.triggers import Trigger, as_trigger
 from ...errors import CellError, SettingError
 from ...records import TraceSpec
-from .protocol import PORT, column_of, fields_of
+from .protocol import PORT, column_of
 from .stream import Row, RtdeStream, StreamReport
 
 BAR_S = 0.5  # at most between two looks at the clock
@@ -46,7 +46,6 @@ class InsertionRecord:
 
     @property
     def complete(self) -> bool:
-        """Whether every sample is there."""
         return self.missing == 0
 
 
@@ -70,12 +69,12 @@ class Cutter:
 
     @property
     def begun(self) -> bool:
-        """Whether a start was seen."""
         return self._start is not None
 
     def feed(self, rows: Sequence[Row]) -> tuple[InsertionRecord | None, int]:
         """The insertion, if it is over; and how many of the rows were looked at."""
-        active = self._active(rows)
+        signals = {name: np.array([row.values[c] for row in rows], dtype=np.float64) for name, c in self._signals.items()}
+        active = self._trigger.active(signals)
         for i, row in enumerate(rows):
             if self._rows and row.timestamp < self._rows[-1].timestamp - self._step / 2:  # the controller began anew
                 if self._start is not None:
@@ -113,10 +112,6 @@ class Cutter:
         trace = np.full((len(self._channels), self._samples), np.nan, dtype=np.float32)
         return InsertionRecord(self._shaped(trace), start_s, self._samples, self._samples, ((0, self._samples),))
 
-    def _active(self, rows: Sequence[Row]) -> NDArray[np.bool_]:
-        named = {name: np.array([row.values[c] for row in rows], dtype=np.float64) for name, c in self._signals.items()}
-        return self._trigger.active(named)
-
     def _shaped(self, trace: NDArray[np.float32]) -> NDArray[np.float32]:
         return trace[0] if len(self._channels) == 1 else trace
 
@@ -150,14 +145,12 @@ class RtdeRecorder:
             raise SettingError(f"Expected 0 to {samples - 1} samples from before the trigger, got {before}.")
         self.trigger = as_trigger(trigger)
         self.channels = (channels,) if isinstance(channels, str) else tuple(channels)
-        units = {column_of(name).partition("[")[0] for name in self.channels}
-        unit = (
-            "N" if units == {"actual_TCP_force"} and not any(n.startswith("Mu") for n in self.channels) else "mixed units"
-        )
+        fields = [column_of(name).partition("[")[0] for name in (*self.channels, *self.trigger.signals)]
+        forces = set(fields[: len(self.channels)]) == {"actual_TCP_force"}
+        unit = "N" if forces and not any(name.startswith("Mu") for name in self.channels) else "mixed units"
         self.spec = TraceSpec(samples, rate_hz, len(self.channels), unit, columns=self.channels)
         self.before = before
-        fields = fields_of(self.channels, self.trigger, tuple(also))
-        self.stream = RtdeStream(host, fields, inputs, rate_hz, port, timeout)
+        self.stream = RtdeStream(host, tuple(dict.fromkeys(("timestamp", *fields, *also))), inputs, rate_hz, port, timeout)
         self._position = 0
 
     def open(self) -> RtdeRecorder:
@@ -167,7 +160,6 @@ class RtdeRecorder:
         return self
 
     def close(self) -> None:
-        """Hang up."""
         self.stream.close()
 
     def __enter__(self) -> RtdeRecorder:
@@ -208,10 +200,6 @@ class RtdeRecorder:
                 return record
         if self.cutter.begun:
             return self.cutter.cut()
-        raise CellError(f"Expected an insertion at {self.stream.where} within {timeout:g} s, {self.why()}.")
-
-    def why(self) -> str:
-        """Why nothing was recorded, as far as is known."""
-        if self.stream.trouble:
-            return f"there is no connection: {self.stream.trouble}"
-        return f"the trigger never went on: {self.trigger}"
+        trouble = self.stream.trouble
+        why = f"there is no connection: {trouble}" if trouble else f"the trigger never went on: {self.trigger}"
+        raise CellError(f"Expected an insertion at {self.stream.where} within {timeout:g} s, {why}.")

@@ -13,7 +13,7 @@ from functools import partial
 from itertools import pairwise
 
 from ...errors import CellError
-from .protocol import PORT, VERSION, HeldError, Kind, Package, Packages, Recipe, recipe_of, text_of
+from .protocol import PORT, VERSION, HeldError, Kind, Package, Packages, Recipe, recipe_of
 
 PIECE = 65536  # bytes asked of the socket at once
 
@@ -57,9 +57,7 @@ class RtdeClient:
     def _set_up(self, outputs: Sequence[str], inputs: Sequence[str], rate_hz: float) -> None:
         accepted = self._ask(Kind.VERSION, struct.pack(">H", VERSION))
         if accepted[:1] != b"\1":
-            raise CellError(
-                f"Expected RTDE protocol version {VERSION} at {self.where}, it is refused; update the controller."
-            )
+            raise CellError(f"Expected RTDE protocol version {VERSION} at {self.where}, it says no; update the controller.")
         named = ",".join(outputs).encode()
         self.outputs = recipe_of(self._ask(Kind.OUTPUTS, struct.pack(">d", rate_hz) + named), outputs, "output")
         self.inputs: Recipe | None = None
@@ -121,7 +119,9 @@ class RtdeClient:
             raise CellError(f"Expected packages from {self.where}, it hung up{self._why()}.")
         for package in self._packages.feed(piece):
             if package.kind is Kind.TEXT:
-                self.said = text_of(package.payload)
+                self.said = (
+                    package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace") if package.payload else ""
+                )
             elif package.kind is not Kind.PAUSE:
                 self._waiting.append(package)
 
@@ -147,8 +147,7 @@ class Row:
 
     @property
     def timestamp(self) -> float:
-        """Seconds of the controller's clock."""
-        return self.values[0]
+        return self.values[0]  # seconds of the controller's clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +168,16 @@ class StreamReport:
 
 
 class Lateness:
-    """Whether a package is late: its way took longer than the quickest one's, which may creep as the clocks drift."""
+    """Whether a package is late: its way took longer than the quickest one's, which may creep as the clocks drift.
+
+    timestamp : seconds, by the controller's clock.  arrival : by ours.
+    """
 
     def __init__(self) -> None:
         self._last: tuple[float, float] | None = None
         self._quickest = 0.0
 
     def is_late(self, timestamp: float, arrival: float) -> bool:
-        """Timestamp : by the controller's clock.  arrival : by ours."""
         way = arrival - timestamp
         if self._last is None or timestamp < self._last[0]:  # a clock that began anew says nothing of the one before
             self._quickest = way
@@ -223,19 +224,17 @@ class RtdeStream:
 
     def open(self) -> RtdeStream:
         """Connect and begin to read."""
-        self._client = self._connect_first()
+        for left in reversed(range(int(RELEASE_S / RETRY_S[0]) + 1)):
+            try:
+                self._client = self._connect()
+                break
+            except HeldError:  # an owner that has just gone is given time to be noticed as gone
+                if not left:
+                    raise
+                self._closing.wait(RETRY_S[0])
         self.columns = self._client.outputs.columns
         self._thread.start()
         return self
-
-    def _connect_first(self) -> RtdeClient:
-        """The first connection; an owner that has just gone is given time to be noticed as gone."""
-        for _ in range(int(RELEASE_S / RETRY_S[0])):
-            try:
-                return self._connect()
-            except HeldError:
-                self._closing.wait(RETRY_S[0])
-        return self._connect()
 
     def close(self) -> None:
         """Hang up, and end the thread."""
@@ -272,10 +271,9 @@ class RtdeStream:
         """
         with self._news:
             self._news.wait_for(lambda: self._first + len(self._rows) > position or self._closing.is_set(), timeout)
-            if position < self._first:
+            if (lost := self._first - position) > 0:
                 raise CellError(
-                    f"Expected to be asked for packages within {KEPT_S:g} s, {self._first - position} were given up; begin "
-                    "with the newest, as arm() does."
+                    f"Expected to be asked within {KEPT_S:g} s, {lost} packages were given up; arm() begins anew."
                 )
             return self._rows[position - self._first :], self._first + len(self._rows)
 
@@ -307,20 +305,19 @@ class RtdeStream:
                 continue
             arrival = self._clock()
             self._keep([Row(values, late.is_late(values[0], arrival), self._session) for values in rows])
-            if again:
-                self._write_again()
+            with self._news:
+                if again and self._clock() - self._written_at < FRESH_S:
+                    self._send()
             again = False
-
-    def _write_again(self) -> None:
-        with self._news:
-            if self._clock() - self._written_at < FRESH_S:
-                self._send()
 
     def _keep(self, rows: list[Row]) -> None:
         with self._news:
-            before = self._rows[-1:]
-            for one, next_ in pairwise([*before, *rows]):
-                self._count_step(next_.timestamp - one.timestamp)
+            for one, next_ in pairwise([*self._rows[-1:], *rows]):
+                steps = round((next_.timestamp - one.timestamp) / self.step)
+                self._counts["missing"] += max(steps - 1, 0)
+                self._counts["repeated"] += steps == 0
+                self._counts["restarts"] += steps < 0
+                self._written = None if steps < 0 else self._written  # it began anew: that was meant for before
             self._counts["packages"] += len(rows)
             self._counts["late"] += sum(row.late for row in rows)
             self._rows += rows
@@ -328,13 +325,6 @@ class RtdeStream:
                 self._first += len(self._rows) - self._most
                 del self._rows[: -self._most]
             self._news.notify_all()
-
-    def _count_step(self, elapsed: float) -> None:
-        steps = round(elapsed / self.step)
-        self._counts["missing"] += max(steps - 1, 0)
-        self._counts["repeated"] += steps == 0
-        self._counts["restarts"] += steps < 0
-        self._written = None if steps < 0 else self._written  # it began anew: that was meant for before
 
     def _again(self, why: str) -> None:
         """Connect again."""
