@@ -3,10 +3,8 @@
 A statement that inserts into a table of CHAINED is met on its way to the database: its rows get the number of the entry
 and a sum of their own, whoever sends it. So no writer has to remember the ledger, and none can go around it.
 
-The hash chain over a cell's history: how a row, and a transaction's rows, become 32 bytes.
-
-What a row's sum is must never change: stores hold sums that were made years ago. So a column without a value is not in it,
-and columns are taken by name: a later schema may add columns that are empty in earlier rows.
+What a row's sum is must never change. So a column without a value is not in it, and columns are taken by name: a later
+schema may add columns that are empty in earlier rows.
 """
 
 from __future__ import annotations
@@ -91,16 +89,6 @@ def entry_digest(previous: bytes, head: Mapping[str, Any], sums: Mapping[str, It
     return digest.digest()
 
 
-def settings_text(settings: Mapping[str, str]) -> str:
-    """Return settings as an entry keeps them: JSON, keys in order."""
-    return json.dumps(dict(settings), sort_keys=True)
-
-
-def added_text(sums: Mapping[str, Iterable[bytes]]) -> str:
-    """Return how many rows of each table an entry chains, as JSON."""
-    return json.dumps({table: len(list(sums[table])) for table in sorted(sums)})
-
-
 DOUBLES = {
     name: tuple(column.name for column in table.c if isinstance(column.type, sa.Double)) for name, table in CHAINED.items()
 }
@@ -160,18 +148,17 @@ class LedgerEntry:
 
     def append(self, connection: sa.Connection) -> None:
         """Write the entry, as the last of the transaction."""
-        if self._number:
-            settings = settings_text(held_settings(connection, self.cell_id)) if self._settings else None
-            row = new_entry(self.cell_id, self._number, self._previous, self._clock(), self._sums, settings)
-            connection.execute(sa.insert(LEDGER), row)
-
-
-def new_entry(
-    cell_id: str, number: int, previous: bytes, time: float, sums: Mapping[str, Sequence[bytes]], settings: str | None
-) -> dict[str, Any]:
-    """Return the row of an entry: it follows `previous`, and chains the rows that `sums` are of."""
-    head = {"cell_id": cell_id, "number": number, "time": float(time), "added": added_text(sums), "settings": settings}
-    return head | {"digest": entry_digest(previous, head, sums)}
+        if not self._number:
+            return
+        held = held_settings(connection, self.cell_id) if self._settings else None
+        head = {
+            "cell_id": self.cell_id,
+            "number": self._number,
+            "time": float(self._clock()),
+            "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
+            "settings": None if held is None else json.dumps(held, sort_keys=True),
+        }
+        connection.execute(sa.insert(LEDGER), head | {"digest": entry_digest(self._previous, head, self._sums)})
 
 
 def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:

@@ -1,8 +1,4 @@
-"""A store read as it is at one moment: of all cells, changing nothing, while engines go on writing to it.
-
-The check of one cell's history: every row is read once, then the ledger is gone through.
-
-Whether a store's history is what was written: every row against its sum, every entry of the ledger against its rows.
+"""Whether a store's history is what was written: every row against its sum, every entry of the ledger against its rows.
 
     report = verify_history("engine.db")
     report.ok, report.faults, report.cells[0].digest      # keep the digest elsewhere: `expect` asks for it again
@@ -283,13 +279,10 @@ class CellCheck:
             self.digests.append(told.hex())
         numbers = [row["number"] for row in rows]
         yield from self._gaps(LEDGER.name, "entry", numbers)
-        yield from self._check_beyond(numbers)
-        yield from self._check_settings(settings)
-
-    def _check_beyond(self, numbers: list[Any]) -> Iterator[HistoryFault]:
         for table, sums in self._sums.items():
             for entry in sums.beyond(number for number in numbers if isinstance(number, int))[:SHOWN]:
                 yield self._fault(table, f"entry {entry}", "the ledger does not hold the entry that rows are of")
+        yield from self._check_settings(settings)
 
     def _check_settings(self, newest: Mapping[str, Any] | None) -> Iterator[HistoryFault]:
         held = held_settings(self.connection, self.cell_id)
@@ -333,9 +326,6 @@ def _integer(value: Any) -> int:
     return value if isinstance(value, int) else -1
 
 
-__all__ = ["CellHistory", "HistoryFault", "HistoryReport", "verify_history"]
-
-
 @dataclass(frozen=True, slots=True)
 class HistoryReport:
     """What `verify_history` found; faults : nothing where all is as it was written."""
@@ -361,17 +351,13 @@ def verify_history(
     wanted = _hexadecimal(expect)
     with snapshot(str(url)) as connection:
         faults = list(_pages(connection))
-        checks = [CellCheck(connection, cell, on_rows or _nobody) for cell in chosen_cells(connection, cell_id)]
+        checks = [CellCheck(connection, cell, on_rows or (lambda n: None)) for cell in chosen_cells(connection, cell_id)]
         for check in checks:
             faults += check.run()
     if wanted and not any(digest.startswith(wanted) for check in checks for digest in check.digests):
         what = "is in no entry: the history was cut off before it, or made anew"
         faults.append(HistoryFault(cell_id or "", "ledger", f"digest {wanted}", what))
     return HistoryReport(tuple(check.history() for check in checks), tuple(faults))
-
-
-def _nobody(rows: int) -> None:
-    """Nobody asks how far it is."""
 
 
 def _hexadecimal(digest: str | None) -> str:
