@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .options import POLICY, cell_options, example, gathered, given, interval_option, json_option
+from . import options
+from .options import POLICY, Known
 from .output import certificate_record, facts, show, write_json
 
 if TYPE_CHECKING:
@@ -20,9 +21,14 @@ Command = Callable[..., Any]
 LABELS = {"good": True, "bad": False}
 
 
-def store_argument(command: Command) -> Command:
-    """STORE, and whose rows of it."""
-    return click.argument("store", metavar="STORE")(cell_options()(command))
+def corrects(example: str) -> Callable[[Command], click.Command]:
+    """A verb on STORE and a cell of it, with `--author` and `--json`; what else it takes comes below."""
+
+    def decorate(command: Command) -> click.Command:
+        whose = options.cell_options()(author_option(options.json_option(command)))
+        return click.command(epilog=options.example(example))(options.store_argument(whose))
+
+    return decorate
 
 
 shadow_option = click.option(
@@ -31,6 +37,7 @@ shadow_option = click.option(
     callback=lambda context, option, state: None if state is None else state == "on",
     help="Verify every part, and let the model only say what it would have done; or let it decide again.",
 )
+interval_option = click.option("--interval", type=Known("interval"), help="The confidence interval.")
 author_option = click.option("--author", help="Who says so, for the record.  [default: the login name]")
 
 
@@ -61,12 +68,9 @@ def _login() -> str:
         return ""
 
 
-@click.command(epilog=example("dengine correct engine.db import-d684ff7e4dbab839-0 bad"))
-@store_argument
+@corrects("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
 @click.argument("decision", metavar="ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-@author_option
-@json_option
 def correct(store: str, decision: str, label: str, author: str | None, as_json: bool) -> None:
     """Say that a label was wrong: the part was good, or bad.
 
@@ -76,12 +80,9 @@ def correct(store: str, decision: str, label: str, author: str | None, as_json: 
     _changed("correct", store, author, lambda engine, who: engine.correct(decision, LABELS[label], who), as_json)
 
 
-@click.command(epilog=example("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'"))
-@store_argument
+@corrects("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
-@author_option
-@json_option
 def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | None, as_json: bool) -> None:
     """Leave labels out of all that is learned and counted.
 
@@ -91,11 +92,8 @@ def forget(store: str, decisions: tuple[str, ...], reason: str, author: str | No
     _changed("forget", store, author, lambda engine, who: engine.forget(*decisions, author=who, reason=reason), as_json)
 
 
-@click.command(epilog=example("dengine rollback engine.db 1"))
-@store_argument
+@corrects("dengine rollback engine.db 1")
 @click.argument("version", metavar="VERSION", type=int)
-@author_option
-@json_option
 def rollback(store: str, version: int, author: str | None, as_json: bool) -> None:
     """Let an earlier model version answer again, as a new one.
 
@@ -104,11 +102,8 @@ def rollback(store: str, version: int, author: str | None, as_json: bool) -> Non
     _changed("rollback", store, author, lambda engine, who: engine.rollback(version, who), as_json)
 
 
-@click.command(epilog=example("dengine policy engine.db --alpha 0.05 --lower-bound 0.95"))
-@store_argument
-@gathered("settings", given, POLICY | {"interval": interval_option, "shadow": shadow_option})
-@author_option
-@json_option
+@corrects("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
+@options.gathered("settings", options.given, POLICY | {"interval": interval_option, "shadow": shadow_option})
 def policy(store: str, settings: dict[str, Any], author: str | None, as_json: bool) -> None:
     """Show the policy in force, or decide by another one.
 
@@ -131,10 +126,7 @@ def policy(store: str, settings: dict[str, Any], author: str | None, as_json: bo
     show(facts(f"{store}: the policy in force", [(name, str(value)) for name, value in asdict(now).items()]))
 
 
-@click.command(epilog=example("dengine retrain engine.db"))
-@store_argument
-@author_option
-@json_option
+@corrects("dengine retrain engine.db")
 def retrain(store: str, author: str | None, as_json: bool) -> None:
     """Train now, on the store's labels as they count.
 

@@ -10,21 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from ..errors import percent
-from .options import (
-    FILE,
-    DataChoice,
-    OutFolder,
-    data_argument,
-    example,
-    force_option,
-    json_option,
-    left_out,
-    must_have_mujoco,
-    n_jobs_option,
-    out_option,
-    scenario_option,
-    seed_option,
-)
+from . import options
+from .options import DataChoice, OutFolder, left_out
 from .output import duration, facts, progress, show, write_json
 
 if TYPE_CHECKING:
@@ -39,10 +26,10 @@ FITTED = {
 }
 
 
-@click.command(epilog=example("dengine data insertion --out out/"))
-@data_argument
-@out_option
-@json_option
+@click.command(epilog=options.example("dengine data insertion --out out/"))
+@options.data_options(argument=True)
+@options.out_option
+@options.json_option
 def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     """Say what a data set is, and what is wrong with it.
 
@@ -50,21 +37,17 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     with X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
     is labelled in it; or the bundled set, insertion.
     """
+    from ..experiments.pictures import data_picture
     from ..experiments.survey import survey
 
     dataset = source.load(quiet=True)
     found = survey(dataset)
-    files = []
-    if out is not None:
-        from ..experiments.figures import save
-        from ..experiments.pictures import data_picture
-
-        files = out.listed([save(data_picture(dataset, found.name), out.path / "data.png", force=out.force)])
-    if as_json:
-        write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
-        return
-    table = facts(found.name, [*_form(found), *_state(found), *_order(found)])
-    show(table, *left_out(dataset, MOST), *(f"Wrote {path}" for path in files))
+    with options.written(out, lambda out: out.picture(data_picture(dataset, found.name), "data.png")) as files:
+        if as_json:
+            write_json({"verb": "data", "data": source.data, "survey": found, "files": files})
+            return
+        table = facts(found.name, [*_form(found), *_state(found), *_order(found)])
+        show(table, *left_out(dataset, MOST), *(f"Wrote {path}" for path in files))
 
 
 def _form(found: Survey) -> Iterator[tuple[str, str]]:
@@ -109,13 +92,9 @@ def _state(found: Survey) -> Iterator[tuple[str, str]]:
 
 def _order(found: Survey) -> Iterator[tuple[str, str]]:
     for each in found.drift:
-        yield f"{each.name} by tenths", f"{_tenths(each)}\n{_trend(each)}"
-
-
-def _tenths(each: Drift) -> str:
-    if each.name == "good":
-        return " ".join(f"{100 * x:.0f}" for x in each.tenths) + " %"
-    return " ".join("-" if math.isnan(x) else f"{x:.3g}" for x in each.tenths)
+        shares = " ".join(f"{100 * x:.0f}" for x in each.tenths) + " %"
+        means = " ".join("-" if math.isnan(x) else f"{x:.3g}" for x in each.tenths)
+        yield f"{each.name} by tenths", f"{shares if each.name == 'good' else means}\n{_trend(each)}"
 
 
 def _trend(each: Drift) -> str:
@@ -125,24 +104,22 @@ def _trend(each: Drift) -> str:
     return f"{said} (Spearman's rho {each.rho:+.2f}, p {each.p:.2g})"
 
 
-@click.command(epilog=example("dengine simulate --n 50 --out traces.npz --seed 0"))
-@click.option("--n", type=click.IntRange(1), default=1503, show_default=True, help="Insertions to simulate, of 2 s each.")
-@click.option(
-    "--out",
-    type=FILE,
-    required=True,
-    help="The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels.",
-)
-@scenario_option
-@seed_option
-@n_jobs_option(-1, "Processes; -1: one a core.")
-@force_option
-@json_option
+OUT = "The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels."
+
+
+@click.command(epilog=options.example("dengine simulate --n 50 --out traces.npz --seed 0"))
+@click.option("--n", type=options.COUNT, default=1503, show_default=True, help="Insertions to simulate, of 2 s each.")
+@click.option("--out", type=options.FILE, required=True, help=OUT)
+@options.scenario_option
+@options.seed_option
+@options.n_jobs_option(-1, "Processes; -1: one a core.")
+@options.force_option
+@options.json_option
 def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bool, as_json: bool) -> None:
     """Simulate insertions and write their forces and labels."""
     from ..files import check_output
 
-    must_have_mujoco()
+    options.must_have_mujoco()
     check_output(out, force)  # before minutes of physics
     from ..cells.simulation.generate import save_traces
     from ..cells.simulation.generate import simulate as simulate_traces

@@ -7,38 +7,27 @@ from typing import Any
 
 import click
 
-from .options import FILE, FOLDER, cell_options, example, force_option, json_option
+from . import options
+from .options import FILE, FOLDER
 from .output import show, size, write_json
 
+EXPORTERS = ("torchscript", "onnx")
+FORMAT = "torchscript decides, audits and learns in the cell; onnx only decides."
+KEY = "Sign the file with this key, as --make-key writes it; the signature comes beside it, as FILE.sig."
+NEW_KEY = "First write a new secret key to this new file, which only you can read; and sign with it."
+CPP = "Write into this new folder the C and C++ sources that run an exported file, of any store."
 
-@click.command(epilog=example("dengine export engine.db --out model.ts"))
+
+@click.command(epilog=options.example("dengine export engine.db --out model.ts"))
 @click.argument("store", metavar="[STORE]", required=False)
-@cell_options()
+@options.cell_options()
 @click.option("--out", type=FILE, help="The file to write; its checksum comes beside it, as FILE.sha256.")
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(["torchscript", "onnx"]),
-    default="torchscript",
-    show_default=True,
-    help="torchscript decides, audits and learns in the cell; onnx only decides.",
-)
-@click.option(
-    "--key",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Sign the file with this key, as --make-key writes it; the signature comes beside it, as FILE.sig.",
-)
-@click.option(
-    "--make-key",
-    "new_key",
-    type=FILE,
-    help="First write a new secret key to this new file, which only you can read; and sign with it.",
-)
-@click.option(
-    "--cpp", type=FOLDER, help="Write into this new folder the C and C++ sources that run an exported file, of any store."
-)
-@force_option
-@json_option
+@click.option("--format", "form", type=click.Choice(EXPORTERS), default=EXPORTERS[0], show_default=True, help=FORMAT)
+@click.option("--key", type=click.Path(exists=True, dir_okay=False, path_type=Path), help=KEY)
+@click.option("--make-key", "new_key", type=FILE, help=NEW_KEY)
+@click.option("--cpp", type=FOLDER, help=CPP)
+@options.force_option
+@options.json_option
 def export(
     store: str | None,
     out: Path | None,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,24 +15,23 @@ import click
 
 from ..errors import percent
 from ..records import plain
-from .options import Known, Naming, cell_options, example, force_option, json_option, out_file_option
+from . import options
+from .options import Known, Naming
 from .output import duration, facts, show, when, write_json
 
 if TYPE_CHECKING:
     from ..history.envelope import Envelope, Excess
     from ..history.explain import Explanation, Neighbour
     from ..history.status import Happened
+    from ..records import Decision
     from ..store.records import Event, StoredDecision
     from ..store.views import PastRetrain
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-COLUMNS = ("time (UTC)", "decision", "part", "action", "model", "bound", "good", "bad", "reason", "v", "label")
-RIGHT = ("good", "bad", "v")
 WIDEST = 120  # columns
-PART = COLUMNS.index("part")
 SHORTEST = 5  # characters of a part's number that are shown
-TOLD = {"verification": "verified"}  # in fewer columns
 SHORT = "%y-%m-%d %H:%M:%S"
+MOST = 5  # excesses that are named
 
 
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
@@ -51,23 +51,21 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-@click.command(epilog=example("dengine history engine.db --last 20 --events"))
-@click.argument("store", metavar="STORE")
-@cell_options()
-@click.option("--last", type=click.IntRange(1), default=50, show_default=True, help="The newest so many that are meant.")
+MODEL = "Only what the model alone would have done so, as in an audit or in the shadow mode."
+
+
+@click.command(epilog=options.example("dengine history engine.db --last 20 --events"))
+@options.store_argument
+@options.cell_options()
+@click.option("--last", type=options.COUNT, default=50, show_default=True, help="The newest so many that are meant.")
 @click.option("--action", type=Known("action"), help="Only what was decided so.")
-@click.option(
-    "--model",
-    "predicted",
-    type=Known("action"),
-    help="Only what the model alone would have done so, as in an audit or in the shadow mode.",
-)
+@click.option("--model", "predicted", type=Known("action"), help=MODEL)
 @click.option("--reason", type=Known("reason"), cls=Naming, metavar="REASON", help="Only for this one: {reason}.")
 @click.option("--label", type=Known("label"), help="Only what turned out so, or was never reported.")
 @click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
 @click.option("--until", type=Moment(), help="Only before then, likewise.")
 @click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
-@json_option
+@options.json_option
 def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
     """Show the decisions of a store, newest last.
 
@@ -79,13 +77,10 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
     from ..history.status import history as read
     from ..store.base import open_store
 
-    opened = open_store(store, must_exist=True)
-    try:
+    with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
         others = beside(opened, since, asked["until"]) if events else None
-    finally:
-        opened.close()
     if as_json:
         listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
         decisions = [plain(past) | {"label": past.label} for past in found]
@@ -96,46 +91,50 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
         click.echo(line)
 
 
+def _bound(made: Decision) -> str:
+    return "-" if math.isnan(made.lower) else f"{made.lower:.2f}-{made.upper:.2f}"
+
+
+def _label(past: StoredDecision) -> str:
+    source = "" if past.source is None else f" {past.source.value}".replace("verification", "verified")
+    return "-" if past.success is None else f"{past.label}{source}"
+
+
+COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which side; and the title
+    "<time (UTC)": lambda past: when(past.time, SHORT),
+    "<decision": lambda past: past.decision.id,
+    "<part": lambda past: past.decision.part or "-",
+    "<action": lambda past: past.decision.action.value,
+    "<model": lambda past: "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
+    "<bound": lambda past: _bound(past.decision),
+    ">good": lambda past: str(past.decision.n_success),
+    ">bad": lambda past: str(past.decision.n_failure),
+    "<reason": lambda past: past.decision.reason.value,
+    ">v": lambda past: str(past.decision.model_version),
+    "<label": _label,
+}
+PART = list(COLUMNS).index("<part")
+
+
 def lines(happened: Sequence[Happened]) -> list[str]:
     """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
     from ..store.records import StoredDecision
 
     if not happened:
         return ["No decision of that kind."]
-    rows = [_cells(each) for each in happened if isinstance(each, StoredDecision)]
-    widths = [max(map(len, column)) for column in zip(COLUMNS, *rows, strict=True)]
+    titles = [name[1:] for name in COLUMNS]
+    rows = [[cell(each) for cell in COLUMNS.values()] for each in happened if isinstance(each, StoredDecision)]
+    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
     # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
     too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
     widths[PART] = min(widths[PART], max(SHORTEST, widths[PART] - max(0, too_wide)))
     for row in rows:
         row[PART] = row[PART] if len(row[PART]) <= widths[PART] else "~" + row[PART][1 - widths[PART] :]
-    waiting = iter(rows)
-    body = [
-        _line(next(waiting), widths) if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1] for each in happened
-    ]
-    return [_line(COLUMNS, widths), "  ".join("-" * width for width in widths), *body]
-
-
-def _line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    pairs = zip(COLUMNS, cells, widths, strict=True)
-    return "  ".join(text.rjust(n) if name in RIGHT else text.ljust(n) for name, text, n in pairs).rstrip()
-
-
-def _cells(past: StoredDecision) -> list[str]:
-    source = "" if past.source is None else f" {TOLD.get(past.source.value, past.source.value)}"
-    return [
-        when(past.time, SHORT),
-        past.decision.id,
-        past.decision.part or "-",
-        past.decision.action.value,
-        "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
-        "-" if math.isnan(past.decision.lower) else f"{past.decision.lower:.2f}-{past.decision.upper:.2f}",
-        str(past.decision.n_success),
-        str(past.decision.n_failure),
-        past.decision.reason.value,
-        str(past.decision.model_version),
-        "-" if past.success is None else f"{past.label}{source}",
-    ]
+    sides = "  ".join(f"{{:{name[0]}{width}}}" for name, width in zip(COLUMNS, widths, strict=True))
+    table = [sides.format(*cells).rstrip() for cells in (titles, ["-" * width for width in widths], *rows)]
+    waiting = iter(table[2:])
+    body = [next(waiting) if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1] for each in happened]
+    return [*table[:2], *body]
 
 
 def _told(each: PastRetrain | Event) -> str:
@@ -148,19 +147,14 @@ def _told(each: PastRetrain | Event) -> str:
     return f"{when(each.time, SHORT)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
 
 
-MOST = 5  # excesses that are named
-
-
-@click.command(epilog=example("dengine explain engine.db last --out why.png"))
-@click.argument("store", metavar="STORE")
-@cell_options()
+@click.command(epilog=options.example("dengine explain engine.db last --out why.png"))
+@options.store_argument
+@options.cell_options()
 @click.argument("decision", metavar="DECISION")
-@click.option(
-    "--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references that are shown."
-)
-@out_file_option
-@force_option
-@json_option
+@click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
+@options.out_file_option
+@options.force_option
+@options.json_option
 def explain(store: str, decision: str, neighbours: int, out: Path | None, force: bool, as_json: bool) -> None:
     """Say why a decision came out as it did.
 
@@ -173,28 +167,23 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, force:
     from ..history.status import history
     from ..store.base import open_store
 
-    opened = open_store(store, must_exist=True)
-    try:
+    with closing(open_store(store, must_exist=True)) as opened:
         if decision == "last":
             newest = next(history(opened, last=1), None)
             if newest is None:
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
             decision = newest.decision.id
         found = explain_stored(opened, decision, neighbours)
-    finally:
-        opened.close()
-    files = [] if out is None else [_drawn(found, out, force)]
+    files = []
+    if out is not None:
+        from ..experiments.figures import save
+        from ..experiments.pictures import explained_picture
+
+        files = [save(explained_picture(found), out, force=force)]
     if as_json:
         write_json({"verb": "explain", "store": store} | found.record() | {"files": files})
         return
     show(*_tables(found), *(f"Wrote {path}" for path in files))
-
-
-def _drawn(found: Explanation, out: Path, force: bool) -> Path:
-    from ..experiments.figures import save
-    from ..experiments.pictures import explained_picture
-
-    return save(explained_picture(found), out, force=force)
 
 
 def _tables(found: Explanation) -> Iterator[Any]:
@@ -207,11 +196,8 @@ def _tables(found: Explanation) -> Iterator[Any]:
 
 def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
     past = found.decision
-    yield (
-        "decided",
-        f"{when(past.time)}, by "
-        + (f"version {past.decision.model_version}" if past.decision.model_version else "no model"),
-    )
+    version = past.decision.model_version
+    yield "decided", f"{when(past.time)}, by " + (f"version {version}" if version else "no model")
     if past.decision.part is not None:
         yield "part", past.decision.part
     for i, sentence in enumerate(found.said):

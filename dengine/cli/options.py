@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import wraps
 from importlib.util import find_spec
@@ -12,15 +13,20 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import SettingError
+from ..errors import DengineError, SettingError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from ..datasets import Dataset
     from ..recipe import Recipe
 
 Command = Callable[..., Any]
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
+COUNT = click.IntRange(1)
+ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
+LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
 
 
 def names_of(kind: str) -> tuple[str, ...]:
@@ -105,6 +111,11 @@ def gathered(
     return decorate
 
 
+def given(**options: Any) -> dict[str, Any]:
+    """Those that were given."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
 def cell_options(*names: str, product: bool = False) -> Callable[[Command], Command]:
     """`--cell`, or other names of it, and where asked for `--product`; the verb's `store` then says whose rows it means."""
 
@@ -133,10 +144,7 @@ def short_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class RecipeChoice:
-    """Which recipe was asked for, if any; what was not given is left to the recipe, or to the store.
-
-    settings : by name, of a policy or `novelty`: those that were given.
-    """
+    """Which recipe was asked for, if any; settings : those that were given, of a policy or `novelty`."""
 
     reducer: str | None = None
     recipe: str | None = None
@@ -146,11 +154,6 @@ class RecipeChoice:
     def name(self) -> str:
         """What to call it in a table."""
         return short_name(self.recipe or self.reducer or "conv")
-
-    @property
-    def asked(self) -> bool:
-        """Whether any of it was given."""
-        return bool(self.reducer or self.recipe or self.settings)
 
     def load(self, name: str | None = None) -> Recipe:
         """The recipe, or the one of another name with these settings. SettingError where its reducer cannot be found."""
@@ -165,50 +168,35 @@ class RecipeChoice:
             reducer_class(recipe.reducer)  # now, and not when a store was made for it
         return recipe
 
+    def if_asked(self) -> Recipe | None:
+        """The recipe, where any of it was given; else the store's counts."""
+        return self.load() if self.reducer or self.recipe or self.settings else None
 
-ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
-LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
-POLICY = {  # what it is by default is the recipe's affair, or the store's
-    "alpha": click.option(
-        "--alpha", type=ALPHA, help="Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
-    ),
-    "lower_bound": click.option(
-        "--lower-bound",
-        type=LOWER_BOUND,
-        help="LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]",
-    ),
-    "guarantee": click.option(
-        "--guarantee",
-        type=Known("guarantee", own=True),
-        help="What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled); "
-        "or a rule of your own.",
-    ),
-    "stops": click.option(
-        "--stops",
-        type=Known("stops"),
-        help="Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good.",
-    ),
-    "audit_rate": click.option(
-        "--audit-rate",
-        type=click.FloatRange(0.0, 1.0, max_open=True),
-        metavar="SHARE",
-        help="Share of what the model is certain of that is verified all the same; rejects are known by it alone.",
-    ),
+
+# What a policy is by default is the recipe's affair, or the store's.
+_ALPHA = "Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
+_LB = "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]"
+_GUARANTEE = (
+    "What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled); or a rule of "
+    "your own."
+)
+_STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
+_AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
+_NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
+_SHARE = click.FloatRange(0.0, 1.0, max_open=True)
+POLICY = {
+    "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
+    "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
+    "guarantee": click.option("--guarantee", type=Known("guarantee", own=True), help=_GUARANTEE),
+    "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
+    "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
 }
-SETTINGS = POLICY | {
-    "novelty": click.option(
-        "--novelty",
-        type=click.FloatRange(0.0),
-        metavar="FACTOR",
-        help="Verify a trace so many times less like the learned ones than these are like each other; 0: off.",
-    )
+SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}
+_REDUCER = "{reducer}, or module:Class of your own, looked for in this folder too.  [default: conv]"
+RECIPE = {
+    "reducer": click.option("--reducer", cls=Naming, metavar="NAME", help=_REDUCER),
+    "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
 }
-interval_option = click.option("--interval", type=Known("interval"), help="The confidence interval.")
-
-
-def given(**options: Any) -> dict[str, Any]:
-    """Those that were given."""
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def _choice(reducer: str | None, recipe: str | None, **settings: Any) -> RecipeChoice:
@@ -218,116 +206,70 @@ def _choice(reducer: str | None, recipe: str | None, **settings: Any) -> RecipeC
 
 
 policy_options = gathered("settings", given, SETTINGS)
-recipe_options = gathered(
-    "choice",
-    _choice,
-    {
-        "reducer": click.option(
-            "--reducer",
-            cls=Naming,
-            metavar="NAME",
-            help="{reducer}, or module:Class of your own, looked for in this folder too.  [default: conv]",
-        ),
-        "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
-        **SETTINGS,
-    },
-)
+recipe_options = gathered("choice", _choice, RECIPE | SETTINGS)
 
 
 @dataclass(frozen=True)
 class DataChoice:
-    """Which data set was asked for, and how: as `load_dataset` takes it."""
+    """Which data set was asked for; how : what was given of the ways to read it, as `load_dataset` calls them."""
 
     data: str
-    samples: int | None = None
-    part: str = "part"
-    channel: str | None = None
-    label: str | None = None
-    labels: str | None = None
-    fit: str | None = None
-    rate_hz: float | None = None
-    trigger: str | None = None
-    topic: str | None = None
+    how: Mapping[str, Any]
 
     def load(self, quiet: bool = False) -> Dataset:
         """The data set; what was left out of it is said on stderr, or not. DataError for what cannot be read."""
         from ..datasets import load_dataset
 
-        how = {name: getattr(self, name) for name in ("channel", "label", "labels", "fit", "rate_hz", "trigger", "topic")}
-        data = load_dataset(self.data, self.samples, self.part, **how)
-        if data.faults and not quiet:
-            for line in left_out(data, 3):
-                click.echo(line, err=True)
+        data = load_dataset(self.data, **self.how)
+        for line in [] if quiet else left_out(data, 3):
+            click.echo(line, err=True)
         return data
 
 
 def left_out(data: Dataset, most: int) -> list[str]:
     """What could not be read, a line each for the first few; none where all could."""
     n = len(data.faults)
-    if not n:
-        return []
     rest = [f"- and {n - most} more"] if n > most else []
     title = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
-    return [title, *(f"- {fault}" for fault in data.faults[:most]), *rest]
+    return [title, *(f"- {fault}" for fault in data.faults[:most]), *rest] if n else []
 
 
-DATA = {  # how a data set is read: what `load_dataset` calls them
-    "samples": click.option(
-        "--samples",
-        type=click.IntRange(1),
-        help="Use only the first so many samples of each trace: decides earlier, on less.  [default: all]",
-    ),
-    "channel": click.option(
-        "--channel", metavar="NAMES", help="FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
-    ),
-    "label": click.option(
-        "--label",
-        metavar="PATTERN",
-        help="In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column.  "
-        "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]",
-    ),
+_SAMPLES = "Use only the first so many samples of each trace: decides earlier, on less.  [default: all]"
+_CHANNEL = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
+_LABEL = (
+    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column.  "
+    "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
+)
+_FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad]"
+_RATE = click.FloatRange(0.0, min_open=True)
+_TRIGGER = (
+    "When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
+    "digital output), motion=0.01 (m/s)."
+)
+_PART = "The array or column of parts' numbers, if any: a part that comes again has one vote.  [default: part]"
+_DATA = (
+    "The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv or "
+    ".parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db."
+)
+DATA = {
+    "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
+    "channel": click.option("--channel", metavar="NAMES", help=_CHANNEL),
+    "label": click.option("--label", metavar="PATTERN", help=_LABEL),
     "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
-    "fit": click.option(
-        "--fit",
-        type=Known("fit"),
-        help="What becomes of traces of another length.  [default: strict where all are alike, else pad]",
-    ),
-    "rate_hz": click.option(
-        "--rate",
-        "rate_hz",
-        type=click.FloatRange(0.0, min_open=True),
-        metavar="HZ",
-        help="Instead of what timestamps tell.",
-    ),
-    "trigger": click.option(
-        "--trigger",
-        metavar="TEXT",
-        help="When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), "
-        "bit=0 (a digital output), motion=0.01 (m/s).",
-    ),
+    "fit": click.option("--fit", type=Known("fit"), help=_FIT),
+    "rate_hz": click.option("--rate", "rate_hz", type=_RATE, metavar="HZ", help="Instead of what timestamps tell."),
+    "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
     "topic": click.option("--topic", metavar="NAME", help="Of the wrench in an .mcap file.  [default: the only one]"),
-    "part": click.option(
-        "--part",
-        metavar="KEY",
-        default="part",
-        show_default=True,
-        help="The array or column of parts' numbers, if any: a part that comes again has one vote.",
-    ),
+    "part": click.option("--part", metavar="KEY", help=_PART),
 }
-data_argument = gathered("source", DataChoice, {"data": click.argument("data", metavar="NAME|FILE|FOLDER")} | DATA)
 
 
-def data_options(default: str | None = "insertion") -> Callable[[Command], Command]:
-    """`--data` and how it is read, handed on as one `DataChoice`, `source`."""
-    shown: dict[str, Any] = {"required": True} if default is None else {"default": default, "show_default": True}
-    option = click.option(
-        "--data",
-        metavar="NAME|FILE|FOLDER",
-        help="The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv "
-        "or .parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db.",
-        **shown,
-    )
-    return gathered("source", DataChoice, {"data": option} | DATA)
+def data_options(default: str | None = "insertion", argument: bool = False) -> Callable[[Command], Command]:
+    """`--data`, or DATA, and how it is read, handed on as one `DataChoice`, `source`."""
+    metavar, shown = "NAME|FILE|FOLDER", {"default": default, "show_default": True}
+    option = click.option("--data", metavar=metavar, help=_DATA, **({"required": True} if default is None else shown))
+    named = click.argument("data", metavar=metavar) if argument else option
+    return gathered("source", lambda data, **how: DataChoice(data, given(**how)), {"data": named} | DATA)
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
@@ -349,44 +291,59 @@ def must_have_mujoco() -> None:
 
 @dataclass(frozen=True)
 class OutFolder:
-    """Where a verb's CSV and pictures go. force : whether they replace the files that are there."""
+    """Where a verb's CSV and pictures go; force : replace the files that are there; files : those written so far."""
 
     path: Path
     force: bool = False
+    files: list[Path] = field(default_factory=list)
 
-    def listed(self, files: list[Path]) -> list[Path]:
-        """What was written, and the manifest that names it, which comes last."""
-        from ..files import write_manifest
+    def table(self, frame: pd.DataFrame, name: str) -> None:
+        """Write a table as CSV."""
+        from ..experiments.tables import write_csv
 
-        return [*files, write_manifest(self.path, files, self.force)]
+        self.files.append(write_csv(frame, self.path / name, self.force))
+
+    def picture(self, figure: Any, name: str) -> None:
+        """Write a picture."""
+        from ..experiments.figures import save
+
+        self.files.append(save(figure, self.path / name, force=self.force))
 
 
+@contextmanager
+def written(out: OutFolder | None, write: Callable[[OutFolder], None]) -> Iterator[list[Path]]:
+    """Gives the files that were written, and their manifest; a refusal is raised once what was computed has been shown."""
+    from ..files import write_manifest
+
+    refusal: DengineError | None = None
+    files: list[Path] = []
+    try:
+        if out is not None:
+            write(out)
+            files = [*out.files, write_manifest(out.path, out.files, out.force)]
+    except DengineError as error:
+        refusal = error
+    yield files
+    if refusal is not None:
+        raise refusal
+
+
+_OUT = "Folder for the CSV and the pictures; made if need be."
+_KEEP = "Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once."
+_SCENARIO = "What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump."
+_SEED = "An integer; the same seed, the same run."
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
 out_option = gathered(
     "out",
     lambda out, force: None if out is None else OutFolder(out, force),
-    {
-        "out": click.option("--out", type=FOLDER, help="Folder for the CSV and the pictures; made if need be."),
-        "force": force_option,
-    },
+    {"out": click.option("--out", type=FOLDER, help=_OUT), "force": force_option},
 )
 out_file_option = click.option("--out", type=FILE, help="A picture, .png, .pdf or .svg, drawn into this file.")
-keep_option = click.option(
-    "--keep",
-    type=FOLDER,
-    metavar="FOLDER",
-    help="Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once.",
-)
-seed_option = click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="An integer; the same seed, the same run."
-)
-scenario_option = click.option(
-    "--scenario",
-    default="nominal",
-    show_default=True,
-    help="What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump.",
-)
+keep_option = click.option("--keep", type=FOLDER, metavar="FOLDER", help=_KEEP)
+seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED)
+scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)
+store_argument = click.argument("store", metavar="STORE")
 
 
 def example(command: str) -> str:

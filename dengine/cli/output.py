@@ -10,14 +10,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
-from pathlib import Path
 from textwrap import fill
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from ..errors import DengineError, without_password
+from ..errors import without_password
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -121,23 +120,6 @@ def imported_line(report: ImportReport, store: str) -> str:
     bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
     known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
     return f"Imported {report.imported} labelled traces into {store}.{bad}{known}{left}"
-
-
-@contextmanager
-def refusals_last() -> Iterator[Callable[[Callable[[], list[Path]]], list[Path]]]:
-    """Gives a function that writes files; where they are refused, that is raised once what was computed has been shown."""
-    refusals: list[DengineError] = []
-
-    def attempt(write: Callable[[], list[Path]]) -> list[Path]:
-        try:
-            return write()
-        except DengineError as error:
-            refusals.append(error)
-            return []
-
-    yield attempt
-    for error in refusals:
-        raise error
 
 
 def certificate_record(certificate: Certificate) -> dict[str, Any]:

@@ -17,40 +17,19 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import SettingError, percent
-from .options import (
-    ALPHA,
-    LOWER_BOUND,
-    DataChoice,
-    Known,
-    Listed,
-    Naming,
-    OutFolder,
-    RecipeChoice,
-    data_options,
-    example,
-    gathered,
-    json_option,
-    keep_option,
-    n_jobs_option,
-    names_of,
-    out_option,
-    policy_options,
-    recipe_options,
-    seed_option,
-    short_name,
-)
-from .output import duration, end_interrupted, figures, progress, refusals_last, show, write_json
+from . import options
+from .options import ALPHA, COUNT, LOWER_BOUND, DataChoice, Known, Listed, Naming, OutFolder, RecipeChoice, short_name
+from .output import duration, end_interrupted, figures, progress, show, write_json
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.costs import CostCurve, PolicyCost
+    from ..experiments.costs import PolicyCost
     from ..experiments.grid import Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
 
-ANSWERS_WITHIN = "5 s"  # what a scheduler has for it, before it counts as not there
 FEEDBACKS = {"stops": False, "confirmed": True}
 
 
@@ -86,6 +65,11 @@ class Finished:
         """Whether some are missing."""
         return len(self.replays) < self.asked
 
+    @property
+    def count(self) -> str:
+        """How many, in words."""
+        return f"Interrupted: {len(self.replays)} of {self.asked} replays were finished"
+
 
 def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream, quiet: bool) -> Finished:
     """Play every task; on Ctrl-C what was finished until then."""
@@ -120,7 +104,7 @@ def _cluster(stream: Stream, dataset: Dataset) -> Iterator[int]:
 
     connect: Any = Client  # untyped
     try:
-        connected = connect(stream.scheduler, timeout=ANSWERS_WITHIN)
+        connected = connect(stream.scheduler, timeout="5 s")
     except (OSError, ValueError, MemoryError) as error:  # the last: what answered there speaks another language
         raise SettingError(
             f"Expected --scheduler to be the address of a running dask scheduler, as tcp://host:8786, got "
@@ -136,65 +120,54 @@ def _stream(repeats: int | None, in_order: bool, seed: int, **how: Any) -> Strea
     return Stream(range(seed, seed + (1 if in_order else repeats or 30)), shuffle=not in_order, **how)
 
 
-stream_options = gathered(
+_TIMED = "Replays at a time, each in a process; -1: one a core. Timings are honest with 1 only."
+stream_options = options.gathered(
     "stream",
     _stream,
     {
-        "repeats": click.option(
-            "--repeats", type=click.IntRange(1), help="Shuffled replays of each recipe.  [default: 30]"
-        ),
-        "seed": seed_option,
-        "cycles": click.option(
-            "--cycles", type=click.IntRange(1), help="Only so many parts of each stream.  [default: all]"
-        ),
+        "repeats": click.option("--repeats", type=COUNT, help="Shuffled replays of each recipe.  [default: 30]"),
+        "seed": options.seed_option,
+        "cycles": click.option("--cycles", type=COUNT, help="Only so many parts of each stream.  [default: all]"),
         "in_order": click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
-        "n_jobs": n_jobs_option(1, "Replays at a time, each in a process; -1: one a core. Timings are honest with 1 only."),
-        "keep": keep_option,
+        "n_jobs": options.n_jobs_option(1, _TIMED),
+        "keep": options.keep_option,
         "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
     },
 )
+REPLAY = "dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/"
 
 
-@click.command(
-    epilog=example("dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/")
-)
-@data_options()
-@recipe_options
+@click.command(epilog=options.example(REPLAY))
+@options.data_options()
+@options.recipe_options
 @click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
 @stream_options
-@out_option
-@json_option
-def replay(
-    choice: RecipeChoice, confirm: bool, source: DataChoice, stream: Stream, out: OutFolder | None, as_json: bool
-) -> None:
+@options.out_option
+@options.json_option
+def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
     Ctrl-C shows the replays that were finished.
     """
     from ..experiments.replay import Contender
 
-    contender = Contender(choice.name, choice.load())
-    _replay("replay", [contender], {"confirms": [confirm]}, source, stream, out, as_json)
+    _replay("replay", [Contender(choice.name, choice.load())], {"confirms": [confirm]}, **played)
+
+
+def _list(name: str, of: click.ParamType[Any], text: str = "To be tried.") -> Callable[[Any], Any]:
+    return click.option(f"--{name}", type=Listed(of), cls=Naming, metavar="LIST", help=text)
 
 
 LISTS = {
-    "alphas": click.option("--alphas", type=Listed(ALPHA), metavar="LIST", help="As in 0.5,0.1,0.05."),
-    "lower_bounds": click.option("--lower-bounds", type=Listed(LOWER_BOUND), metavar="LIST", help="As in 0.8,0.9,0.95."),
-    "intervals": click.option(
-        "--intervals", type=Listed(Known("interval")), cls=Naming, metavar="LIST", help="Of {interval}."
-    ),
-    "guarantees": click.option(
-        "--guarantees",
-        type=Listed(Known("guarantee", own=True)),
-        cls=Naming,
-        metavar="LIST",
-        help="Of {guarantee}, module:Class of your own.",
-    ),
+    "alphas": _list("alphas", ALPHA, "As in 0.5,0.1,0.05."),
+    "lower_bounds": _list("lower-bounds", LOWER_BOUND, "As in 0.8,0.9,0.95."),
+    "intervals": _list("intervals", Known("interval"), "Of {interval}."),
+    "guarantees": _list("guarantees", Known("guarantee", own=True), "Of {guarantee}, module:Class of your own."),
 }
 
 
-@click.command(epilog=example("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/"))
-@data_options()
+@click.command(epilog=options.example("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/"))
+@options.data_options()
 @click.option(
     "--reducers",
     "asked",
@@ -205,9 +178,9 @@ LISTS = {
     type=Listed(click.STRING),
     help="With commas between, of {reducer}, TOML files, module:Class of your own; and rivals: {rival}.",
 )
-@policy_options
+@options.policy_options
 @click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
-@gathered("lists", lambda **lists: {name: values for name, values in lists.items() if values}, LISTS)
+@options.gathered("lists", lambda **lists: {name: values for name, values in lists.items() if values}, LISTS)
 @click.option(
     "--feedback",
     type=Listed(click.Choice(list(FEEDBACKS))),
@@ -217,18 +190,15 @@ LISTS = {
     help=f"What is known of accepted parts, of {','.join(FEEDBACKS)}: their stops alone, or of good ones too.",
 )
 @stream_options
-@out_option
-@json_option
+@options.out_option
+@options.json_option
 def compare(
     asked: Sequence[str],
     settings: Mapping[str, Any],
     paper: bool,
     lists: Mapping[str, Any],
     feedback: Sequence[str],
-    source: DataChoice,
-    stream: Stream,
-    out: OutFolder | None,
-    as_json: bool,
+    **played: Any,
 ) -> None:
     """Replay the same streams through several methods.
 
@@ -237,16 +207,19 @@ def compare(
     """
     if len({short_name(one) for one in asked}) < len(asked):
         raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
-    grid: dict[str, Any] = {}
-    if paper:
-        from ..experiments.paper import GRID
+    from ..experiments.paper import GRID
+    from ..experiments.replay import Contender
 
-        grid |= GRID
-    grid |= lists
+    grid: dict[str, Any] = {**(GRID if paper else {}), **lists}
     _must_be_listed(settings, grid)
-    grid["confirms"] = [FEEDBACKS[name] for name in feedback]
-    choice = RecipeChoice(settings=settings)
-    _replay("compare", [_contender(name, choice) for name in asked], grid, source, stream, out, as_json)
+    choice, rivals = RecipeChoice(settings=settings), options.names_of("rival")
+    who = [
+        replace(Contender.load(one), recipe=choice.load())
+        if one in rivals
+        else Contender(short_name(one), choice.load(one))
+        for one in asked
+    ]
+    _replay("compare", who, grid | {"confirms": [FEEDBACKS[name] for name in feedback]}, **played)
 
 
 def _must_be_listed(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
@@ -255,15 +228,6 @@ def _must_be_listed(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
         if f"{name}s" in lists:
             flag = name.replace("_", "-")
             raise click.UsageError(f"--{flag} names one value, here it is asked for: name those to be tried, --{flag}s.")
-
-
-def _contender(asked: str, choice: RecipeChoice) -> Contender:
-    """A rival by its name, else a recipe; with the settings that were given."""
-    from ..experiments.replay import Contender
-
-    if asked in names_of("rival"):
-        return replace(Contender.load(asked), recipe=choice.load())
-    return Contender(short_name(asked), choice.load(asked))
 
 
 def _replay(
@@ -283,47 +247,42 @@ def _replay(
     if finished.replays:
         _report(verb, finished, dataset, stream, out, as_json)
     if finished.interrupted:
-        kept = "the table shows those" if finished.replays else "there is nothing to show"
-        end_interrupted(f"Interrupted: {len(finished.replays)} of {len(tasks)} replays were finished; {kept}.")
+        end_interrupted(f"{finished.count}; {'the table shows those' if finished.replays else 'there is nothing to show'}.")
 
 
 def _report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: OutFolder | None, as_json: bool) -> None:
     """Print the tables, or one JSON document; write CSV, tables and pictures to `out`."""
-    from ..experiments.paper import finding_lines
-    from ..experiments.tables import (
-        CONDITION,
-        encoder_line,
-        frame_of,
-        pool,
-        pooled_table,
-        promise_kept,
-        promise_lines,
-        retrain_line,
-    )
+    from ..experiments import tables
+    from ..experiments.paper import finding_lines, findings
 
     replays = finished.replays
-    frame = frame_of(replays)
+    frame = tables.frame_of(replays)
     dropped = frame.assign(dropped=[sum(not each.accepted for each in one.retrains) for one in replays])
-    sums = dropped.groupby(CONDITION, sort=False)["dropped"].sum()
+    sums = dropped.groupby(tables.CONDITION, sort=False)["dropped"].sum()
     rows = [
-        row | {"promise_kept": promise_kept(row), "retrains_dropped": int(n)}
-        for row, n in zip(pool(frame, replays), sums, strict=True)
+        row | {"promise_kept": tables.promise_kept(row), "retrains_dropped": int(n)}
+        for row, n in zip(tables.pool(frame, replays), sums, strict=True)
     ]
     by_name = _grouped(replays, lambda each: each.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
-    with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: out.listed(_save(frame, replays, title, out)))
-        found = _findings(frame)
+    # The paper's findings are of a grid under one guarantee and one feedback.
+    found = findings(frame) if _is_grid(frame) and not _varies(frame, "guarantee", "stops", "confirm") else []
+    core = sum(each.seconds for each in replays)
+    with options.written(out, lambda out: _save(frame, replays, title, out)) as files:
         if as_json:
             about = {"verb": verb, "data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults}
-            costs = _replay_costs(finished) | {"found": finished.found}
+            costs = {"seconds": finished.seconds, "core_seconds": core, "found": finished.found}
             about |= {"interrupted": finished.interrupted, "findings": found, "costs": costs, "files": files}
             write_json(about | {"rows": rows})
             return
-        show(pooled_table(rows, title), *promise_lines(rows))
+        show(tables.pooled_table(rows, title), *tables.promise_lines(rows))
         for name, some in by_name.items():
-            show(f"{name}: {retrain_line([each for one in some for each in one.retrains])}{encoder_line(some)}")
-        show(*finding_lines(found), _cost_line(finished), *(f"Wrote {path}" for path in files))
+            retrains = [each for one in some for each in one.retrains]
+            show(f"{name}: {tables.retrain_line(retrains)}{tables.encoder_line(some)}")
+        many = "" if len(replays) == 1 else "s"
+        kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
+        took = f"{duration(core)} of one core's time, in {duration(finished.seconds)}{kept}."
+        show(*finding_lines(found), f"{len(replays)} replay{many}, {took}", *(f"Wrote {path}" for path in files))
 
 
 def _grouped(replays: Sequence[Replay], key: Callable[[Replay], str]) -> dict[str, list[Replay]]:
@@ -338,8 +297,7 @@ def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> st
     cycles = len(next(iter(by_name.values()))[0])
     order = "in recorded order" if in_order else "shuffled"
     how = f"{order}, {' or '.join(map(str, each))} replay{'s' if each[-1] > 1 else ''} of {cycles} cycles"
-    source = "simulated insertions" if data == "insertion" else data
-    return f"{', '.join(by_name)} on {source}, {how}"
+    return f"{', '.join(by_name)} on {'simulated insertions' if data == 'insertion' else data}, {how}"
 
 
 def _varies(frame: pd.DataFrame, *names: str) -> bool:
@@ -350,37 +308,27 @@ def _is_grid(frame: pd.DataFrame) -> bool:
     return _varies(frame, "interval", "alpha", "lower_bound")
 
 
-def _findings(frame: pd.DataFrame) -> list[Any]:
-    """The paper's findings, where a grid was played under one guarantee and one feedback."""
-    from ..experiments.paper import findings
-
-    return findings(frame) if _is_grid(frame) and not _varies(frame, "guarantee", "stops", "confirm") else []
-
-
-def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: OutFolder) -> list[Path]:
-    from ..experiments.figures import curves, embedding_map, grid_figure, save
+def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: OutFolder) -> None:
+    from ..experiments.figures import curves, embedding_map, grid_figure
     from ..experiments.paper import grid_lines
-    from ..experiments.tables import write_csv
     from ..files import write_output
 
-    files = [write_csv(frame, out.path / "replays.csv", out.force)]
-    pictures: dict[str, Any] = {}
+    out.table(frame, "replays.csv")
     if _is_grid(frame):
         page = "\n".join(grid_lines(frame)) + "\n"
-        files.append(write_output(out.path / "tables.md", page.encode("utf-8"), out.force, make_folder=True))
-        grids = _grouped(replays, lambda each: _row_name(each, frame, "interval"))
-        pictures |= {f"grid_{name}": lambda some=some, name=name: grid_figure(some, name) for name, some in grids.items()}
+        out.files.append(write_output(out.path / "tables.md", page.encode("utf-8"), out.force, make_folder=True))
+        for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
+            out.picture(grid_figure(some, name), _file_name(f"grid_{name}"))
     else:
-        by_row = _grouped(replays, lambda each: _row_name(each, frame))
-        pictures["curves"] = lambda: curves(by_row, title)
+        out.picture(curves(_grouped(replays, lambda each: _row_name(each, frame)), title), "curves.png")
     for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
         if one.embedded:
             said = f"{name}, newest parts of one replay (seed {one.seed})"
-            pictures[f"map_{name}"] = lambda one=one, said=said: embedding_map(one, title=said)
-    for name, draw in pictures.items():
-        safe = re.sub(r"[^\w.=-]+", "_", name)
-        files.append(save(draw(), out.path / f"{safe}.png", force=out.force))
-    return files
+            out.picture(embedding_map(one, title=said), _file_name(f"map_{name}"))
+
+
+def _file_name(title: str) -> str:
+    return re.sub(r"[^\w.=-]+", "_", title) + ".png"
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame, *more: str) -> str:
@@ -391,17 +339,6 @@ def _row_name(replay: Replay, frame: pd.DataFrame, *more: str) -> str:
     return ", ".join([replay.name, *(word for name, word in said.items() if name in more or _varies(frame, name))])
 
 
-def _replay_costs(finished: Finished) -> dict[str, float]:
-    return {"seconds": finished.seconds, "core_seconds": sum(each.seconds for each in finished.replays)}
-
-
-def _cost_line(finished: Finished) -> str:
-    seconds, core = (duration(each) for each in _replay_costs(finished).values())
-    several = "" if len(finished.replays) == 1 else "s"
-    kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
-    return f"{len(finished.replays)} replay{several}, {core} of one core's time, in {seconds}{kept}."
-
-
 CAPTION = (
     "cost: of a part, the mean over shuffles of {cycles} parts, {reporting} of them; below it what it would be with the "
     "errors at the ends of their 95 % intervals. LB all: everything is verified. late: over the last third of a shuffle, "
@@ -410,36 +347,33 @@ CAPTION = (
     "figures here are not those that it was picked for. All shuffles play the same parts: parts that were recorded later "
     "are the clean test."
 )
-COST = click.FloatRange(0.0)
+COLUMNS = ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
+SAID = ("recipe", "verdict", "policy", "sentence", "baseline", "costs", "cycles", "choosing", "reporting")
+_COST = click.FloatRange(0.0)
+_ESCAPE = "What a bad part costs that is accepted: a stop, or worse."
 PRICES = {
-    "check": click.option("--check", type=COST, default=5.0, show_default=True, help="What one verification costs."),
-    "escape": click.option(
-        "--escape", type=COST, required=True, help="What a bad part costs that is accepted: a stop, or worse."
-    ),
-    "false_reject": click.option(
-        "--false-reject", type=COST, required=True, help="What a good part costs that is sent back."
-    ),
+    "check": click.option("--check", type=_COST, default=5.0, show_default=True, help="What one verification costs."),
+    "escape": click.option("--escape", type=_COST, required=True, help=_ESCAPE),
+    "false_reject": click.option("--false-reject", type=_COST, required=True, help="What a good part costs, sent back."),
 }
+_HALF = "Shuffles of each policy; half choose."
+COSTS = "dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30"
 
 
-@click.command(
-    epilog=example("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
-)
-@data_options()
-@gathered("prices", dict, PRICES)
+@click.command(epilog=options.example(COSTS))
+@options.data_options()
+@options.gathered("prices", dict, PRICES)
 @click.option("--unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
-@recipe_options
-@click.option("--alphas", type=Listed(ALPHA), metavar="LIST", help="To be tried.  [default: 0.5,0.1,0.05]")
-@click.option("--lower-bounds", type=Listed(LOWER_BOUND), metavar="LIST", help="To be tried.  [default: 0.8 to 0.99]")
-@click.option(
-    "--repeats", type=click.IntRange(2), default=10, show_default=True, help="Shuffles of each policy; half choose."
-)
-@seed_option
-@click.option("--cycles", type=click.IntRange(1), help="Only so many parts of each shuffle.  [default: all]")
-@n_jobs_option(-1, "Replays at a time, each in a process; -1: one a core.")
-@keep_option
-@out_option
-@json_option
+@options.recipe_options
+@_list("alphas", ALPHA, "To be tried.  [default: 0.5,0.1,0.05]")
+@_list("lower-bounds", LOWER_BOUND, "To be tried.  [default: 0.8 to 0.99]")
+@click.option("--repeats", type=click.IntRange(2), default=10, show_default=True, help=_HALF)
+@options.seed_option
+@click.option("--cycles", type=COUNT, help="Only so many parts of each shuffle.  [default: all]")
+@options.n_jobs_option(-1, "Replays at a time, each in a process; -1: one a core.")
+@options.keep_option
+@options.out_option
+@options.json_option
 def costs(
     choice: RecipeChoice,
     prices: dict[str, float],
@@ -449,11 +383,9 @@ def costs(
     source: DataChoice,
     repeats: int,
     seed: int,
-    cycles: int | None,
-    n_jobs: int,
-    keep: Path | None,
     out: OutFolder | None,
     as_json: bool,
+    **how: Any,
 ) -> None:
     """Say which alpha and LB pay.
 
@@ -462,63 +394,46 @@ def costs(
     """
     _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import ALPHAS, LOWER_BOUNDS, cost_tasks, curve_of
+    from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
     from ..experiments.replay import Contender
 
-    priced = Costs(**prices)
-    stream = Stream(range(seed, seed + repeats), cycles, n_jobs=n_jobs, keep=keep)
+    priced, stream = Costs(**prices), Stream(range(seed, seed + repeats), **how)
     tried: dict[str, Any] = {"alphas": alphas or ALPHAS, "lower_bounds": lower_bounds or LOWER_BOUNDS}
-    tasks = cost_tasks(Contender(choice.name, choice.load()), seeds=stream.seeds, cycles=cycles, **tried)
+    tasks = cost_tasks(Contender(choice.name, choice.load()), seeds=stream.seeds, cycles=stream.cycles, **tried)
     finished = _played(source.load(quiet=as_json), tasks, stream, as_json)
     seeds = [each.seed for each in finished.replays]
     if finished.interrupted and sum(seeds.count(seed) == len(tasks) / repeats for seed in set(seeds)) < 2:
         end_interrupted("Interrupted: fewer than two shuffles were finished under every policy; there is nothing to show.")
-    _report_costs(curve_of(finished.replays, priced), unit, finished.interrupted, out, as_json)
-    if finished.interrupted:
-        done = len(finished.replays)
-        end_interrupted(f"Interrupted: {done} of {len(tasks)} replays were finished; the shuffles that all have are shown.")
+    curve = curve_of(finished.replays, priced)
+    frame = curve.to_frame()
 
+    def save(out: OutFolder) -> None:
+        out.table(frame, "costs.csv")
+        out.picture(cost_picture(curve, unit=unit), "costs.png")
 
-def _report_costs(curve: CostCurve, unit: str, interrupted: bool, out: OutFolder | None, as_json: bool) -> None:
-    with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: out.listed(_save_costs(curve, unit, out)))
+    with options.written(out, save) as files:
         if as_json:
-            about = {"verb": "costs", "data": curve.dataset, "unit": unit, "interrupted": interrupted}
-            names = ("recipe", "verdict", "policy", "sentence", "baseline", "costs", "cycles", "choosing", "reporting")
-            said = {name: getattr(curve, name) for name in names}
-            write_json(about | said | {"rows": curve.to_frame().to_dict("records"), "files": files})
-            return
-        title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB"
-        every = f"{curve.baseline:.3g}"
-        first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
-        rows = [dict(zip(COST_COLUMNS, first, strict=True)), *(_cost_cells(row, curve) for row in curve.rows)]
-        show(figures(title, rows, CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)))
-        show(curve.sentence, *(f"Wrote {path}" for path in files))
+            about = {"verb": "costs", "data": curve.dataset, "unit": unit, "interrupted": finished.interrupted}
+            said = {name: getattr(curve, name) for name in SAID}
+            write_json(about | said | {"rows": frame.to_dict("records"), "files": files})
+        else:
+            title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB"
+            every = f"{curve.baseline:.3g}"
+            first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
+            cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
+            rows = [dict(zip(COLUMNS, each, strict=True)) for each in cells]
+            show(figures(title, rows, CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)))
+            show(curve.sentence, *(f"Wrote {path}" for path in files))
+    if finished.interrupted:
+        end_interrupted(f"{finished.count}; the shuffles that all have are shown.")
 
 
-def _save_costs(curve: CostCurve, unit: str, out: OutFolder) -> list[Path]:
-    from ..experiments.figures import cost_picture, save
-    from ..experiments.tables import write_csv
-
-    table = write_csv(curve.to_frame(), out.path / "costs.csv", out.force)
-    return [table, save(cost_picture(curve, unit=unit), out.path / "costs.png", force=out.force)]
-
-
-COST_COLUMNS = ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
-
-
-def _cost_cells(row: PolicyCost, curve: CostCurve) -> dict[str, str]:
-    cells = (
-        ">" if row.policy == curve.policy else "",
-        f"{row.policy.alpha:g}",
-        percent(row.policy.lower_bound, "g"),
-        f"{row.cost:.3g}" + (f"\n{row.lower:.3g} to {row.upper:.3g}" if row.certain else ""),
-        f"{row.late:.3g}",
-        percent(row.verified, ".0f"),
-        _wrong(row.bad),
-        _wrong(row.good),
-    )
-    return dict(zip(COST_COLUMNS, cells, strict=True))
+def _cells(row: PolicyCost, chosen: bool) -> tuple[str, ...]:
+    numbers = (f"{row.policy.alpha:g}", percent(row.policy.lower_bound, "g"))
+    cost = f"{row.cost:.3g}" + (f"\n{row.lower:.3g} to {row.upper:.3g}" if row.certain else "")
+    shares = (percent(row.verified, ".0f"), _wrong(row.bad), _wrong(row.good))
+    return (">" if chosen else "", *numbers, cost, f"{row.late:.3g}", *shares)
 
 
 def _wrong(error: ErrorRate) -> str:

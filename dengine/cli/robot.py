@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from .options import DataChoice
 
 SAMPLES, RATE_HZ = 1000, 500.0  # of a trace, where nothing else was asked for: two seconds
-
-
+RECORDED = ("samples", "rate_hz", "trigger")
 host_option = click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
 
 
@@ -27,9 +26,9 @@ def open_robot(address: str | None, source: DataChoice) -> UrCell:
     if not address:
         raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
     host, port = host_and_port(address)
-    how: dict[str, Any] = {"samples": source.samples or SAMPLES, "rate_hz": source.rate_hz or RATE_HZ}
-    how |= {"trigger": source.trigger} if source.trigger else {}
-    how |= {"channels": names_of(source.channel)} if source.channel else {}
+    asked: dict[str, Any] = dict(source.how)
+    how = {"samples": SAMPLES, "rate_hz": RATE_HZ} | {name: asked[name] for name in RECORDED if name in asked}
+    how |= {"channels": names_of(asked["channel"])} if "channel" in asked else {}
     return UrCell(host, port=port, **how).open()
 
 

@@ -2,41 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import click
 
 from ..errors import CellError, SettingError, percent
-from .options import (
-    DataChoice,
-    OutFolder,
-    RecipeChoice,
-    cell_options,
-    data_options,
-    example,
-    json_option,
-    must_have_mujoco,
-    out_option,
-    recipe_options,
-    scenario_option,
-    short_name,
-)
-from .output import (
-    EndAskedError,
-    certificate_record,
-    end_interrupted,
-    figures,
-    interruptible,
-    progress,
-    refusals_last,
-    show,
-    write_json,
-)
+from . import options
+from .options import DataChoice, OutFolder, RecipeChoice, short_name
+from .output import EndAskedError, certificate_record, end_interrupted, figures, interruptible, progress, show, write_json
 from .robot import host_option, open_robot, recording_line, recording_record
 
 if TYPE_CHECKING:
@@ -48,30 +25,26 @@ if TYPE_CHECKING:
     from ..store.base import Store
 
 STRETCHES = 6
+RUN = "dengine run --cell simulated --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9"
+KINDS = "simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller."
+SEED = "An integer, of a new store's engine and of the simulated cell.  [default: 0]"
 
 
-@click.command(epilog=example("dengine run --cell simulated --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9"))
+@click.command(epilog=options.example(RUN))
 @click.option(
-    "--cell",
-    "kind",
-    type=click.Choice(["simulated", "replay", "ur"]),
-    default="simulated",
-    show_default=True,
-    help="simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller.",
+    "--cell", "kind", type=click.Choice(("simulated", "replay", "ur")), default="simulated", show_default=True, help=KINDS
 )
 @host_option
-@data_options()
-@scenario_option
-@click.option("--cycles", type=click.IntRange(1), default=300, show_default=True, help="Parts to insert, one a cycle.")
+@options.data_options()
+@options.scenario_option
+@click.option("--cycles", type=options.COUNT, default=300, show_default=True, help="Parts to insert, one a cycle.")
 @click.option("--store", metavar="FILE|URL", help="Remembers everything; without one the run is forgotten.")
-@cell_options("--cell-id", product=True)
-@recipe_options
-@click.option(
-    "--seed", type=click.IntRange(0), help="An integer, of a new store's engine and of the simulated cell.  [default: 0]"
-)
+@options.cell_options("--cell-id", product=True)
+@options.recipe_options
+@click.option("--seed", type=click.IntRange(0), help=SEED)
 @click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
-@out_option
-@json_option
+@options.out_option
+@options.json_option
 def run(
     choice: RecipeChoice,
     kind: str,
@@ -94,14 +67,15 @@ def run(
     safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
     """
     if kind == "simulated":
-        must_have_mujoco()
+        options.must_have_mujoco()
     from ..engine.engine import DataEngine
 
-    recipe = choice.load() if choice.asked else None
-    with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=recipe) as engine:
+    with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=choice.if_asked()) as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](engine.store, engine.seed, source, scenario, cycles, host)
+        cell, name = CELLS[kind](
+            store=engine.store, seed=engine.seed, source=source, scenario=scenario, cycles=cycles, host=host
+        )
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes, failure = _drive(engine, cell, cycles, name, as_json)
         said: dict[str, Any] = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
@@ -156,9 +130,7 @@ def _mode_line(change: Mapping[str, Any]) -> str:
     return f"After cycle {change['cycle']}: {what}."
 
 
-def _simulated(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
-) -> tuple[Cell, str]:
+def _simulated(store: Store, seed: int, scenario: str, cycles: int, **others: Any) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
     from ..store.base import is_shared
 
@@ -169,9 +141,7 @@ def _simulated(
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
 
-def _recorded(
-    store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None
-) -> tuple[Cell, str]:
+def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> tuple[Cell, str]:
     import numpy as np
 
     from ..cells.replay import ReplayCell
@@ -195,23 +165,28 @@ def _recorded(
     return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
 
 
-def _robot(store: Store, seed: int, source: DataChoice, scenario: str, cycles: int, host: str | None) -> tuple[Cell, str]:
+def _robot(source: DataChoice, host: str | None, **others: Any) -> tuple[Cell, str]:
     return open_robot(host, source), f"robot at {host}"
 
 
-CELLS = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
+CELLS: dict[str, Callable[..., tuple[Cell, str]]] = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
 
 
 def _report(
     log: Replay, said: dict[str, Any], certificate: Certificate, cell: Cell, out: OutFolder | None, as_json: bool
 ) -> None:
+    from ..experiments.figures import run_picture
     from ..experiments.tables import retrain_line
 
     total, stretches = log.stretch(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
     worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
-    with refusals_last() as attempt:
-        files = [] if out is None else attempt(lambda: out.listed(_save(log, said["title"], out)))
+
+    def save(out: OutFolder) -> None:
+        out.table(log.to_frame().reset_index(), "run.csv")
+        out.picture(run_picture(log, said["title"]), "run.png")
+
+    with options.written(out, save) as files:
         if as_json:
             counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording, "files": files}
             retrains = {"retrains": log.retrains, "retrain_max_s": worst}
@@ -251,11 +226,3 @@ def _cells(row: dict[str, Any], timed: bool) -> dict[str, str]:
     cells |= {title: str(row[name]) for title, name in names.items()}
     rate = row["parts_per_hour"]
     return cells | ({"good/h": "-" if rate is None else f"{rate:.1f}"} if timed else {})
-
-
-def _save(log: Replay, title: str, out: OutFolder) -> list[Path]:
-    from ..experiments.figures import run_picture, save
-    from ..experiments.tables import write_csv
-
-    table = write_csv(log.to_frame().reset_index(), out.path / "run.csv", out.force)
-    return [table, save(run_picture(log, title), out.path / "run.png", force=out.force)]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import SettingError
-from .options import FILE, RecipeChoice, cell_options, example, recipe_options
+from . import options
+from .options import COUNT, FILE, RecipeChoice
 from .robot import host_and_port
 
 if TYPE_CHECKING:
@@ -23,57 +24,39 @@ if TYPE_CHECKING:
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
+SPEED, DEADLINE, PORT = click.FloatRange(0.01, 1000.0), click.FloatRange(0.001, 60.0), click.IntRange(1, 65535)
+DEMO = "Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."
+NAMED = "A name by which the server is called, beside its own."
+WAITS = "Seconds that a decision may wait in line; then it is verify, and recorded so."
+RATE = "Requests a second of one client; 0: any."
 
 
-@click.command(epilog=example("dengine serve --store cell.db --port 8000"))
+@click.command(epilog=options.example("dengine serve --store cell.db --port 8000"))
 @click.option("--store", metavar="FILE|URL", help="Remembers everything; made where there is none.")
-@click.option(
-    "--demo", is_flag=True, help="Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."
-)
-@click.option(
-    "--speed", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, help="Parts a second of --demo."
-)
-@cell_options("--cell-id", product=True)
+@click.option("--demo", is_flag=True, help=DEMO)
+@click.option("--speed", type=SPEED, default=1.0, show_default=True, help="Parts a second of --demo.")
+@options.cell_options("--cell-id", product=True)
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
 @click.option("--token-file", type=FILE, help="A file, its owner's alone, with the token that every request has to say.")
 @click.option("--cert", type=FILE, help="For TLS: the certificate, with its chain, in PEM.")
 @click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
-@click.option(
-    "--allow-host",
-    "allow_hosts",
-    multiple=True,
-    metavar="NAME",
-    help="A name by which the server is called, beside its own.",
-)
-@click.option(
-    "--deadline",
-    type=click.FloatRange(0.001, 60.0),
-    default=0.5,
-    show_default=True,
-    metavar="S",
-    help="Seconds that a decision may wait in line; then it is verify, and recorded so.",
-)
-@click.option(
-    "--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help="Requests a second of one client; 0: any."
-)
+@click.option("--allow-host", "allow_hosts", multiple=True, metavar="NAME", help=NAMED)
+@click.option("--deadline", type=DEADLINE, default=0.5, show_default=True, metavar="S", help=WAITS)
+@click.option("--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help=RATE)
 @click.option("--largest", type=click.IntRange(1024), default=2**20, show_default=True, help="Bytes of a request's body.")
-@click.option("--connections", type=click.IntRange(1), default=100, show_default=True, help="Connections at once.")
+@click.option("--connections", type=COUNT, default=100, show_default=True, help="Connections at once.")
 @click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
-@click.option(
-    "--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as a robot's program speaks it."
-)
+@click.option("--xmlrpc/--no-xmlrpc", default=True, show_default=True, help="XML-RPC at /RPC2, as robots' programs speak.")
 @click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
-@click.option(
-    "--opcua", type=click.IntRange(1, 65535), metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840."
-)
+@click.option("--opcua", type=PORT, metavar="PORT", help="Speak OPC UA there, as PLC and SCADA do; 4840.")
 @click.option("--opcua-cert", type=FILE, help="Its certificate, in PEM.  [default: --cert]")
 @click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
 @click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
-@click.option("--samples", type=click.IntRange(1), default=1000, show_default=True, help="Of a recorded trace.")
+@click.option("--samples", type=COUNT, default=1000, show_default=True, help="Of a recorded trace.")
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
-@recipe_options
+@options.recipe_options
 def serve(
     choice: RecipeChoice,
     store: str | None,
@@ -102,7 +85,7 @@ def serve(
     from ..serve.server import serve as serve_cell
 
     interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
-    recipe = choice.load() if choice.asked else None
+    recipe = choice.if_asked()
     with ExitStack() as stack:
         if demo:
             if store is not None and Path(store).exists():

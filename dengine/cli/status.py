@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..errors import percent
-from .options import cell_options, example, force_option, json_option, out_file_option
+from . import options
 from .output import certificate_record, duration, facts, interruptible, show, when, write_json
 
 if TYPE_CHECKING:
@@ -33,23 +34,19 @@ STOPS = {
 SHADOW = "all of what it is certain of: the shadow mode, in which it only says what it would have done"
 
 
-@click.command(epilog=example("dengine status engine.db --last 500"))
-@click.argument("store", metavar="STORE")
-@cell_options()
-@click.option(
-    "--last", type=click.IntRange(1), default=500, show_default=True, help="The newest so many decisions, looked at apart."
-)
-@click.option(
-    "--watch",
-    type=click.FloatRange(0.1),
-    is_flag=False,
-    flag_value=5.0,
-    metavar="[SECONDS]",
-    help="Show it again every so many seconds, 5 if none are given, until Ctrl-C; after STORE.",
-)
-@out_file_option
-@force_option
-@json_option
+LAST = "The newest so many decisions, looked at apart."
+WATCH = "Show it again every so many seconds, 5 if none are given, until Ctrl-C; after STORE."
+WATCHING: dict[str, Any] = {"type": click.FloatRange(0.1), "is_flag": False, "flag_value": 5.0, "metavar": "[SECONDS]"}
+
+
+@click.command(epilog=options.example("dengine status engine.db --last 500"))
+@options.store_argument
+@options.cell_options()
+@click.option("--last", type=options.COUNT, default=500, show_default=True, help=LAST)
+@click.option("--watch", **WATCHING, help=WATCH)
+@options.out_file_option
+@options.force_option
+@options.json_option
 def status(store: str, last: int, watch: float | None, out: Path | None, force: bool, as_json: bool) -> None:
     """Say how an engine is doing, and what its store holds.
 
@@ -70,23 +67,17 @@ def status(store: str, last: int, watch: float | None, out: Path | None, force: 
         show(_cells_table(store, cells), "Name one of them, --cell NAME, and how it is doing is shown.")
         return
     found = _read(store, last, out)
+    files = [] if out is None else [out]
     if as_json:
-        files = [] if out is None else [out]
         from ..records import plain
 
         said = plain(found) | {"certificate": certificate_record(found.certificate)}
         write_json({"verb": "status", "store": store} | said | {"files": files})
         return
-    show(*_tables(store, found), *([] if out is None else [f"Wrote {out}"]))
-    if watch is not None:
-        _watch(store, last, out, watch)
-
-
-def _watch(store: str, last: int, out: Path | None, seconds: float) -> None:
-    """Show it again and again; Ctrl-C is how it ends, so that is no failure."""
-    with interruptible() as asked:
-        while True:
-            end = time.monotonic() + seconds
+    show(*_tables(store, found), *(f"Wrote {path}" for path in files))
+    with interruptible() as asked:  # Ctrl-C is how watching ends, so that is no failure
+        while watch is not None:
+            end = time.monotonic() + watch
             while (left := end - time.monotonic()) > 0:
                 if asked():
                     return
@@ -103,8 +94,7 @@ def _read(store: str, last: int, out: Path | None) -> Status:
     from ..history.status import status as status_of
     from ..store.base import open_store
 
-    opened = open_store(store, must_exist=True)
-    try:
+    with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
         if out is not None:
             from ..experiments.figures import save
@@ -113,8 +103,6 @@ def _read(store: str, last: int, out: Path | None) -> Status:
             title = f"{found.cell}: {found.recipe.name}"
             save(status_picture(course(opened, found.recipe, last), title), out, force=True)
         return found
-    finally:
-        opened.close()
 
 
 def _several(store: str) -> list[CellSummary]:
@@ -130,14 +118,17 @@ def _several(store: str) -> list[CellSummary]:
 
 
 def _cells_table(store: str, found: list[CellSummary]) -> Any:
-    owned = any(cell.owner for cell in found)
-    columns = ("cell", "product", "decisions", "labels", "version", "last seen (UTC)", *(["owner"] if owned else []))
-    rows = []
-    for cell in found:
-        counts = (f"{cell.decisions:,}", f"{cell.labels:,}", "-" if cell.version is None else str(cell.version))
-        seen = when(cell.last_seen, "%Y-%m-%d %H:%M:%S")
-        rows.append((cell.cell_id, cell.product or "-", *counts, seen, *([cell.owner or "-"] if owned else [])))
-    return facts(store, rows, columns)
+    columns: dict[str, Callable[[CellSummary], str]] = {
+        "cell": lambda cell: cell.cell_id,
+        "product": lambda cell: cell.product or "-",
+        "decisions": lambda cell: f"{cell.decisions:,}",
+        "labels": lambda cell: f"{cell.labels:,}",
+        "version": lambda cell: "-" if cell.version is None else str(cell.version),
+        "last seen (UTC)": lambda cell: when(cell.last_seen, "%Y-%m-%d %H:%M:%S"),
+    }
+    if any(cell.owner for cell in found):
+        columns["owner"] = lambda cell: cell.owner or "-"
+    return facts(store, [tuple(cell_of(each) for cell_of in columns.values()) for each in found], tuple(columns))
 
 
 def _tables(store: str, found: Status) -> list[Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .options import cell_options, example, json_option
+from . import options
 from .output import imported_line, progress, show, write_json
 
 if TYPE_CHECKING:
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 SHOWN = 20  # faults that a screen shows
 
 
-@click.command(epilog=example("dengine verify engine.db"))
-@click.argument("store", metavar="STORE")
+@click.command(epilog=options.example("dengine verify engine.db"))
+@options.store_argument
 @click.option("--cell", metavar="ID", help="Of this cell alone.  [default: of all cells]")
 @click.option(
     "--expect",
     metavar="DIGEST",
     help="A digest that an earlier check showed: the history must still hold it, or it was cut off or made anew.",
 )
-@json_option
+@options.json_option
 @click.pass_context
 def verify(context: click.Context, store: str, cell: str | None, expect: str | None, as_json: bool) -> None:
     """Check that a store's history is what was written.
@@ -60,12 +60,12 @@ def _lines(report: HistoryReport) -> list[str]:
     return [*lines, f"Faults: {len(report.faults)}. This history is not as it was written."]
 
 
-@click.command("import-labels", epilog=example("dengine import-labels cell.csv --store engine.db"))
+@click.command("import-labels", epilog=options.example("dengine import-labels cell.csv --store engine.db"))
 @click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
 @click.option("--any-model", is_flag=True, help="Take a journal of a model that the store does not know as its export.")
-@cell_options()
-@json_option
+@options.cell_options()
+@options.json_option
 def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> None:
     """Take a cell program's labels back into the store.
 

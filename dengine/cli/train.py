@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .options import DataChoice, RecipeChoice, cell_options, data_options, example, json_option, recipe_options, short_name
+from . import options
+from .options import DataChoice, RecipeChoice, short_name
 from .output import Asked, EndAskedError, end_interrupted, imported_line, interruptible, progress, show, write_json
 
 if TYPE_CHECKING:
@@ -16,23 +17,17 @@ if TYPE_CHECKING:
     from ..recipe import Recipe
     from ..records import RetrainReport
 
-RETRAINS = 10
+WITHIN = "At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one."
 
 
-@click.command(epilog=example("dengine train --data insertion --store engine.db --reducer conv"))
-@data_options(None)
+@click.command(epilog=options.example("dengine train --data insertion --store engine.db --reducer conv"))
+@options.data_options(None)
 @click.option("--store", required=True, metavar="FILE|URL", help="Where the engine remembers; made if need be.")
-@cell_options(product=True)
-@recipe_options
+@options.cell_options(product=True)
+@options.recipe_options
 @click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
-@click.option(
-    "--retrains",
-    type=click.IntRange(1),
-    default=RETRAINS,
-    show_default=True,
-    help="At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one.",
-)
-@json_option
+@click.option("--retrains", type=options.COUNT, default=10, show_default=True, help=WITHIN)
+@options.json_option
 def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, retrains: int, as_json: bool) -> None:
     """Import labelled traces into a store and train on them.
 
@@ -40,7 +35,12 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    dataset, recipe = _as_before(source, store).load(quiet=as_json), choice.load() if choice.asked else None
+    from ..datasets.importing import form_in
+    from ..experiments.tables import retrain_line
+
+    before = form_in(store, source.data)  # of what the store has, where no other form was asked for
+    dataset = replace(source, how=before | source.how).load(quiet=as_json)
+    recipe = choice.if_asked()
     with interruptible() as asked:
         imported = _import(dataset, store, recipe, seed, as_json, asked)
         trained = _train(store, retrains, as_json, asked)
@@ -48,19 +48,18 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
         about = {"verb": "train", "store": store, "interrupted": trained.interrupted, "faults": dataset.faults}
         write_json(about | {"import": imported, "retrains": trained.reports})
     else:
-        _show(imported, trained, store)
+        last = trained.reports[-1].version
+        answers = f"Version {last} of {trained.reducer} answers. {retrain_line(trained.reports)}"
+        kind = "a used store" if imported.resumed else "a new store"
+        lines = (
+            answers if last else "No version answers yet: every part is verified.",
+            f"{store} holds {trained.labels} labels.",
+        )
+        show(imported_line(imported, f"{store}, {kind}"), *lines)
     if trained.interrupted:
         end_interrupted(f"Interrupted after {len(trained.reports)} of at most {retrains} retrains; they are in {store}.")
     if not trained.reports[-1].accepted:
         raise click.ClickException(f"The last retrain was {trained.reports[-1].reason}.")
-
-
-def _as_before(source: DataChoice, store: str) -> DataChoice:
-    """The choice, in the form of what the store has, where no other was asked for."""
-    from ..datasets.importing import form_in
-
-    form = form_in(store, source.data)
-    return replace(source, **{name: value for name, value in form.items() if getattr(source, name) is None})
 
 
 @dataclass(frozen=True)
@@ -117,17 +116,3 @@ def _train(store: str, retrains: int, quiet: bool, asked: Asked) -> Trained:
         except EndAskedError:
             interrupted = True
         return Trained(reports, short_name(engine.recipe.name), engine.store.status()["labels"], interrupted)
-
-
-def _show(imported: ImportReport, trained: Trained, store: str) -> None:
-    from ..experiments.tables import retrain_line
-
-    kind = "a used store" if imported.resumed else "a new store"
-    version = trained.reports[-1].version
-    show(
-        imported_line(imported, f"{store}, {kind}"),
-        f"Version {version} of {trained.reducer} answers. {retrain_line(trained.reports)}"
-        if version
-        else "No version answers yet: every part is verified.",
-        f"{store} holds {trained.labels} labels.",
-    )

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import Result
 
 from dengine import DataEngine, Dataset
 from dengine.cli.output import WIDE
@@ -16,13 +15,7 @@ from dengine.datasets import Fault
 from dengine.experiments.figures import save
 from dengine.experiments.pictures import data_picture
 from dengine.experiments.survey import Spread, survey
-from tests.support.command_line import dengine, document
-
-
-def well(*words: object) -> Result:
-    result = dengine(*words)
-    assert result.exit_code == 0, result.output
-    return result
+from tests.support.command_line import dengine, document, well
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +74,9 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
     assert "all 77 traces were there from an earlier import" in again.stdout
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
-        files = [path for path in sorted(folder.iterdir()) if len(path.read_bytes()) > 10**5][:3]
-        lengths = set()
-        for path in files:
-            frame = pd.read_csv(path)
-            lengths.add(len(frame))
-            assert engine.decide(frame).embedding is not None
-        assert len(lengths) > 1
+        frames = [pd.read_csv(path) for path in sorted(folder.iterdir()) if len(path.read_bytes()) > 10**5][:3]
+        assert all(engine.decide(frame).embedding is not None for frame in frames)
+        assert len({len(frame) for frame in frames}) > 1
     other = dengine("train", "--data", folder, "--channel", "FX_Base", "--store", store)
     assert other.exit_code == 1
     assert "Expected the channels FZ_Base, got FX_Base" in other.stderr
@@ -119,6 +108,20 @@ def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Da
     said = well("data", tmp_path / "wide.csv").stdout
     assert said.count("- wide.csv, line ") == 10
     assert "- and 3 more" in said
+
+
+def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_path: Path) -> None:
+    names, some = sorted(folder.iterdir(), key=lambda path: path.stat().st_size), tmp_path / "some"
+    some.mkdir()
+    words, found = ("train", "--data", some, "--store", tmp_path / "a.db"), []
+    for files, asked in ((names[50:], ("--reducer", "pca")), (names[:50], ())):  # when the others come, the median falls
+        for path in files:
+            (some / path.name).write_bytes(path.read_bytes())
+        found.append(document(*words, *asked)["import"])
+    assert (found[0]["imported"], found[1]["known"], found[1]["imported"]) == (30, 30, 47)
+    wrong = dengine(*words, "--samples", 900)
+    assert wrong.exit_code == 1
+    assert "samples=" in wrong.output
 
 
 # ------------------------------------------------------------------------------------------------------- the survey
@@ -162,27 +165,10 @@ def test_lengths_and_rates_are_those_of_the_recordings(make_data: Callable[..., 
     assert (found.lengths, found.rates) == (Spread(58, 60, 66), Spread(499, 500, 501))
 
 
-@pytest.mark.parametrize("channels", [1, 4])
-@pytest.mark.parametrize("n", [1, 6, 60])
+@pytest.mark.parametrize(("n", "channels"), [(1, 1), (6, 4), (60, 4)])
 def test_a_picture_is_drawn_of_any_data(make_data: Callable[..., Dataset], tmp_path: Path, n: int, channels: int) -> None:
     data = make_data(n, samples=40, channels=channels)
     data.X[0, ..., 3] = np.nan
     figure = data_picture(data, "x")
     assert len(figure.axes) == min(channels, 3) + 2
     assert save(figure, tmp_path / "data.png").stat().st_size > 5_000
-
-
-def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_path: Path) -> None:
-    names, some = sorted(folder.iterdir(), key=lambda path: path.stat().st_size), tmp_path / "some"
-    some.mkdir()
-    for path in names[50:]:  # the longer ones first: the median falls when the others come
-        (some / path.name).write_bytes(path.read_bytes())
-    first = document("train", "--data", some, "--store", tmp_path / "a.db", "--reducer", "pca")
-    for path in names[:50]:
-        (some / path.name).write_bytes(path.read_bytes())
-    again = document("train", "--data", some, "--store", tmp_path / "a.db")
-    assert (first["import"]["imported"], again["import"]["known"]) == (30, 30)
-    assert again["import"]["imported"] == 47
-    wrong = dengine("train", "--data", some, "--store", tmp_path / "a.db", "--samples", 900)
-    assert wrong.exit_code == 1
-    assert "samples=" in wrong.output

@@ -1,22 +1,21 @@
 """`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
 
 import os
-import re
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
+from dengine import Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
 from dengine.cli.history import WIDEST
 from dengine.cli.output import WIDE
 from dengine.decision.intervals import wilson_interval
-from dengine.history.status import bad_accepts, course, status
+from dengine.history.status import Status, bad_accepts, course, status
+from dengine.store import Store
 from dengine.store.records import Outcomes
-from tests.support.command_line import dengine, document, succeed
+from tests.support.command_line import dengine, document, said, succeed, well
+from tests.support.driving import drive
 
 NOTHING = Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
 
@@ -38,9 +37,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for _ in engine.run(ReplayCell(data), 700):
             pass
     return path
-
-
-# --------------------------------------------------------------------------------------------------------------- history
 
 
 def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(store: Path) -> None:
@@ -68,21 +64,19 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("verb", "words", "expected"),
     [
-        (["--since", "yesterday"], "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'"),
-        (["--action", "pass"], "'pass' is not one of"),
-        (["--reason", "why"], "'why' is not one of"),
-        (["--last", "0"], "0 is not in the range"),
+        ("history", "--since yesterday", "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'"),
+        ("history", "--action pass", "'pass' is not one of"),
+        ("history", "--reason why", "'why' is not one of"),
+        ("history", "--last 0", "0 is not in the range"),
+        ("status", "--watch 1 --json", "--watch and --json exclude each other"),
     ],
 )
-def test_a_wrong_filter_is_a_wrong_call(words: list[str], said: str, store: Path) -> None:
-    result = dengine("history", store, *words)
+def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, store: Path) -> None:
+    result = dengine(verb, store, *words.split())
     assert result.exit_code == 2
-    assert said in result.stderr
-
-
-# --------------------------------------------------------------------------------------------------------------- explain
+    assert expected in result.stderr
 
 
 def ids(store: Path) -> dict[str, str]:
@@ -123,9 +117,6 @@ def test_an_unknown_decision_is_one_line_that_says_where_the_ids_are(store: Path
     assert len(result.stderr.strip().splitlines()) == 1
 
 
-# ---------------------------------------------------------------------------------------------------------------- status
-
-
 def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
     found = document("status", store, "--last", 200)
     newest, ever = found["newest"], found["ever"]
@@ -153,8 +144,8 @@ def test_status_is_a_table_of_80_columns_and_a_picture(store: Path, tmp_path: Pa
     out = tmp_path / "status.png"
     shown = succeed("status", store, "--last", 200, "--out", out)
     assert max(map(len, shown.replace(str(out), "").splitlines())) <= WIDE
-    for said in ("last 200", "since birth", "labels waiting", "way to an alarm", "of them bad"):
-        assert said in shown
+    for words in ("last 200", "since birth", "labels waiting", "way to an alarm", "of them bad"):
+        assert words in shown
     assert out.read_bytes().startswith(b"\x89PNG")
     opened = open_store(store)
     drawn = course(opened, Recipe.from_toml(opened.settings()["recipe"]), 200)
@@ -196,22 +187,19 @@ def test_dropped_retrains_are_counted_with_their_reasons(tmp_path: Path) -> None
         assert found.ever.unlabelled == 1
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Ctrl-C is another signal there")
-def test_watch_redraws_until_ctrl_c_and_ends_cleanly(store: Path) -> None:
-    command = [sys.executable, "-m", "dengine", "status", str(store), "--watch", "0.2"]
-    env = os.environ | {"PYTHONUNBUFFERED": "1"}
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env) as process:
-        assert process.stdout is not None
-        seen = ""
-        while seen.count("how it is doing") < 2:
-            line = process.stdout.readline()
-            assert line, process.communicate()
-            seen += line
-        process.send_signal(signal.SIGINT)
-        rest, error = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert error == ""
-    assert re.search(r"worst retrain", seen + rest)
+def test_watch_redraws_until_ctrl_c_and_ends_cleanly(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[int] = []
+
+    def drawn(store: Store, last: int, watching: bool) -> Status:
+        shown.append(last)
+        if len(shown) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return status(store, last, watching=watching)
+
+    monkeypatch.setattr("dengine.history.status.status", drawn)
+    result = well("status", store, "--watch", "0.1")
+    assert result.stdout.count("how it is doing") == len(shown) == 2
+    assert result.stderr == ""
 
 
 def test_a_password_is_never_shown() -> None:
@@ -222,5 +210,27 @@ def test_a_password_is_never_shown() -> None:
         assert "secret" not in result.output + result.stderr
 
 
-def test_watch_and_json_exclude_each_other(store: Path) -> None:
-    assert dengine("status", store, "--watch", "--json").exit_code == 2
+def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(stream: Dataset, tmp_path: Path) -> None:
+    store, recipe = tmp_path / "engine.db", Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(0.1, 0.9))
+    with DataEngine(recipe=recipe, store=store) as engine:
+        drive(engine, stream, 0, 30)
+        assert "would accept │ none was checked" in " ".join(succeed("status", store).split())
+        engine.set_shadow(True)
+        cycles = drive(engine, stream, 30, 300)
+    certain = [cycle for cycle in cycles if cycle.decision.audit]
+    told = document("status", store)
+    assert told["shadow"] is True
+    for name, action in (("would_accept", Action.ACCEPT), ("would_reject", Action.REJECT)):
+        true = [cycle.success for cycle in certain if cycle.decision.predicted is action]
+        wrong = true.count(action is Action.REJECT)
+        span = told["ever"][name]
+        lower, upper = wilson_interval(len(true) - wrong, wrong, 0.05)  # whatever the policy's alpha
+        assert (span["n"], span["wrong"]) == (len(true), wrong)
+        assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
+    accept, certified = told["ever"]["would_accept"], told["certificate"]
+    assert accept["n"] > 50
+    assert accept["verdict"] == "kept"
+    assert certified["accepted"]["shadowed"] is True
+    assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
+    assert "parts that the model would reject, each of which was" in certified["sentence_on_rejects"]
+    assert "the shadow mode, in which it only says what" in said("status", store)

@@ -12,16 +12,25 @@ def dengine(*words: object) -> Result:
     return CliRunner().invoke(main, [str(word) for word in words])
 
 
-def succeed(*words: object) -> str:
-    """What a verb that ends well says."""
+def well(*words: object) -> Result:
+    """A verb that must end well."""
     result = dengine(*words)
     assert result.exit_code == 0, result.output
-    return result.stdout
+    return result
+
+
+def succeed(*words: object) -> str:
+    """What a verb that ends well prints."""
+    return well(*words).stdout
+
+
+def said(*words: object) -> str:
+    """The same in one line, without the lines of tables."""
+    return " ".join(succeed(*words).replace("│", " ").replace("┃", " ").split())
 
 
 def document(*words: object) -> dict:
     """Its JSON document, and nothing else."""
-    result = dengine(*words, "--json")
-    assert result.exit_code == 0, result.output
+    result = well(*words, "--json")
     assert result.stderr == ""
     return json.loads(result.stdout)
