@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import percent
-from ..records import plain
 from . import options
 from .options import Known, Naming
 from .output import duration, facts, show, when, write_json
@@ -82,6 +81,8 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
         others = beside(opened, since, asked["until"]) if events else None
     if as_json:
+        from ..records import plain
+
         listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
         decisions = [plain(past) | {"label": past.label} for past in found]
         write_json({"verb": "history", "store": store, "decisions": decisions} | listed)
