@@ -6,12 +6,10 @@ sample that is null is one that the sensor did not give, and a number that is no
 
 from __future__ import annotations
 
-import json
 import logging
 import re
-from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import fields
-from html import escape
 from http import HTTPStatus
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
@@ -39,11 +37,31 @@ from ..store.records import StoredDecision
 from .service import Told
 
 log = logging.getLogger("dengine")
-RETRY_AFTER = 1  # seconds
-PROBLEM = "application/problem+json"
-JSON, RAW, MSGPACK = "application/json", "application/octet-stream", "application/msgpack"
 T = TypeVar("T")
 Json = dict[str, Any]
+JSON, RAW, MSGPACK = "application/json", "application/octet-stream", "application/msgpack"
+PROBLEM = "application/problem+json"
+PROBLEMS = {
+    400: "No JSON or MessagePack, or a header that makes no sense.",
+    401: "The token is missing or another.",
+    403: "A web page of another site asks.",
+    404: "There is no such path, or no such decision.",
+    405: "The path has no such method.",
+    408: "The request's body did not come in time.",
+    409: "The id is another trace's, or the label is against what was reported first.",
+    413: "The request is larger than the server takes.",
+    415: "The body is of a type that is not read here.",
+    421: "The server was called by a name that is not its own.",
+    422: "The body says something that cannot be: what was expected stands in detail.",
+    429: "Too many requests of one client; Retry-After says when.",
+    500: "The server failed; its log says why.",
+    503: "Too many wait, the store is away, or the server is closing; Retry-After says when.",
+}
+LATER, EVERYWHERE = (429, 503), (401, 421, 429, 500)
+RETRY_AFTER = 1  # seconds
+DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
+STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
+FIELD = re.compile(r"(?:^ *|  )((?:\w+, )*\w+) : ", re.MULTILINE)  # "name, name : what it is", in a docstring
 
 # What is asked
 
@@ -95,10 +113,6 @@ class Refusal(Exception):  # noqa: N818  # it is an answer, not a fault
     def __init__(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(detail)
         self.status, self.detail, self.headers = status, detail, dict(headers or {})
-
-
-DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
-STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
 
 
 def media_type(request: Request) -> str:
@@ -186,26 +200,13 @@ def _samples(value: list[Any]) -> NDArray[Any]:
 # What is answered
 
 
-def fields_of(*records: type, without: Iterable[str] = (), **more: Any) -> dict[str, Any]:
-    """The fields of records by name, with their types as JSON has them: a number that is not finite is null."""
-    hints = {field.name: get_type_hints(each)[field.name] for each in records for field in fields(each)}
-    hints |= {name: float | None for name, hint in hints.items() if hint is float}
-    return {name: hint for name, hint in (hints | more).items() if name not in without}
-
-
-TRACE = list[list[float | None]]
-HIDDEN = ("content_hash",)  # JavaScript has no integers of 64 bits
-DECISION = fields_of(Decision)
-OF_STORE = fields_of(StoredDecision, without=("decision", "trace", *HIDDEN))
-STORED = DECISION | OF_STORE
-STATUS = fields_of(Status, without=("settings", "retrains"))  # `ever.retrains` counts these
-LINE = {"waiting": int, "late": int, "busy": int, "deadline": float}  # of the service
-
-
-def answer_type(name: str, about: str, kinds: Mapping[str, Any], *documented: type, **optional: Any) -> type[Struct]:
-    """The type of an answer, for the document.  documented : records whose docstrings say what the fields are."""
-    doc = "\n".join([about, *(each.__doc__ or "" for each in documented)])
-    members: list[Any] = [*kinds.items(), *((key, kind, UNSET) for key, kind in optional.items())]
+def _answer(name: str, about: str, *records: type, optional: Json | None = None, **more: Any) -> type[Struct]:
+    """The type of an answer: the fields of records, where a number that is not finite is null, and more of them."""
+    kinds = {field.name: get_type_hints(each)[field.name] for each in records for field in fields(each)}
+    kinds = {key: float | None if kind is float else kind for key, kind in kinds.items() if key not in HIDDEN} | more
+    members: list[Any] = [(key, kind) for key, kind in kinds.items() if key not in (optional or {})]
+    members += [(key, kind, UNSET) for key, kind in (optional or {}).items()]
+    doc = "\n".join([about, *(each.__doc__ or "" for each in records)])
     return msgspec.defstruct(name, members, namespace={"__doc__": doc}, kw_only=True)
 
 
@@ -230,105 +231,82 @@ class Problem(Struct):
     action: Action = Action.VERIFY
 
 
+# JavaScript has no integers of 64 bits, a stored decision's fields are the decision's too, `ever.retrains` counts those.
+HIDDEN = ("content_hash", "decision", "settings", "retrains")
 LATE = (
     "late : deadline exceeded in the queue; recorded as VERIFY.  seconds : from the request to the answer, in the server."
 )
-ABOUT_LINE = (
+LINE = (
     "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
     "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at."
 )
-PastAnswer = answer_type("PastDecision", "A decision as it was recorded.", STORED, Decision, StoredDecision)
-ANSWERS: dict[str, Any] = {
-    "Answer": answer_type(
-        "Answer", f"A decision, as it is recorded.\n{LATE}", DECISION | {"late": bool, "seconds": float}, Decision
-    ),
-    "Told": answer_type("Told", "The label is on the disk.", fields_of(Told), Told),
-    "Decision": answer_type("Decision", "A decision with its label.", STORED, Decision, StoredDecision, trace=TRACE),
-    "Decisions": answer_type("Decisions", "Newest first.", {"decisions": list[PastAnswer]}),  # type: ignore[valid-type]  # made above
-    "Status": answer_type("Status", f"{Status.__doc__}\n{ABOUT_LINE}", STATUS | LINE | {"alarm": str}),
+IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float}
+TRACE = {"trace": list[list[float | None]]}
+ANSWERS: dict[str, type[Struct]] = {
+    "Answer": _answer("Answer", f"A decision, as it is recorded.\n{LATE}", Decision, late=bool, seconds=float),
+    "Told": _answer("Told", "The label is on the disk.", Told),
+    "Decision": _answer("Decision", "A decision with its label.", Decision, StoredDecision, optional=TRACE),
+    "Status": _answer("Status", LINE, Status, **IN_LINE, alarm=str),
     "Health": Health,
     "Problem": Problem,
 }
+ANSWERS["Decisions"] = _answer("Decisions", "Newest first.", decisions=list[ANSWERS["Decision"]])  # type: ignore[misc]  # made above
 
 
-def record(value: object, names: Iterable[str], **more: Any) -> Json:
-    """Some fields of a record, to be answered."""
-    return {name: getattr(value, name) for name in names} | more
-
-
-def stored_record(stored: StoredDecision, **more: Any) -> Json:
-    """A decision with its label, to be answered."""
-    return record(stored.decision, DECISION) | record(stored, OF_STORE, **more)
+def answer(name: str, *records: object, **more: Any) -> Struct:
+    """An answer out of records' fields and properties; of two that have one, the later's."""
+    names = ANSWERS[name].__struct_fields__
+    return ANSWERS[name](**{key: getattr(each, key) for each in records for key in names if hasattr(each, key)} | more)
 
 
 def answered(body: Any, status: int = 200, headers: Mapping[str, str] | None = None, kind: str = JSON) -> Response:
     """A JSON answer; a number that is not finite is null."""
-    return Response(msgspec.json.encode(body, enc_hook=_encoded), status, headers, kind)
 
+    def encoded(value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
-def _encoded(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+    return Response(msgspec.json.encode(body, enc_hook=encoded), status, headers, kind)
 
 
 def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) -> Response:
     """The answer of a request that is not served. Whatever is wrong, a part without a decision is verified."""
-    said = dict(headers or {})
-    if status in LATER:
-        said.setdefault("Retry-After", str(RETRY_AFTER))
+    said = ({"Retry-After": str(RETRY_AFTER)} if status in LATER else {}) | dict(headers or {})
     line = " ".join(without_password(detail).split())
     return answered(Problem(f"/docs#problem-{status}", HTTPStatus(status).phrase, status, line), status, said, PROBLEM)
 
 
 def _refused(request: Request, error: Any) -> Response:
-    return problem(error.status, error.detail, error.headers)
-
-
-def _not_there(request: Request, error: Any) -> Response:
-    said = {404: "Expected one of the paths in /openapi.json, got another.", 405: "Expected another method on this path."}
-    return problem(error.status_code, said.get(error.status_code, str(error.detail)), error.headers)
-
-
-def _failed(request: Request, error: Exception) -> Response:
+    """What is not served, by the nearest class of what was raised."""
+    if isinstance(error, Refusal):
+        return problem(error.status, error.detail, error.headers)
+    if isinstance(error, HTTPException):
+        said = {
+            404: "Expected one of the paths in /openapi.json, got another.",
+            405: "Expected another method on this path.",
+        }
+        return problem(error.status_code, said.get(error.status_code, str(error.detail)), error.headers)
+    if isinstance(error, ClientDisconnect):
+        return problem(400, "Expected the whole of the request.")  # which nobody reads
+    for kind, status in STATUSES.items():
+        if isinstance(error, kind):
+            return problem(status, str(error))
     log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
     return problem(500, "The server failed at this request; its log says why.")
 
 
-def _status(status: int, detail: str = "") -> Callable[[Request, Exception], Response]:
-    return lambda request, error: problem(status, detail or str(error))
-
-
-HANDLERS: dict[type[Exception], Callable[[Request, Any], Response]] = {  # the nearest class counts
-    Refusal: _refused,
-    UnknownDecisionError: _status(404),
-    ReportConflictError: _status(409),
-    TraceConflictError: _status(409),
-    BusyError: _status(503),
-    StoreError: _status(503),
-    DengineError: _status(422),
-    ClientDisconnect: _status(400, "Expected the whole of the request."),  # which nobody reads
-    HTTPException: _not_there,
-    Exception: _failed,
+STATUSES: dict[type[Exception], int] = {  # the first that fits
+    UnknownDecisionError: 404,
+    ReportConflictError: 409,
+    TraceConflictError: 409,
+    BusyError: 503,
+    StoreError: 503,
+    DengineError: 422,
 }
+HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
+    (Refusal, HTTPException, ClientDisconnect, *STATUSES, Exception), _refused
+)
 
 # The OpenAPI document
-
-PROBLEMS = {
-    400: "No JSON or MessagePack, or a header that makes no sense.",
-    401: "The token is missing or another.",
-    403: "A web page of another site asks.",
-    404: "There is no such path, or no such decision.",
-    405: "The path has no such method.",
-    408: "The request's body did not come in time.",
-    409: "The id is another trace's, or the label is against what was reported first.",
-    413: "The request is larger than the server takes.",
-    415: "The body is of a type that is not read here.",
-    421: "The server was called by a name that is not its own.",
-    422: "The body says something that cannot be: what was expected stands in detail.",
-    429: "Too many requests of one client; Retry-After says when.",
-    500: "The server failed; its log says why.",
-    503: "Too many wait, the store is away, or the server is closing; Retry-After says when.",
-}
-LATER, EVERYWHERE, OF_BODIES = (429, 503), (401, 421, 429, 500), (400, 403, 408, 413, 415, 422)
 
 
 class Operation(NamedTuple):
@@ -348,8 +326,26 @@ class Operation(NamedTuple):
     examples: tuple[Json, ...] = ()
     raw: bool = False
 
-
-FIELD = re.compile(r"(?:^ *|  )((?:\w+, )*\w+) : ", re.MULTILINE)  # "name, name : what it is", in a docstring
+    def described(self) -> Json:
+        """It, as the document has it."""
+        known = self.answer in ANSWERS
+        schema = {"$ref": f"#/components/schemas/{self.answer}"} if known else {"type": "string"}
+        content: Json = {JSON if known else self.answer: {"schema": schema}}
+        responses = {"200": {"description": "Done.", "content": content}}
+        responses |= {str(s): {"$ref": f"#/components/responses/{s}"} for s in sorted({*self.problems, *EVERYWHERE})}
+        asked = _schemas([self.query])[self.query.__name__]["properties"] if self.query else {}
+        parameters = [{"name": name, "in": "query", "required": False, "schema": kind} for name, kind in asked.items()]
+        if "{" in self.path:
+            parameters.append({"name": "id", "in": "path", "required": True, "schema": {"type": "string"}})
+        said = {"summary": " ".join((self.run.__doc__ or "").split()), "parameters": parameters, "responses": responses}
+        if self.takes is None:
+            return said
+        body: Json = {"schema": {"$ref": f"#/components/schemas/{self.takes.__name__}"}}
+        examples = {"examples": {str(i): {"value": value} for i, value in enumerate(self.examples)}}
+        content = {JSON: body | examples, MSGPACK: body}
+        if self.raw:
+            content[RAW] = {"schema": {"type": "string", "format": "binary", "description": "float32, little-endian."}}
+        return said | {"requestBody": {"required": True, "content": content}}
 
 
 def _schemas(kinds: Iterable[Any]) -> Json:
@@ -365,75 +361,25 @@ def _schemas(kinds: Iterable[Any]) -> Json:
     return schemas
 
 
-def document(operations: Iterable[Operation], version: str, answers: Mapping[str, Any] = ANSWERS) -> Json:
+def document(operations: Iterable[Operation], version: str) -> Json:
     """The OpenAPI document of these operations."""
-    operations = list(operations)
-    schemas = _schemas([*answers.values(), *(each.takes for each in operations if each.takes)])
-    queries = _schemas(each.query for each in operations if each.query)
     after = {"Retry-After": {"schema": {"type": "integer"}, "description": f"Seconds, {RETRY_AFTER} as a rule."}}
     content = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-    responses = {
-        str(status): {"description": about, "content": content} | ({"headers": after} if status in LATER else {})
-        for status, about in PROBLEMS.items()
-    }
     paths: Json = {}
     for each in operations:
-        paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = _operation(each, queries, answers)
-    schemes = {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")}
+        paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = each.described()
+    components = {
+        "schemas": _schemas([*ANSWERS.values(), *(each.takes for each in operations if each.takes)]),
+        "responses": {
+            str(status): {"description": about, "content": content} | ({"headers": after} if status in LATER else {})
+            for status, about in PROBLEMS.items()
+        },
+        "securitySchemes": {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")},
+    }
     return {
         "openapi": "3.1.0",
         "info": {"title": "dengine serve", "version": version, "description": "A robot cell's data engine."},
         "paths": paths,
-        "components": {"schemas": schemas, "responses": responses, "securitySchemes": schemes},
+        "components": components,
         "security": [{}, {"bearer": []}, {"basic": []}],
     }
-
-
-def _operation(each: Operation, queries: Json, answers: Mapping[str, Any]) -> Json:
-    known = each.answer in answers
-    schema = {"$ref": f"#/components/schemas/{each.answer}"} if known else {"type": "string"}
-    responses: Json = {"200": {"description": "Done.", "content": {JSON if known else each.answer: {"schema": schema}}}}
-    responses |= {str(s): {"$ref": f"#/components/responses/{s}"} for s in sorted({*each.problems, *EVERYWHERE})}
-    asked = queries[each.query.__name__]["properties"] if each.query else {}
-    parameters = [{"name": name, "in": "query", "required": False, "schema": schema} for name, schema in asked.items()]
-    if "{" in each.path:
-        parameters.append({"name": "id", "in": "path", "required": True, "schema": {"type": "string"}})
-    said = {"summary": " ".join((each.run.__doc__ or "").split()), "parameters": parameters, "responses": responses}
-    if each.takes is None:
-        return said
-    body: Json = {"schema": {"$ref": f"#/components/schemas/{each.takes.__name__}"}}
-    shown = {"examples": {str(i): {"value": value} for i, value in enumerate(each.examples)}}
-    content = {JSON: body | shown, MSGPACK: body}
-    if each.raw:
-        content[RAW] = {"schema": {"type": "string", "format": "binary", "description": "float32, little-endian."}}
-    return said | {"requestBody": {"required": True, "content": content}}
-
-
-def as_page(openapi: Json) -> Iterator[str]:
-    """The document as plain HTML, in pieces."""
-    title = escape(f"{openapi['info']['title']} {openapi['info']['version']}")
-    yield f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><main><h1>{title}</h1>'
-    yield '<p>The same for machines: <a href="/openapi.json">/openapi.json</a>.</p>'
-    for path, methods in openapi["paths"].items():
-        for method, said in methods.items():
-            yield f"<h2><code>{method.upper()} {escape(path)}</code></h2><p>{escape(said['summary'])}</p>"
-            yield _list((each["name"], each["schema"]) for each in said["parameters"])
-            for kind, content in said.get("requestBody", {}).get("content", {}).items():
-                shown = "".join(
-                    f"<pre>{escape(json.dumps(e['value']))}</pre>" for e in content.get("examples", {}).values()
-                )
-                yield f"<p>Takes <code>{escape(kind)}</code>.</p>{shown}"
-            yield f"<p>Answers: {', '.join(said['responses'])}.</p>"
-    yield "<h2>Objects</h2>"
-    for name, schema in openapi["components"]["schemas"].items():
-        yield f'<h3 id="{escape(name)}">{escape(name)}</h3><p>{escape(schema["description"])}</p>'
-        yield _list(schema.get("properties", {}).items())
-    yield "<h2>Problems</h2>"
-    for status, answer in openapi["components"]["responses"].items():
-        yield f'<h3 id="problem-{status}">{status}</h3><p>{escape(answer["description"])}</p>'
-    yield "</main></html>\n"
-
-
-def _list(items: Iterable[tuple[str, Json]]) -> str:
-    rows = (f"<dt><code>{escape(key)}</code></dt><dd>{escape(each.get('description', ''))}</dd>" for key, each in items)
-    return f"<dl>{''.join(rows)}</dl>"

@@ -10,6 +10,8 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from typing import Any
 
+import msgspec
+from msgspec import UNSET
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
@@ -24,25 +26,21 @@ from ..store.records import StoredDecision
 from ..store.views import HistoryFilter
 from . import http, page, xmlrpc
 from .api import (
-    DECISION,
     HANDLERS,
     JSON,
-    LINE,
-    STATUS,
     DetailQuery,
+    Health,
     ListQuery,
     Operation,
     RawQuery,
     Report,
     TraceRequest,
+    answer,
     answered,
-    as_page,
     document,
     read_query,
     read_struct,
     read_trace,
-    record,
-    stored_record,
 )
 from .auth import Access, Guard
 from .metrics import Metrics
@@ -85,8 +83,8 @@ class HttpApi:
         """Decide on a trace. With a request id, whoever died before the answer asks again and has the same. The query is of
         a raw body; JSON and MessagePack hold it all.
         """
-        answer = await self.service.decide(*await read_trace(request))
-        return answered(record(answer.decision, DECISION, late=answer.late, seconds=answer.seconds))
+        given = await self.service.decide(*await read_trace(request))
+        return answered(answer("Answer", given.decision, given))
 
     async def report(self, request: Request) -> Response:
         """Report what became of a part; the label is on the disk when this answers. The same twice is no error."""
@@ -95,11 +93,9 @@ class HttpApi:
 
     async def status(self, request: Request) -> Response:
         """How the cell is doing."""
-        service = self.service
-        await service.ask(lambda engine: engine.flush())
-        found = await service.status()
-        line = {name: getattr(service, name) for name in LINE}
-        return answered(plain(record(found, STATUS, alarm=found.alarm, **line)))
+        await self.service.ask(lambda engine: engine.flush())
+        found = answer("Status", self.service, await self.service.status())
+        return answered(plain(msgspec.structs.asdict(found)))
 
     async def decision(self, request: Request) -> Response:
         """One decision with its label; with trace=true its trace too."""
@@ -107,7 +103,7 @@ class HttpApi:
         known = await self.service.find(request.path_params["id"])
         if known is None:
             raise UnknownDecisionError("Expected the id of a decision of this cell, got one that is unknown.")
-        return answered(stored_record(known, **{"trace": known.trace} if shown.trace else {}))
+        return answered(answer("Decision", known.decision, known, trace=known.trace if shown.trace else UNSET))
 
     async def decisions(self, request: Request) -> Response:
         """The newest decisions, newest first; with open=true those that wait for a label: what a controller that died goes
@@ -115,7 +111,7 @@ class HttpApi:
         """
         asked = read_query(request, ListQuery)
         found = await self.service.look(lambda store: _newest(store, asked.limit, asked.open))
-        return answered({"decisions": [stored_record(each) for each in found]})
+        return answered({"decisions": [answer("Decision", each.decision, each, trace=UNSET) for each in found]})
 
     async def metrics(self, request: Request) -> Response:
         """What Prometheus reads."""
@@ -129,8 +125,7 @@ class HttpApi:
         """
         engine, alive = self.service.engine, self.service.silent < HUNG
         state = "down" if not alive else "degraded" if engine.store_fault else "ok"
-        said = {"status": state, "store_fault": engine.store_fault, "waiting": self.service.waiting}
-        return answered(said, 200 if alive else 503)
+        return answered(Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
 
     async def openapi(self, request: Request) -> Response:
         """The OpenAPI document."""
@@ -138,7 +133,7 @@ class HttpApi:
 
     async def docs(self, request: Request) -> Response:
         """The same, to read."""
-        return HTMLResponse("\n".join(as_page(document(self.operations(), __version__))))
+        return HTMLResponse(page.environment().get_template("docs.html").render(document(self.operations(), __version__)))
 
 
 def _newest(store: Store, limit: int, waiting: bool) -> list[StoredDecision]:

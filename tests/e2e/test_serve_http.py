@@ -208,12 +208,11 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
 
 
 def test_what_can_be_looked_at_is_as_the_document_says(client: Client) -> None:
-    validate(client.get("/status").json(), "Status", client)
-    validate(client.get("/healthz").json(), "Health", client)
-    listed = client.get("/decisions", params={"limit": 3}).json()
-    validate(listed, "Decisions", client)
-    assert len(listed["decisions"]) == 3
-    times = [each["time"] for each in listed["decisions"]]
+    listed = client.get("/decisions", params={"limit": 3})
+    for answer, schema in ((client.get("/status"), "Status"), (client.get("/healthz"), "Health"), (listed, "Decisions")):
+        validate(answer.json(), schema, client)
+    times = [each["time"] for each in listed.json()["decisions"]]
+    assert len(times) == 3
     assert times == sorted(times, reverse=True)
     must_be_problem(client.get("/decisions/nobody"), 404)
     for query in ("limit=0", "limit=x", "limit=9999", "open=yes"):
@@ -254,40 +253,40 @@ def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
 
 # What it refuses
 
-TWO, ONE = {"trace": [[1.0] * SAMPLES, [1.0]]}, {"trace": [1.0] * SAMPLES}
+
+def as_json(content: bytes) -> dict[str, Any]:
+    return {"content": content, "headers": {"content-type": "application/json"}}
+
+
+def as_floats(content: bytes, *params: tuple[str, str]) -> dict[str, Any]:
+    return {"content": content, "headers": {"content-type": RAW}, "params": list(params)}
+
+
+ONE = {"trace": [1.0] * SAMPLES}
 REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
     "no type": (415, {"content": b"1"}),
     "another type": (415, {"content": b"1", "headers": {"content-type": "text/csv"}}),
-    "nothing": (400, {"content": b"", "headers": {"content-type": "application/json"}}),
-    "no JSON": (400, {"content": b"{", "headers": {"content-type": "application/json"}}),
-    "no UTF-8": (400, {"content": b'{"trace": [1], "request": "\xff"}', "headers": {"content-type": "application/json"}}),
-    "NaN": (400, {"content": b'{"trace": [NaN]}', "headers": {"content-type": "application/json"}}),
-    "a name twice": (400, {"content": b'{"trace": [1], "trace": [2]}', "headers": {"content-type": "application/json"}}),
-    "too deep": (422, {"content": b'{"trace": ' + b"[" * 100_000, "headers": {"content-type": "application/json"}}),
-    "digits": (422, {"content": b'{"trace": [' + b"1" * 5000 + b"]}", "headers": {"content-type": "application/json"}}),
-    "a huge number": (422, {"json": {"trace": [10**400]}}),
+    "nothing": (400, as_json(b"")),
+    "no UTF-8": (400, as_json(b'{"trace": [1], "request": "\xff"}')),
+    "NaN": (400, as_json(b'{"trace": [NaN]}')),
+    "a name twice": (400, as_json(b'{"trace": [1], "trace": [2]}')),
+    "too deep": (422, as_json(b'{"trace": ' + b"[" * 100_000)),
+    "digits": (422, as_json(b'{"trace": [' + b"1" * 5000 + b"]}")),
     "a list": (422, {"json": [1.0]}),
     "no trace": (422, {"json": {"request": "a"}}),
     "an unknown name": (422, {"json": ONE | {"reqest": "a"}}),
     "an empty trace": (422, {"json": {"trace": []}}),
     "a bool among numbers": (422, {"json": {"trace": [1.0, True]}}),
-    "a text among numbers": (422, {"json": {"trace": [1.0, "2"]}}),
-    "unequal channels": (422, {"json": TWO}),
+    "unequal channels": (422, {"json": {"trace": [[1.0] * SAMPLES, [1.0]]}}),
     "another length": (422, {"json": {"trace": [1.0] * (SAMPLES - 1)}}),
     "a request that is a number": (422, {"json": ONE | {"request": 7}}),
-    "a request of no characters": (422, {"json": ONE | {"request": ""}}),
     "a request that ends a line": (422, {"json": ONE | {"request": "a\nb"}}),
     "a request too long": (422, {"json": ONE | {"request": "a" * 201}}),
     "a part that is a bool": (422, {"json": ONE | {"part": True}}),
-    "half a float": (422, {"content": b"12345", "headers": {"content-type": RAW}}),
-    "no channels": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"channels": "0"}}),
-    "channels in words": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"channels": "one"}}),
-    "an unknown query": (422, {"content": b"1234", "headers": {"content-type": RAW}, "params": {"path": "/etc"}}),
-    "a query twice": (
-        422,
-        {"content": b"1234", "headers": {"content-type": RAW}, "params": [("part", "1"), ("part", "2")]},
-    ),
-    "no MessagePack": (400, {"content": b"\xc1", "headers": {"content-type": MSGPACK}}),
+    "half a float": (422, as_floats(b"12345")),
+    "no channels": (422, as_floats(b"1234", ("channels", "0"))),
+    "an unknown query": (422, as_floats(b"1234", ("path", "/etc"))),
+    "a query twice": (422, as_floats(b"1234", ("part", "1"), ("part", "2"))),
     "a name twice in MessagePack": (
         400,
         {"content": b"\x82\xa5trace\x91\x01\xa5trace\x91\x02", "headers": {"content-type": MSGPACK}},
@@ -385,28 +384,13 @@ def test_every_answer_tells_a_browser_what_it_may_do(client: Client) -> None:
         assert "server" not in headers
 
 
-def test_sizes_times_and_rates_are_limited(stream: Dataset) -> None:
-    access = Access(largest=4000, body_seconds=0.2, rate=0.01, burst=20)
+def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
+    access = Access(largest=4000, rate=0.01, burst=20)
     with serving(access, connections=3, head_seconds=0.3) as (_, client):
-        host, port = client.base_url.host, client.base_url.port
-        must_be_problem(client.post("/decide", content=b"0" * 4001, headers={"content-type": RAW}), 413)
+        must_be_problem(client.post("/decide", **as_floats(b"0" * 4001)), 413)
         must_be_problem(client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}), 413)
-        for text, status in (
-            (
-                "POST /decide HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: 9\r\n\r\n{",
-                408,
-            ),
-            ("GET /healthz HTTP/1.1\r\nhost: loc", 408),
-            ("GET /healthz HTTP/1.1\r\nhost: localhost\r\nx: " + "y" * 100_000, 400),
-            ("\x16\x03\x01 no HTTP\r\n\r\n", 400),
-        ):
-            with socket.create_connection((host, port), timeout=60) as raw:
-                raw.sendall(text.encode("latin-1"))
-                said = read_all(raw)
-            assert said.startswith(f"HTTP/1.1 {status} ".encode()), said
-            assert json.loads(said.partition(b"\r\n\r\n")[2])["action"] == "verify"
-        idle = [socket.create_connection((host, port), timeout=60) for _ in range(4)]
-        fulls = [read_all(each) for each in idle]
+        at = client.base_url.host, client.base_url.port
+        fulls = [read_all(each) for each in [socket.create_connection(at, timeout=60) for _ in range(4)]]
         assert fulls[-1].startswith(b"HTTP/1.1 503 ")
         while (answer := client.get("/healthz")).status_code == 200:
             pass
@@ -421,12 +405,12 @@ def half(head: str, body: str = "") -> bytes:
 NINE = "content-type: {}\r\ncontent-length: 9\r\n\r\n{{"
 CHUNKED = f"content-type: {RAW}\r\ntransfer-encoding: chunked\r\n\r\n"
 HALVES = {  # what is sent; the status of what comes
-    "a method": (b"G", 408),
     "a line": (b"GET /healthz HT", 408),
     "a head": (half("GET /healthz"), 408),
     "no HTTP, without an end": (b"\xfe\xff\x80" * 30, 408),
+    "no HTTP": (b"\x16\x03\x01 no HTTP\r\n\r\n", 400),
+    "too long a head": (half("GET /healthz", "x: " + "y" * 100_000), 400),
     "a trace": (half("POST /decide", NINE.format("application/json")), 408),
-    "a report": (half("POST /report", NINE.format(MSGPACK)), 408),
     "a call": (half("POST /RPC2", NINE.format("text/xml")), 408),
     "a piece": (half("POST /decide", f"{CHUNKED}9\r\n1"), 408),
     "a piece of no length": (half("POST /decide", f"{CHUNKED}x\r\n"), 400),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe
+from dengine import DataEngine, Dataset, Policy, Reason, Recipe
 from dengine.errors import BusyError, ReportError, StoreError, TraceError
 from dengine.serve.service import CellService
 
@@ -26,25 +26,6 @@ def service(make_service: Callable[[Recipe], CellService]) -> CellService:
     return make_service(RECIPE)
 
 
-def test_what_is_decided_and_reported_is_what_the_engine_has(service: CellService, stream: Dataset) -> None:
-    verified: list[bool] = []
-
-    async def cell() -> None:
-        for i in range(60):
-            answer = await service.decide(stream.X[i], f"order-{i}", part=f"P{i}")
-            verified.append(answer.decision.action is Action.VERIFY)
-            if answer.decision.action is Action.VERIFY:
-                told = await service.report(answer.decision.id, bool(stream.y[i]))
-                assert (told.success, told.repeated) == (bool(stream.y[i]), False)
-        known = await service.find("order-7")
-        assert (known.success, known.decision.part) == (bool(stream.y[7]), "P7")
-        assert await service.find("order-1000") is None
-
-    asyncio.run(cell())
-    assert service.engine.version == 1
-    assert service.reading.status()["labels"] == sum(verified) < 60
-
-
 def test_the_same_report_twice_is_no_error_and_another_one_is(service: CellService, stream: Dataset) -> None:
     async def cell() -> None:
         await service.decide(stream.X[0], "order-0")
@@ -59,30 +40,6 @@ def test_the_same_report_twice_is_no_error_and_another_one_is(service: CellServi
 
     asyncio.run(cell())
     assert service.reading.status()["labels"] == 1
-
-
-def test_who_waits_too_long_is_told_to_verify_and_so_it_is_recorded(service: CellService, stream: Dataset) -> None:
-    free = threading.Event()
-    service.deadline = 0.05
-
-    async def cell() -> None:
-        first = await service.decide(stream.X[0], "order-0")
-        assert not first.late
-        held = asyncio.ensure_future(service.ask(lambda engine: free.wait(60)))
-        await asyncio.sleep(0)
-        late = await service.decide(stream.X[1], "order-1")
-        assert late.late
-        assert late.decision.action is Action.VERIFY
-        assert (await service.decide(stream.X[0], "order-0")).decision == first.decision  # it was answered before
-        free.set()
-        await held
-        service.deadline = 30.0
-        assert (await service.decide(stream.X[1], "order-1")).decision == late.decision
-        assert not (await service.report("order-1", bool(stream.y[1]))).repeated
-        assert (await service.find("order-1")).decision.reason is Reason.LATE
-
-    asyncio.run(cell())
-    assert service.late == 2
 
 
 def test_a_late_answer_is_on_the_disk_when_it_leaves(service: CellService, stream: Dataset, tmp_path: Path) -> None:
@@ -129,18 +86,15 @@ def held(service: CellService) -> Iterator[None]:
 
 
 def test_a_full_line_takes_no_more_and_records_nothing_of_it(stream: Dataset) -> None:
-    service, free = CellService(lambda: DataEngine(recipe=RECIPE), deadline=30.0, most=2), threading.Event()
+    service = CellService(lambda: DataEngine(recipe=RECIPE), deadline=30.0, most=2)
 
     async def cell() -> None:
-        begun = threading.Event()
-        held = asyncio.ensure_future(service.ask(lambda engine: (begun.set(), free.wait(60))))
-        await asyncio.to_thread(begun.wait, 60)
-        waiting = [asyncio.ensure_future(service.decide(stream.X[i], f"order-{i}")) for i in range(2)]
-        await asyncio.sleep(0)
-        with pytest.raises(BusyError, match="at most 2 requests in line"):
-            await service.decide(stream.X[2], "order-2")
-        free.set()
-        await asyncio.gather(held, *waiting)
+        with held(service):
+            waiting = [asyncio.ensure_future(service.decide(stream.X[i], f"order-{i}")) for i in range(2)]
+            await asyncio.sleep(0)
+            with pytest.raises(BusyError, match="at most 2 requests in line"):
+                await service.decide(stream.X[2], "order-2")
+        await asyncio.gather(*waiting)
 
     asyncio.run(cell())
     assert service.reading.status()["decisions"] == 2
@@ -153,18 +107,6 @@ def test_a_full_line_takes_no_more_and_records_nothing_of_it(stream: Dataset) ->
 def test_what_cannot_be_opened_is_told_where_the_service_is_made(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="found no file"):
         CellService(lambda: DataEngine.open(tmp_path / "none.db"))
-
-
-def test_who_listens_hears_of_every_change(service: CellService, stream: Dataset) -> None:
-    async def cell() -> None:
-        changes = service.changes()
-        await anext(changes)
-        for i in range(3):
-            await service.decide(stream.X[i])
-            await asyncio.wait_for(anext(changes), 60)
-        await changes.aclose()
-
-    asyncio.run(cell())
 
 
 def test_the_engine_does_what_it_has_to_while_nobody_asks(make_data, tmp_path: Path) -> None:

@@ -1,10 +1,5 @@
-"""The live page: what the cell does now, how it is doing, the map of its parts, its history, and what people may do.
+"""The live page, rendered here with nothing from outside: `create_app(service, interfaces=("page",))`."""
 
-    app = create_app(service, interfaces=("page",))
+from .routes import environment, routes
 
-Rendered here, with nothing from outside: templates, one stylesheet and one script are part of the package.
-"""
-
-from .routes import routes
-
-__all__ = ["routes"]
+__all__ = ["environment", "routes"]

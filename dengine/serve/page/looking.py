@@ -14,10 +14,13 @@ from ...recipe import Recipe
 from ...store.base import Store
 from ..service import CellService
 
+T = TypeVar("T")
 SETTLED = 0.15  # seconds after a change until it is told: the store's writer lets a decision wait for 0.05
 AGAIN = 1.0  # seconds after the last change until it is told once more: a disk may be slow
 RETRY = 1000  # ms after which a browser that was cut off tries again
 TICK = 5.0  # seconds of quiet, after which a watcher is told that the line still stands
+MOST = 64  # looks that are kept
+REST, LONGEST = 10.0, 30.0  # a look that took a second is not taken anew for so many: it is not to be felt; and at most
 
 
 class ChangeFeed:
@@ -25,10 +28,9 @@ class ChangeFeed:
 
     def __init__(self, service: CellService) -> None:
         self.number, self.boot = 0, uuid.uuid4().hex
-        self._service = service
+        self._service, self._over = service, False
         self._task: asyncio.Task[None] | None = None
         self._turn = asyncio.Event()
-        self._over = False
         self._coming: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
@@ -46,8 +48,9 @@ class ChangeFeed:
 
     def advance_in(self, seconds: float) -> None:
         """`advance` then, once, whoever else asks for it meanwhile."""
-        if self._coming is None or self._coming.cancelled() or self._coming.when() < asyncio.get_running_loop().time():
-            self._coming = asyncio.get_running_loop().call_later(seconds, self.advance)
+        loop = asyncio.get_running_loop()
+        if self._coming is None or self._coming.cancelled() or self._coming.when() < loop.time():
+            self._coming = loop.call_later(seconds, self.advance)
 
     async def _follow(self) -> None:
         loop, later = asyncio.get_running_loop(), None
@@ -75,13 +78,6 @@ class ChangeFeed:
                     continue
             known = self.number
             yield {"event": "changed", "data": str(known)}
-
-
-MOST = 64  # looks that are kept
-REST = 10.0  # a look that took a second is not taken anew for so many: reading a large store is not to be felt
-LONGEST = 30.0  # seconds of rest
-
-T = TypeVar("T")
 
 
 class Looking:
@@ -124,24 +120,21 @@ class Looking:
 
     def kept(self, what: Hashable, fits: Hashable, read: Callable[[], T]) -> T:
         """What `read` finds, or found when `fits` was the same: for what changes less often than the decisions."""
-        known = self._kept.get(what)
-        if known is not None and known[0] == fits:
-            found: T = known[1]
-            return found
-        fresh = read()
-        while len(self._kept) >= MOST:
-            del self._kept[next(iter(self._kept))]
-        self._kept[what] = (fits, fresh)
-        return fresh
+        if what not in self._kept or self._kept[what][0] != fits:
+            fresh = read()
+            while len(self._kept) >= MOST:
+                del self._kept[next(iter(self._kept))]
+            self._kept[what] = fits, fresh
+        found: T = self._kept[what][1]
+        return found
 
     def _look(self, view: Hashable, read: Callable[[Looking], T], longest: float) -> T:
         with self._lock:
-            begin, known = time.monotonic(), self._kept.get(view)
-            if known is not None and begin < self._rests.get(view, 0.0):
-                found: T = known[1]
-                return found
-            fresh = self.kept(view, self.feed.number, lambda: read(self))
-            end = time.monotonic()
-            self._rests = {each: until for each, until in self._rests.items() if until > end}
-            self._rests[view] = end + min(longest, REST * (end - begin))
-            return fresh
+            begin = time.monotonic()
+            rests = view in self._kept and begin < self._rests.get(view, 0.0)
+            found = self.kept(view, self._kept[view][0] if rests else self.feed.number, lambda: read(self))
+            if not rests:
+                end = time.monotonic()
+                self._rests = {each: until for each, until in self._rests.items() if until > end}
+                self._rests[view] = end + min(longest, REST * (end - begin))
+            return found
