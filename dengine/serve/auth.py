@@ -31,8 +31,6 @@ from .api import Refusal, problem
 log = logging.getLogger("dengine")
 SHORTEST = 16  # characters of a token
 CLIENTS = 4096  # whose rate is remembered
-SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-WITHOUT_TOKEN = frozenset({"/healthz"})
 RPC = "/RPC2"  # where a robot that cannot send headers may have its token in the path or the query
 
 
@@ -57,18 +55,16 @@ class Access:
 class Rates:
     """A token bucket for each client; those that were not seen for longest are forgotten first."""
 
-    def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
         self.rate, self.burst, self.clock = rate, burst, clock
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when they were counted
 
     def take(self, client: str) -> bool:
         """Take one token; False where there is none."""
-        if self.rate <= 0.0:
-            return True
         now = self.clock()
-        tokens, since = self._buckets.pop(client, (float(self.burst), now))
-        tokens = min(float(self.burst), tokens + (now - since) * self.rate)
-        taken = tokens >= 1.0
+        tokens, since = self._buckets.pop(client, (self.burst, now))
+        tokens = min(self.burst, tokens + (now - since) * self.rate)
+        taken = self.rate <= 0.0 or tokens >= 1.0
         self._buckets[client] = (tokens - taken, now)
         if len(self._buckets) > CLIENTS:
             self._buckets.popitem(last=False)
@@ -114,14 +110,12 @@ def is_called(host: str | None, names: Iterable[str]) -> bool:
         return False
     try:
         parts = urlsplit(f"//{host}")
-        name = parts.hostname if parts.port is None or parts.port else None  # a ValueError for what is no port
-        if name is None or name == "localhost" or name in {each.lower() for each in names}:
-            return name is not None
-    except ValueError:
-        return False
-    try:
-        ip_address(name)
-    except ValueError:
+        name = parts.hostname
+        if name is None or parts.port == 0:
+            return False
+        if name != "localhost" and name not in {each.lower() for each in names}:
+            ip_address(name)
+    except ValueError:  # no port, or no address
         return False
     return True
 
@@ -130,10 +124,7 @@ def is_own_page(origin: str | None, fetch_site: str | None, host: str | None) ->
     """Whether what a browser says of a request lets it be one of this server's own pages, or of no page at all."""
     if fetch_site is not None and fetch_site not in ("same-origin", "none"):
         return False
-    if origin is None:
-        return True
-    _, _, called = origin.partition("://")
-    return host is not None and called.lower() == host.lower()
+    return origin is None or (host is not None and origin.partition("://")[2].lower() == host.lower())
 
 
 def may_ask(token: str, authorization: str | None) -> bool:
@@ -159,13 +150,12 @@ def split_rpc(path: str, query: bytes) -> tuple[str, bytes, str | None]:
         return RPC, query, path.removeprefix(f"{RPC}/")
     if path != RPC or b"token=" not in query:
         return path, query, None
-    pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True, max_num_fields=None)
+    pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True)
     said = [value for name, value in pairs if name == "token"]
-    rest = urlencode([(name, value) for name, value in pairs if name != "token"]).encode("ascii")
-    return path, rest, said[0] if len(said) == 1 else ""
+    rest = urlencode([pair for pair in pairs if pair[0] != "token"])
+    return path, rest.encode("ascii"), said[0] if len(said) == 1 else ""
 
 
-ASK = 'Bearer realm="dengine", Basic realm="dengine", charset="UTF-8"'
 CLOSE = {"Connection": "close"}  # what was not read is not to be taken for the next request
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -211,43 +201,37 @@ class Guard:
                 connection.end_request()
 
     def _look(self, scope: MutableMapping[str, Any]) -> None:
-        headers = Headers(scope=scope)
+        headers, access = Headers(scope=scope), self.access
         host, client = headers.get("host"), (scope.get("client") or ("", 0))[0]
-        if not is_called(host, self.access.hosts):
-            raise Refusal(
-                HTTPStatus.MISDIRECTED_REQUEST,
-                "Expected the server to be called by its address, localhost, or a name that it was given "
-                "(dengine serve --allow-host NAME).",
-            )
+        if not is_called(host, access.hosts):
+            names = "its address, localhost, or a name that it was given (dengine serve --allow-host NAME)"
+            raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}.")
         if not self.rates.take(client):
             raise Refusal(
-                HTTPStatus.TOO_MANY_REQUESTS, f"Expected at most {self.access.rate:g} requests a second of one client."
+                HTTPStatus.TOO_MANY_REQUESTS, f"Expected at most {access.rate:g} requests a second of one client."
             )
-        self._must_have_token(scope, headers, client)
-        if scope["method"] not in SAFE and not is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host):
+        self._must_have_token(scope, headers.get("authorization"), client)
+        own = is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host)
+        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and not own:
             raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdecimal()):
             raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
-        if len(length) > 18 or int(length) > self.access.largest:
-            raise _too_large(self.access.largest)
+        if len(length) > 18 or int(length) > access.largest:
+            raise _too_large(access.largest)
 
-    def _must_have_token(self, scope: MutableMapping[str, Any], headers: Headers, client: str) -> None:
+    def _must_have_token(self, scope: MutableMapping[str, Any], authorization: str | None, client: str) -> None:
         path, query, said = split_rpc(scope["path"], scope["query_string"])
         if said is not None:  # it is nobody's business from here on, with a token or without
             scope.update(path=path, raw_path=RPC.encode("ascii"), query_string=query)
         token = self.access.token
-        if not token or path in WITHOUT_TOKEN or (said is not None and is_same(token, said)):
+        if not token or path == "/healthz" or (said is not None and is_same(token, said)) or may_ask(token, authorization):
             return
-        authorization = headers.get("authorization")
-        if not may_ask(token, authorization):
-            if (authorization or said is not None) and self.lines.take(client):
-                log.warning("a wrong token came from %s", client)
-            raise Refusal(
-                HTTPStatus.UNAUTHORIZED,
-                "Expected the server's token: Authorization: Bearer TOKEN, or any user name with it as the password.",
-                {"WWW-Authenticate": ASK},
-            )
+        if (authorization or said is not None) and self.lines.take(client):
+            log.warning("a wrong token came from %s", client)
+        how = "Authorization: Bearer TOKEN, or any user name with it as the password"
+        ask = {"WWW-Authenticate": 'Bearer realm="dengine", Basic realm="dengine", charset="UTF-8"'}
+        raise Refusal(HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", ask)
 
 
 class Body:

@@ -33,7 +33,7 @@ from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError
 from .auth import in_url, is_loopback
-from .robot_calls import RobotCalls
+from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
 log = logging.getLogger("dengine")
@@ -254,8 +254,7 @@ class AddressSpace:
         return method
 
     async def _refuse(self, status: ua.StatusCode, text: str, result: Any = None) -> Any:
-        line = "".join(c if c.isprintable() else " " for c in text)[:300]
-        await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(line, VariantType.String)))
+        await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(one_line(text), VariantType.String)))
         return status if result is None else result
 
     def _id(self, text: str) -> ua.NodeId:

@@ -35,22 +35,14 @@ Answered = dict[str, Any]
 Call = Callable[..., Awaitable[Any]]
 
 
-class Recording(Protocol):
-    """One insertion that was cut out of a stream. trace : (T,) or (C, T); NaN where a sample never came."""
-
-    @property
-    def trace(self) -> ArrayLike:
-        """The samples."""
-
-
 class Recorder(Protocol):
     """Cuts insertions out of what a robot sends, as `RtdeRecorder` does; its calls may block."""
 
     def arm(self) -> None:
         """Look for an insertion from now on."""
 
-    def record(self, timeout: float) -> Recording:
-        """The next insertion; an error after `timeout` seconds without one."""
+    def record(self, timeout: float) -> Any:
+        """The next insertion, whose `trace` is (T,) or (C, T), NaN where none came; an error after `timeout` seconds."""
 
 
 class RobotCalls:
@@ -89,16 +81,13 @@ class RobotCalls:
             self._pieces.popitem(last=False)
         if self._recorder is not None:
             async with self._recording:
-                await self._arm(self._recorder, id_)
+                self._armed = None
+                try:
+                    await asyncio.to_thread(self._recorder.arm)
+                    self._armed = id_
+                except (DengineError, OSError) as error:  # the part will be verified
+                    log.warning("the recorder does not listen: %s", error)
         return id_
-
-    async def _arm(self, recorder: Recorder, request: str) -> None:
-        self._armed = None
-        try:
-            await asyncio.to_thread(recorder.arm)
-            self._armed = request
-        except (DengineError, OSError) as error:  # the part will be verified
-            log.warning("the recorder does not listen: %s", error)
 
     async def add(self, request: Any, samples: Any) -> int:
         """A piece of a part's trace, one channel, in order; how many samples there are by now."""
@@ -110,10 +99,11 @@ class RobotCalls:
         piece = as_samples(samples)
         if piece.ndim != 1:
             raise TraceError("Expected a piece of one channel, a list of numbers; use decide for several channels.")
-        if sum(map(len, pieces)) + len(piece) > SAMPLES:
+        n = sum(map(len, pieces)) + len(piece)
+        if n > SAMPLES:
             raise TraceError(f"Expected at most {SAMPLES} samples of a part, got more.")
         pieces.append(piece)
-        return sum(map(len, pieces))
+        return n
 
     async def decide(self, trace: Any, request: Any = "", part: Any = "") -> Answered:
         """Decide on a whole trace, (T,) or (channels, T), of lists."""
@@ -206,6 +196,11 @@ class RobotCalls:
         except (BusyError, StoreError):
             return None
         return None if known is None else _answered(known.decision)
+
+
+def one_line(text: str) -> str:
+    """What is told of a refused call, of characters that print."""
+    return "".join(c if c.isprintable() else " " for c in text)[:300]
 
 
 def as_samples(value: Any) -> NDArray[np.float32]:

@@ -32,6 +32,8 @@ from .retraining import retraining_process
 from .robot_calls import Recorder
 from .service import DEADLINE, Answer, CellService, Told
 
+log = logging.getLogger("dengine")
+
 
 class Lines(logging.Formatter):
     """A record as one line of time, level, logger and message, as JSON has a text, for a machine to read; no password."""
@@ -39,32 +41,30 @@ class Lines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Time, level, logger, message; and what was raised."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        told = {"message": record.getMessage()}
+        said = f"message={json.dumps(without_password(record.getMessage()))}"
         if record.exc_info:
-            told["raised"] = self.formatException(record.exc_info)
-        said = " ".join(f"{name}={json.dumps(without_password(text))}" for name, text in told.items())
+            said += f" raised={json.dumps(without_password(self.formatException(record.exc_info)))}"
         return f"{time} level={record.levelname.lower()} logger={record.name} {said}"
 
 
 @contextmanager
 def log_lines_to(stream: TextIO) -> Iterator[None]:
     """Have every logger write such lines; uvicorn none, for what it refuses is answered, and what fails is told here."""
-    handler = logging.StreamHandler(stream)
+    handler, root = logging.StreamHandler(stream), logging.getLogger()
     handler.setFormatter(Lines())
-    root, ours, theirs = (logging.getLogger(name) for name in ("", "dengine", "uvicorn"))
-    handlers, levels = root.handlers[:], {logger: logger.level for logger in (root, ours, theirs)}
+    levels = {root: logging.WARNING, log: logging.INFO, logging.getLogger("uvicorn"): logging.CRITICAL}
+    handlers, before = root.handlers[:], {logger: logger.level for logger in levels}
     root.handlers[:] = [handler]
-    for logger, level in ((root, logging.WARNING), (ours, logging.INFO), (theirs, logging.CRITICAL)):
-        logger.setLevel(level)
     try:
+        for logger, level in levels.items():
+            logger.setLevel(level)
         yield
     finally:
         root.handlers[:] = handlers
-        for logger, level in levels.items():
+        for logger, level in before.items():
             logger.setLevel(level)
 
 
-log = logging.getLogger("dengine")
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds in which requests under way are answered when the server ends
 SWITCH = 0.0005  # seconds after which a thread gives Python's lock to one that waits: a robot waits for both of ours
@@ -109,10 +109,6 @@ class Serving:
         names = () if is_loopback(self.host) else (self.host, socket.gethostname())
         return Access(token, (*names, *self.allow_hosts), self.largest, rate=self.rate, burst=max(1, int(2 * self.rate)))
 
-    def address(self, port: int) -> str:
-        """Where it is reached."""
-        return f"http{'s' if self.cert else ''}://{in_url(self.host)}:{port}"
-
 
 def serve(
     make: Callable[[Executor], DataEngine], store: str | None, serving: Serving, say: Callable[[str], object]
@@ -133,12 +129,20 @@ def serve(
         service = CellService(lambda: make(executor), store, serving.deadline)
         service.observers.append(tell)
         try:
-            beside = (*serving.beside, *_opcua(serving, access))
+            beside = list(serving.beside)
+            if serving.opcua is not None:
+                from .opcua import opcua_server
+
+                files = {"cert": serving.opcua_cert or serving.cert, "key": serving.opcua_key or serving.key}
+                how = {"port": serving.opcua, "host": serving.host, "token": access.token or None}
+                beside.append(partial(opcua_server, **how, **files))
             app = create_app(service, access, serving.interfaces, beside, recorder)
             config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
-            line = f"{service.engine.store.cell_id} is served at {serving.address(port)}"
-            server = CellServer(config, service, lambda: say(f"{line}{'' if access.token else ', to this machine alone'}."))
+            address = f"http{'s' if serving.cert else ''}://{in_url(serving.host)}:{port}"
+            alone = "" if access.token else ", to this machine alone"
+            line = f"{service.engine.store.cell_id} is served at {address}{alone}."
+            server = CellServer(config, service, lambda: say(line))
             try:
                 with quick_switches():
                     server.run([listening])
@@ -147,16 +151,6 @@ def serve(
                 raise getattr(app.state, "failure", why) from None
         finally:
             service.close()
-
-
-def _opcua(serving: Serving, access: Access) -> list[Beside]:
-    """What speaks OPC UA, where it is asked for."""
-    if serving.opcua is None:
-        return []
-    from .opcua import opcua_server
-
-    token, cert, key = access.token or None, serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
-    return [partial(opcua_server, port=serving.opcua, host=serving.host, token=token, cert=cert, key=key)]
 
 
 def uvicorn_options(serving: Serving) -> dict[str, Any]:

@@ -20,18 +20,16 @@ from starlette.routing import Route
 from ..errors import DengineError, ReportError
 from .api import media_type, read_body
 from .auth import RPC
-from .robot_calls import PATIENCE, Recorder, RobotCalls
+from .robot_calls import PATIENCE, Recorder, RobotCalls, one_line
 from .service import CellService
 
 log = logging.getLogger("dengine")
 MOST = 2 << 20  # bytes of a call: 40,000 samples, as robots write them
 SMALL = 1 << 16  # bytes of a call that is read at once; more is read in a thread
-LONGEST = 300  # characters of a fault's line
-TYPES = ("text/xml", "application/xml")
 TAGS = ("int", "i4", "double", "boolean", "string", "array", "value", "params", "methodName")
 ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1")
 
-NOT_XML, NO_CALL, NO_METHOD, WRONG_ARGUMENTS, OURS = -32700, -32600, -32601, -32602, -32603  # as XML-RPC servers agreed on
+NOT_XML, NO_METHOD, WRONG_ARGUMENTS, OURS = -32700, -32601, -32602, -32603  # as XML-RPC servers agreed on
 REFUSED, NO_REPORT = 1, 2  # a trace, or anything else, that breaks the contract; a report that does
 
 
@@ -72,7 +70,7 @@ def routes(
     calls = RobotCalls(service, recorder, patience).table()
 
     async def rpc(request: Request) -> Response:
-        if media_type(request) not in TYPES:
+        if media_type(request) not in ("text/xml", "application/xml"):
             return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
@@ -97,10 +95,8 @@ async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: 
         return fault(WRONG_ARGUMENTS, f"Expected {fewest} to {most} arguments of {name}, got {len(arguments)}.")
     try:
         return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
-    except ReportError as error:
-        return fault(NO_REPORT, str(error))
     except DengineError as error:
-        return fault(REFUSED, str(error))
+        return fault(NO_REPORT if isinstance(error, ReportError) else REFUSED, str(error))
     except Exception:  # ours: the log has it, the caller verifies
         log.exception("a call failed")
         return fault(OURS, "The server failed on this call: verify the part.")
@@ -108,5 +104,4 @@ async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: 
 
 def fault(code: int, text: str) -> bytes:
     """A fault of one line, of characters that print."""
-    line = "".join(c if c.isprintable() else " " for c in text)[:LONGEST]
-    return xmlrpc.client.dumps(xmlrpc.client.Fault(code, line), methodresponse=True).encode("utf-8", "replace")
+    return xmlrpc.client.dumps(xmlrpc.client.Fault(code, one_line(text)), methodresponse=True).encode("utf-8", "replace")

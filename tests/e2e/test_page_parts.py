@@ -21,7 +21,7 @@ from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.serve.page.charts import Scale, element, number, percent
 from dengine.serve.page.looking import ChangeFeed, Looking
-from dengine.serve.page.views import SOURCE, WORDS, duration, history_query
+from dengine.serve.page.views import SOURCE, WORDS, duration
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
 
@@ -117,13 +117,6 @@ def test_stops_stand_beside_the_time_that_they_are_not_taken_off(
     service.reading.flush()
     for view in ("/", "/how"):
         assert "s each; system stops, not taken off: 1</p>" in client.get(view).text
-
-
-def test_a_filter_that_makes_no_sense_is_left_out() -> None:
-    query = history_query({"action": "dance", "reason": "novel", "label": "x", "since": "soon", "before": "later,1"})
-    assert query.asked == (("reason", "novel"),)
-    assert query.beyond is None
-    assert history_query({"since": "2026-01-02T03:04"}).where.since is not None
 
 
 def test_the_history_is_filtered_and_its_older_pages_follow_one_another(
@@ -226,12 +219,3 @@ def test_a_view_that_takes_long_rests_and_is_told_of_again(service: CellService,
 
     asyncio.run(asyncio.wait_for(reader(), 60))
     assert len(set(looks)) == 3
-
-
-def test_how_near_an_alarm_is_is_shown_where_it_is_watched(
-    stream: Dataset, make_service: Callable[[Recipe], CellService]
-) -> None:
-    service = make_service(RECIPE.with_policy(stops="all"))
-    cell_runs(service, stream, 70)
-    with TestClient(create_app(service, interfaces=("page",)), "http://localhost") as client:
-        assert client.get("/how").text.count("<meter") == 3

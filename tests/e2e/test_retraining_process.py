@@ -65,16 +65,6 @@ def test_a_call_is_answered_and_its_error_is_raised() -> None:
         assert process.submit(os.getpid).result(60) != os.getpid()
 
 
-def test_a_process_that_was_killed_takes_no_more_calls() -> None:
-    with RetrainingProcess() as process:
-        pid = process.submit(os.getpid).result(60)
-        os.kill(pid, signal.SIGKILL)
-        with pytest.raises(BrokenExecutor, match="has ended"):
-            process.submit(os.getpid).result(60)
-        with pytest.raises(BrokenExecutor):
-            process.submit(os.getpid)
-
-
 def test_it_ends_with_whoever_made_it_also_at_work() -> None:
 
     with RetrainingProcess() as process:
@@ -111,11 +101,12 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
     assert decided[0] == decided[1]  # bit for bit
 
 
-def test_after_its_process_was_killed_an_engine_retrains_in_line(data: Dataset) -> None:
+def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(data: Dataset) -> None:
     with retraining_process() as process:
-        pid = process.submit(os.getpid).result(60)
         engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
-        os.kill(pid, signal.SIGKILL)
+        os.kill(process.submit(os.getpid).result(60), signal.SIGKILL)
+        with pytest.raises(BrokenExecutor, match="has ended"):
+            process.submit(os.getpid).result(60)
         learn(engine, data)
         wait_for(engine)
         engine.start_retrain()

@@ -119,9 +119,6 @@ def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
     return said
 
 
-# What it answers
-
-
 def test_an_interface_that_there_is_not_is_an_error_and_not_a_silence(service: CellService) -> None:
     with pytest.raises(SettingError, match="among http, xmlrpc, page, got 'xmlrcp'"):
         create_app(service, interfaces=("http", "xmlrcp"))
@@ -251,9 +248,6 @@ def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
     assert found["dengine_late_total",] == found["dengine_safe_mode",] == found["dengine_store_fault",] == 0
 
 
-# What it refuses
-
-
 def as_json(content: bytes) -> dict[str, Any]:
     return {"content": content, "headers": {"content-type": "application/json"}}
 
@@ -304,43 +298,45 @@ def test_what_is_no_trace_is_refused_and_leaves_nothing(client: Client, stream: 
     assert client.get("/status").json()["ever"]["decisions"] == before
 
 
-def test_paths_and_methods_that_there_are_not(client: Client) -> None:
-    must_be_problem(client.get("/nothing"), 404)
+def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header(client: Client) -> None:
+    for method, path, status in (("GET", "/nothing", 404), ("GET", "/decide", 405), ("DELETE", "/decisions", 405)):
+        answer = client.request(method, path)
+        must_be_problem(answer, status)
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["content-security-policy"].startswith("default-src 'self'")
+        assert "server" not in answer.headers
     must_be_problem(client.get("/decisions/../../etc/passwd"), 404)
-    must_be_problem(client.get("/decide"), 405)
-    must_be_problem(client.delete("/decisions"), 405)
+
+
+@contextmanager
+def held(service: CellService) -> Iterator[None]:
+    """The engine's thread, busy with something else."""
+    begun, free = threading.Event(), threading.Event()
+    service.submit(lambda engine: (begun.set(), free.wait(60)))
+    assert begun.wait(60)
+    try:
+        yield
+    finally:
+        free.set()
 
 
 def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None:
-    free, begun = threading.Event(), threading.Event()
-    with serving(most=1) as (service, client):
-        hold = lambda engine: (begun.set(), free.wait(60))  # noqa: E731
-        for _ in range(2):  # one is under way, one in line
-            threading.Thread(target=asyncio.run, args=(service.ask(hold),)).start()
-            begun.wait(60)
-        while service.waiting < 1:
-            threading.Event().wait(0.01)
+    with serving(most=1) as (service, client), held(service):
+        service.submit(lambda engine: None)
         answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"])
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1
-        free.set()
-    assert service.busy == 1
+        assert service.busy == 1
 
 
 def test_an_answer_that_would_be_late_is_verify_and_recorded_so(tmp_path: Path, stream: Dataset) -> None:
-    free, begun = threading.Event(), threading.Event()
     with serving(deadline=0.05, file=tmp_path / "cell.db") as (service, client):
-        threading.Thread(target=asyncio.run, args=(service.ask(lambda engine: (begun.set(), free.wait(60))),)).start()
-        begun.wait(60)
-        answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
-        assert (answer["action"], answer["late"], answer["reason"]) == ("verify", True, "late")
-        free.set()
+        with held(service):
+            answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
+            assert (answer["action"], answer["late"], answer["reason"]) == ("verify", True, "late")
         service.deadline = 60.0
         again = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
         assert again | {"seconds": 0} == answer | {"seconds": 0}
-
-
-# Who may ask
 
 
 def test_a_token_is_asked_for_and_compared(stream: Dataset) -> None:
@@ -374,14 +370,6 @@ def test_pages_of_other_sites_are_not_served(client: Client, stream: Dataset) ->
         must_be_problem(client.get("/healthz", headers={"host": host}), 421)
     for host in ("localhost", "localhost:8000", "[::1]:8000", "192.168.0.7"):
         assert client.get("/healthz", headers={"host": host}).status_code == 200
-
-
-def test_every_answer_tells_a_browser_what_it_may_do(client: Client) -> None:
-    for path in ("/healthz", "/docs", "/nothing"):
-        headers = client.get(path).headers
-        assert headers["x-content-type-options"] == "nosniff"
-        assert headers["content-security-policy"].startswith("default-src 'self'")
-        assert "server" not in headers
 
 
 def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
@@ -443,13 +431,6 @@ def test_half_a_request_is_answered_before_its_connection_is_closed(hasty: Clien
     assert set(json.loads(body)) == {"type", "title", "status", "detail", "action"}
 
 
-@pytest.mark.parametrize("path", ["/nothing", "/acts/retrain"])
-def test_what_is_refused_by_its_head_is_refused_before_its_body_has_come(hasty: Client, path: str) -> None:
-    with socket.create_connection((hasty.base_url.host, hasty.base_url.port), timeout=60) as raw:
-        raw.sendall(half(f"POST {path}", NINE.format(RAW)))
-        assert raw.recv(10) == b"HTTP/1.1 4"
-
-
 def read_all(connection: socket.socket) -> bytes:
     """What comes until the other side closes."""
     found = b""
@@ -459,9 +440,6 @@ def read_all(connection: socket.socket) -> bytes:
     return found
 
 
-# What it remembers
-
-
 def test_a_controller_that_died_finds_its_open_decision_after_a_restart(tmp_path: Path, stream: Dataset) -> None:
     answers = []
     for _ in range(2):
@@ -469,9 +447,6 @@ def test_a_controller_that_died_finds_its_open_decision_after_a_restart(tmp_path
             answers.append(client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json() | {"seconds": 0})
             assert [each["id"] for each in client.get("/decisions?open=true").json()["decisions"]] == ["order-0"]
     assert answers[0] == answers[1]
-
-
-# The process
 
 
 def start(folder: Path, *words: str) -> tuple["subprocess.Popen[str]", str]:

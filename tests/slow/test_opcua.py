@@ -1,7 +1,6 @@
 """OPC UA by a real client: what a PLC calls, what a SCADA reads, and what strangers get."""
 
 import asyncio
-import socket
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -129,30 +128,26 @@ def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, stream: Dat
     run(cell())
 
 
-def test_the_variables_are_of_their_types_described_and_read_only(plant: Plant, run) -> None:
+def test_the_variables_and_methods_are_as_they_are_described_and_read_only(plant: Plant, run) -> None:
     async def scada() -> None:
+        page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
         for name, (type_, _, text) in opcua.VARIABLES.items():
             node = plant.node(f"Cell.{name}")
             assert await node.read_data_type_as_variant_type() is type_, name
             assert (await node.read_data_value()).Value.VariantType is type_, name
             assert (await node.read_description()).Text == text
+            assert f"| `Cell.{name}` | {type_.name} | {text} |" in page
             with pytest.raises(ua.UaStatusCodeError):
                 await node.write_value(await node.read_value())
         with pytest.raises(ua.UaStatusCodeError):
             await plant.client.nodes.objects.add_folder(plant.index, "mine")
-
-    run(scada())
-
-
-def test_the_methods_say_what_they_take_and_give(plant: Plant, run) -> None:
-    async def plc() -> None:
         for method, (taken, given) in (("Decide", opcua.DECIDE), ("Report", opcua.REPORT)):
             for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
                 node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
                 said = [(each.Name, each.DataType.Identifier, each.ValueRank) for each in await node.read_value()]
                 assert said == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
 
-    run(plc())
+    run(scada())
 
 
 def test_a_request_that_is_asked_again_has_the_same_answer(plant: Plant, stream: Dataset, run) -> None:
@@ -173,14 +168,10 @@ def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
     bad, few, many = ua.uaerrors.BadInvalidArgument, ua.uaerrors.BadArgumentsMissing, ua.uaerrors.BadTooManyArguments
     return [
         ("Decide", (), few),
-        ("Decide", (trace, one, none), few),
         ("Decide", (trace, one, none, none, none), many),
         ("Decide", (ua.Variant([1.0] * 60, ua.VariantType.Double), one, none, none), bad),
-        ("Decide", (ua.Variant(1.0, FLOAT), one, none, none), bad),
-        ("Decide", (ua.Variant(["1"], TEXT), one, none, none), bad),
         ("Decide", (ua.Variant([], FLOAT, is_array=True), one, none, none), bad),
         ("Decide", (trace, ua.Variant(0, COUNT), none, none), bad),
-        ("Decide", (trace, ua.Variant(7, COUNT), none, none), bad),
         ("Decide", (trace, ua.Variant(2, COUNT), none, none), bad),  # two channels of a cell of one
         ("Decide", (ua.Variant([1.0] * 10, FLOAT), one, none, none), bad),
         ("Decide", (trace, one, ua.Variant("a\nb", TEXT), none), bad),
@@ -191,7 +182,7 @@ def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:
     ]
 
 
-@pytest.mark.parametrize(("method", "arguments", "status"), wrong_calls(), ids=range(16))
+@pytest.mark.parametrize(("method", "arguments", "status"), wrong_calls(), ids=range(12))
 def test_a_wrong_call_is_a_bad_status_and_says_why(
     plant: Plant, run, method: str, arguments: tuple[Any, ...], status: type
 ) -> None:
@@ -201,15 +192,6 @@ def test_a_wrong_call_is_a_bad_status_and_says_why(
             await plant.call(method, *arguments)
         assert (await plant.value("LastRefused")).startswith("Expected ")
         assert await plant.decisions() == before
-
-    run(plc())
-
-
-def test_bad_samples_are_verified_and_not_refused(plant: Plant, stream: Dataset, run) -> None:
-    async def plc() -> None:
-        for i, odd in enumerate((float("nan"), float("inf"))):
-            action, _, reason, *_ = await plant.decide(np.r_[odd, stream.X[0][1:]], f"odd-{i}")
-            assert (action, reason) == (VERIFY, "not_finite")
 
     run(plc())
 
@@ -283,24 +265,6 @@ def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService, run)
     for options in ({}, {"token": "a token"}, {"cert": "c.pem", "key": "k.pem"}):
         with pytest.raises(SettingError, match="a token, a certificate and a key"):
             run(serve(host="0.0.0.0", **options))
-
-
-def test_the_page_lists_every_variable_as_it_is() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
-    for name, (type_, _, text) in opcua.VARIABLES.items():
-        assert f"| `Cell.{name}` | {type_.name} | {text} |" in page
-
-
-def test_a_port_in_use_is_an_error(service: CellService, run) -> None:
-    async def serve(port: int) -> None:
-        async with opcua.opcua_server(service, port=port):
-            raise AssertionError("it must not be served")
-
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        with pytest.raises(OSError, match="address already in use"):
-            run(serve(taken.getsockname()[1]))
 
 
 @pytest.fixture(scope="module")
