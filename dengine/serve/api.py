@@ -171,26 +171,24 @@ async def read_trace(request: Request) -> tuple[NDArray[Any], str | None, str | 
     asked: TraceRequest | RawQuery
     if media_type(request) == RAW:
         asked = read_query(request, RawQuery)
-        trace = _floats(await request.body(), asked.channels)
+        trace = _samples(await request.body(), asked.channels)
     else:
         asked = await read_struct(request, TraceRequest, RAW)
-        trace = _floats(asked.trace, 1) if isinstance(asked.trace, bytes) else _samples(asked.trace)
+        trace = _samples(asked.trace, 1)
     return trace, None if asked.request is UNSET else asked.request, None if asked.part is UNSET else asked.part
 
 
-def _floats(raw: bytes, channels: int) -> NDArray[Any]:
-    if not raw or len(raw) % (4 * channels):
-        raise Refusal(
-            422, f"Expected float32, little-endian, channel after channel, {channels} of them, got {len(raw)} bytes."
-        )
-    values = np.frombuffer(raw, dtype="<f4")
-    return values if channels == 1 else values.reshape(channels, -1)
-
-
-def _samples(value: list[Any]) -> NDArray[Any]:
+def _samples(given: bytes | list[Any], channels: int) -> NDArray[Any]:
     try:
-        samples = np.array(value, dtype=np.float64)  # None becomes NaN
+        if isinstance(given, bytes):
+            samples = np.frombuffer(given, dtype="<f4")
+            samples = samples if channels == 1 else samples.reshape(channels, -1)
+        else:
+            samples = np.array(given, dtype=np.float64)  # None becomes NaN
     except ValueError as error:
+        if isinstance(given, bytes):
+            held = f"float32, little-endian, channel after channel, {channels} of them"
+            raise Refusal(422, f"Expected {held}, got {len(given)} bytes.") from error
         raise Refusal(422, "Expected a list of numbers, or a list as long for each channel.") from error
     if not samples.size:
         raise Refusal(422, "Expected a trace of at least one sample, got none.")

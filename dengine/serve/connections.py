@@ -19,7 +19,6 @@ from .api import problem
 
 HEAD_SECONDS = 10.0  # from a connection, or from the first byte after an answer, to the end of the request's head
 FEWEST = 8  # places of one address, where half of all are fewer
-FULL = "Expected fewer connections at once (dengine serve --connections); verify the part, and try again."
 
 
 class Places:
@@ -65,7 +64,8 @@ class Connection(asyncio.Protocol):
         self._address = str((transport.get_extra_info("peername") or ("",))[0])
         self._has_place = places.taken.total() < places.most and places.taken[self._address] < places.of_address
         if not self._has_place:
-            self._end(HTTPStatus.SERVICE_UNAVAILABLE, FULL)
+            full = "Expected fewer connections at once (dengine serve --connections); verify the part, and try again."
+            self._end(HTTPStatus.SERVICE_UNAVAILABLE, full)
             return
         places.taken[self._address] += 1
         self.inner.connection_made(self)  # type: ignore[arg-type]  # it is one by what it can do
@@ -103,7 +103,8 @@ class Connection(asyncio.Protocol):
         """The client sends no more: what it asked is answered, half a head is refused."""
         self._ended = True
         if self._begun and not self.asked:  # a head that is whole is told of by then, or within this turn of the loop
-            asyncio.get_running_loop().call_soon(self._refuse_half)
+            half = HTTPStatus.BAD_REQUEST, "Expected the whole of the request."
+            asyncio.get_running_loop().call_soon(lambda: self.asked or self._end(*half))
         return self._begun or self.asked
 
     def write(self, data: bytes) -> None:
@@ -124,10 +125,6 @@ class Connection(asyncio.Protocol):
         if self._ended:
             self._transport.close()
 
-    def _refuse_half(self) -> None:
-        if not self.asked:
-            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
-
     def _end(self, status: HTTPStatus, detail: str) -> None:
         """Answer outside of HTTP's course, and close."""
         if self._transport.is_closing():
@@ -140,12 +137,11 @@ class Connection(asyncio.Protocol):
 
     def _wait(self) -> None:
         if self._timer is None:
-            self._timer = asyncio.get_running_loop().call_later(self._places.head_seconds, self._give_up)
+            seconds = self._places.head_seconds
+            late = HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {seconds:g} s."
+            self._timer = asyncio.get_running_loop().call_later(seconds, self._end, *late)
 
     def _stop_waiting(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-
-    def _give_up(self) -> None:
-        self._end(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's head within {self._places.head_seconds:g} s.")

@@ -65,11 +65,11 @@ class HttpApi:
     def operations(self) -> list[Operation]:
         """Every path and method."""
         one: dict[str, Any] = {"trace": [0.1, 1.5, 2.25, None, 0.4], "request": "order-7", "part": "P-1007"}
-        two: dict[str, Any] = {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
-        reported = ({"id": "order-7", "success": True},)
+        traces = one, {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
+        reports = ({"id": "order-7", "success": True},)
         return [
-            Operation("POST", "/decide", self.decide, "Answer", (409, 503), TraceRequest, RawQuery, (one, two), raw=True),
-            Operation("POST", "/report", self.report, "Told", (404, 409, 503), Report, examples=reported),
+            Operation("POST", "/decide", self.decide, "Answer", (409, 503), TraceRequest, RawQuery, traces, raw=True),
+            Operation("POST", "/report", self.report, "Told", (404, 409, 503), Report, examples=reports),
             Operation("GET", "/status", self.status, "Status", (503,)),
             Operation("GET", "/decisions", self.decisions, "Decisions", (422, 503), query=ListQuery),
             Operation("GET", "/decisions/{id:path}", self.decision, "Decision", (404, 422, 503), query=DetailQuery),

@@ -170,9 +170,12 @@ class AddressSpace:
         """Make the object, its variables and methods, and what tells of alarms."""
         self._index = await self._server.register_namespace(NAMESPACE)
         cell = await self._server.nodes.objects.add_object(self._id(CELL), self._name(CELL))
-        for name, (type_, _, text) in VARIABLES.items():
-            await self._variable(cell, name, type_, text)
-        await self._variable(cell, REFUSED, VariantType.String, "why the newest call was refused")
+        refused = {REFUSED: (VariantType.String, "", "why the newest call was refused")}
+        for name, (type_, _, text) in {**VARIABLES, **refused}.items():
+            first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
+            node = await cell.add_variable(self._id(f"{CELL}.{name}"), self._name(name), first, type_)
+            await node.write_attribute(AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
+            self._nodes[name] = node
         for name, call, (taken, given) in (("Decide", self.decide, DECIDE), ("Report", self.report, REPORT)):
             checked = self._checked(call, taken, given)
             arguments = [_argument(*each) for each in taken], [_argument(*each) for each in given]
@@ -227,12 +230,6 @@ class AddressSpace:
             await self._events.trigger(message=now["alarm"] or f"Over: {self._alarm}")
             self._alarm = now["alarm"]
 
-    async def _variable(self, cell: Node, name: str, type_: VariantType, text: str) -> None:
-        first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
-        node = await cell.add_variable(self._id(f"{CELL}.{name}"), self._name(name), first, type_)
-        await node.write_attribute(AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
-        self._nodes[name] = node
-
     def _checked(
         self, call: Callable[..., Awaitable[list[Any]]], taken: list[Argument], given: list[Argument]
     ) -> Callable[..., Awaitable[Any]]:
@@ -240,22 +237,23 @@ class AddressSpace:
 
         @wraps(call)
         async def method(parent: ua.NodeId, *arguments: ua.Variant) -> Any:
-            if (wrong := _wrong(arguments, taken)) is not None:
-                return await self._refuse(wrong.StatusCode, f"Expected {_listed(taken)}.", wrong)
-            try:
-                answer = await call(*(each.Value for each in arguments))
-            except DengineError as error:
-                return await self._refuse(_status(StatusCodes.BadInvalidArgument), str(error))
-            except Exception:  # ours: the log has it, the caller verifies
-                log.exception("a call over OPC UA failed")
-                return await self._refuse(_status(StatusCodes.BadInternalError), "The server failed on this call.")
-            return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
+            wrong: Any = _wrong(arguments, taken)
+            if wrong is not None:
+                listed = ", ".join(f"{name} ({kind.name}{' array' if array else ''})" for name, kind, array, _ in taken)
+                said = f"Expected {listed}."
+            else:
+                try:
+                    answer = await call(*(each.Value for each in arguments))
+                    return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
+                except DengineError as error:
+                    wrong, said = _status(StatusCodes.BadInvalidArgument), str(error)
+                except Exception:  # ours: the log has it, the caller verifies
+                    log.exception("a call over OPC UA failed")
+                    wrong, said = _status(StatusCodes.BadInternalError), "The server failed on this call."
+            await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(one_line(said), VariantType.String)))
+            return wrong
 
         return method
-
-    async def _refuse(self, status: ua.StatusCode, text: str, result: Any = None) -> Any:
-        await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(one_line(text), VariantType.String)))
-        return status if result is None else result
 
     def _id(self, text: str) -> ua.NodeId:
         return ua.NodeId(ua.String(text), ua.Int16(self._index))
@@ -269,14 +267,12 @@ def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> ua.CallM
     if len(arguments) != len(taken):
         few = len(arguments) < len(taken)
         return ua.CallMethodResult(_status(StatusCodes.BadArgumentsMissing if few else StatusCodes.BadTooManyArguments))
-    codes = [
-        StatusCodes.Good
-        if each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
-        else StatusCodes.BadTypeMismatch
+    fits = [
+        each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
         for each, (_, type_, array, _) in zip(arguments, taken, strict=True)
     ]
-    bad = any(code != StatusCodes.Good for code in codes)
-    return ua.CallMethodResult(_status(StatusCodes.BadInvalidArgument), list(map(_status, codes))) if bad else None
+    codes = [_status(StatusCodes.Good if each else StatusCodes.BadTypeMismatch) for each in fits]
+    return None if all(fits) else ua.CallMethodResult(_status(StatusCodes.BadInvalidArgument), codes)
 
 
 def _status(code: int) -> ua.StatusCode:
@@ -286,7 +282,3 @@ def _status(code: int) -> ua.StatusCode:
 def _argument(name: str, type_: VariantType, array: bool, text: str) -> ua.Argument:
     rank, dimensions = (ua.ValueRank.OneDimension, [0]) if array else (ua.ValueRank.Scalar, [])
     return ua.Argument(name, ua.NodeId(ua.Int32(type_.value)), rank, dimensions, ua.LocalizedText(text))
-
-
-def _listed(taken: list[Argument]) -> str:
-    return ", ".join(f"{name} ({type_.name}{' array' if array else ''})" for name, type_, array, _ in taken)

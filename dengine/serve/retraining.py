@@ -25,6 +25,8 @@ import torch
 from torch import Tensor
 
 LARGE = 1 << 16  # bytes that are sent by themselves
+NICE = 10  # decisions first, where cores are scarce
+ENDED = "The retraining process has ended."
 
 
 class _Pickler(pickle.Pickler):
@@ -79,9 +81,6 @@ def receive(connection: Connection) -> Any:
         connection.recv_bytes_into(each)
     return pickle.loads(main, buffers=large)
 
-
-NICE = 10  # decisions first, where cores are scarce
-ENDED = "The retraining process has ended."
 
 T = TypeVar("T")
 
@@ -151,10 +150,8 @@ def retraining_process() -> Iterator[Executor]:
         yield process
 
 
-# In that process
-
-
 def _work(connection: Connection) -> None:
+    """In that process: answer calls, one after the other, until the other side ends."""
     with suppress(AttributeError, OSError):  # there is none on Windows
         os.nice(NICE)
     threading.Thread(target=_end_with_parent, name="dengine-parent", daemon=True).start()

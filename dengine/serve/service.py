@@ -53,11 +53,10 @@ class Job(NamedTuple):
         wanted = self.future.set_running_or_notify_cancel()
         try:
             result = self.work(engine, not wanted)
+            if wanted:
+                self.future.set_result(result)
         except BaseException as error:  # whoever asked is told
             self.future.set_exception(error) if wanted else log.error("a decision that came too late failed: %s", error)
-            return
-        if wanted:
-            self.future.set_result(result)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +119,6 @@ class CellService:
         self.engine = opened.result()  # its facts may be read in any thread, its verbs only by `ask`
         self.reading = self.engine.store if store is None else open_store(store)
 
-    # What interfaces ask
-
     async def decide(self, trace: ArrayLike, request: str | None = None, part: str | int | None = None) -> Answer:
         """Decide on a trace, (T,) or (channels, T).
 
@@ -129,9 +126,9 @@ class CellService:
         TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
         """
         begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else as_id(request)
+        # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
 
         def work(engine: DataEngine, late: bool) -> Decision:
-            # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
             given = id_ if late or request is not None else None
             return engine.decide(trace, part, decision_id=given, late=late)
 
@@ -139,9 +136,10 @@ class CellService:
         answer = asyncio.wrap_future(future)
         await asyncio.wait([answer], timeout=self.deadline)
         if answer.done() or not future.cancel():
-            return self._heard(Answer(await answer, time.monotonic() - begin))
-        decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
-        self.late += 1
+            decision = await answer
+        else:
+            decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
+            self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
     async def report(self, decision_id: str, success: float) -> Told:
@@ -251,8 +249,6 @@ class CellService:
             observe(news)  # type: ignore[arg-type]  # only what the list is of
         return news
 
-    # In the engine's thread
-
     def _serve(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
         try:
             engine = make()
@@ -278,16 +274,14 @@ class CellService:
             try:
                 return self._jobs.get(timeout=patience)
             except queue.Empty:
-                self._settle(engine)
-                patience = SOON if engine.swapping else IDLE
-
-    def _settle(self, engine: DataEngine) -> None:
-        try:
-            if (report := engine.settle(brief=True)) is not None:
-                self._heard(report)
-                self._tell()
-        except Exception:  # whatever it is, the next request is answered
-            log.exception("what the engine does between requests failed")
+                pass
+            try:
+                if (report := engine.settle(brief=True)) is not None:
+                    self._heard(report)
+                    self._tell()
+            except Exception:  # whatever it is, the next request is answered
+                log.exception("what the engine does between requests failed")
+            patience = SOON if engine.swapping else IDLE
 
     def _tell(self) -> None:
         for loop, changed in tuple(self._listeners):

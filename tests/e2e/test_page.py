@@ -6,11 +6,10 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from zipfile import ZipFile
@@ -21,6 +20,7 @@ from dengine import Action, DataEngine, Dataset, Policy, load_exported
 from dengine.recipe import Recipe
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
+from tests.support.serving import served
 
 REQUIRED = os.environ.get("DENGINE_REQUIRE_BROWSER") == "1"
 CHROMIUM = shutil.which("chromium")
@@ -35,13 +35,12 @@ def missing(what: str) -> None:
 if CHROMIUM is None:
     missing("Debian's chromium")
 try:
-    import uvicorn
+    import uvicorn  # noqa: F401
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import Browser, Page, expect, sync_playwright
 
     from dengine.serve.http import create_app
     from dengine.serve.page import routes  # noqa: F401
-    from dengine.serve.server import bound
     from dengine.serve.service import CellService
 except ImportError as error:
     missing(str(error))
@@ -261,21 +260,6 @@ def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(browser: Bro
     context.close()
 
 
-@contextmanager
-def served(service: CellService, port: int = 0) -> Iterator[int]:
-    """A server in a thread of this process; gives its port."""
-    with bound("127.0.0.1", port) as listening:
-        app = create_app(service, interfaces=("page",))
-        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
-        thread = threading.Thread(target=server.run, args=([listening],))
-        thread.start()
-        try:
-            yield listening.getsockname()[1]
-        finally:
-            server.should_exit = True
-            thread.join()
-
-
 def stopped_until_safe(service: CellService, data: Dataset) -> str:
     """Parts, until accepted ones that are said to have stopped the line bring on the safe mode; the id of the last."""
 
@@ -305,7 +289,7 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
     context = browser.new_context(viewport={"width": 390, "height": 844}, locale="en-GB")
     context.set_default_timeout(PATIENT)
     page = context.new_page()
-    with closing(service), served(service) as port:
+    with closing(service), served(create_app(service, interfaces=("page",))) as port:
         demo = DemoCell(f"http://127.0.0.1:{port}", file)
         opened(page, demo)
         last = stopped_until_safe(service, data)  # while somebody looks on
@@ -337,12 +321,12 @@ def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser) -> None
     context = browser.new_context(locale="en")
     context.set_default_timeout(PATIENT)
     page = context.new_page()
-    with served(service) as port:
+    with served(create_app(service, interfaces=("page",))) as port:
         page.goto(f"http://127.0.0.1:{port}/")
         expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
         boot = page.evaluate("document.body.dataset.boot")
     expect(page.locator("#cut")).to_contain_text("What you see is old", timeout=PATIENT)
-    with served(service, port):
+    with served(create_app(service, interfaces=("page",)), port):
         expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
         expect(page.locator("#cut")).to_be_hidden()
         page.wait_for_function("was => document.body.dataset.boot !== was", arg=boot)  # it took the new server's token

@@ -9,10 +9,8 @@ import socket
 import ssl
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +25,6 @@ httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not insta
 msgpack = pytest.importorskip("msgspec.msgpack")
 jsonschema = pytest.importorskip("jsonschema")
 
-import uvicorn  # not before it is known to be there
-
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.cli import main
 from dengine.errors import SettingError
@@ -36,8 +32,9 @@ from dengine.serve import http as http_routes
 from dengine.serve.auth import Access
 from dengine.serve.connections import Places
 from dengine.serve.http import create_app
-from dengine.serve.server import CellServer, Serving, uvicorn_options
+from dengine.serve.server import Serving, uvicorn_options
 from dengine.serve.service import CellService
+from tests.support.serving import certificate, held, served
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 TOKEN = "correct-horse-battery-staple"
@@ -52,21 +49,13 @@ def running(
     service: CellService, access: Access | None = None, interfaces: tuple[str, ...] = ("http",), **limits: Any
 ) -> Iterator[Client]:
     """A client of a server in front of this service."""
-    app, begun = create_app(service, access or Access(rate=0.0), interfaces), threading.Event()
+    app = create_app(service, access or Access(rate=0.0), interfaces)
     options = uvicorn_options(Serving()) | {"http": Places(**{"connections": 100} | limits).connection}
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        server = CellServer(uvicorn.Config(app, **options), service, begun.set)
-        thread = threading.Thread(target=server.run, args=([listening],))
-        thread.start()
-        assert begun.wait(60)
-        try:
-            with httpx.Client(
-                base_url=f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=60, trust_env=False
-            ) as client:
-                yield client
-        finally:
-            server.should_exit = True
-            thread.join()
+    with (
+        served(app, **options) as port,
+        httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60, trust_env=False) as client,
+    ):
+        yield client
 
 
 @contextmanager
@@ -308,18 +297,6 @@ def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header
     must_be_problem(client.get("/decisions/../../etc/passwd"), 404)
 
 
-@contextmanager
-def held(service: CellService) -> Iterator[None]:
-    """The engine's thread, busy with something else."""
-    begun, free = threading.Event(), threading.Event()
-    service.submit(lambda engine: (begun.set(), free.wait(60)))
-    assert begun.wait(60)
-    try:
-        yield
-    finally:
-        free.set()
-
-
 def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None:
     with serving(most=1) as (service, client), held(service):
         service.submit(lambda engine: None)
@@ -458,29 +435,11 @@ def start(folder: Path, *words: str) -> tuple["subprocess.Popen[str]", str]:
     return process, process.stdout.readline().rstrip(".\n").rpartition(":")[2]
 
 
-def certificate(folder: Path) -> None:
-    """Files for TLS by the name of localhost: cert.pem, key.pem, and locked.pem with a password; and a token."""
-    x509 = pytest.importorskip("cryptography.x509", reason="the test's certificate needs cryptography")
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    made = x509.CertificateBuilder(name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(1))
-    made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), False)
-    (folder / "cert.pem").write_bytes(made.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
-    locks = {"key.pem": serialization.NoEncryption(), "locked.pem": serialization.BestAvailableEncryption(b"secret")}
-    for file, lock in locks.items():
-        form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
-        (folder / file).write_bytes(key.private_bytes(*form, lock))
-    (folder / "token").write_text(TOKEN, encoding="ascii")
-    (folder / "token").chmod(0o600)
-
-
 def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_store(
     tmp_path: Path, stream: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certificate(tmp_path)
+    make_token(tmp_path)
     words = ("--shadow", "--host", "0.0.0.0", "--token-file", "token", "--cert", "cert.pem", "--key", "key.pem")
     process, port = start(tmp_path, *words)
     monkeypatch.delenv("DENGINE_STORE_WAIT", raising=False)  # as a cell waits for its store: the tests' own wait is long
@@ -514,6 +473,11 @@ def test_what_the_verb_does_by_default_is_what_serving_does() -> None:
     assert {name: typed[name] for name in names} == {name: getattr(Serving(), name) for name in names}
 
 
+def make_token(folder: Path, text: str = TOKEN, mode: int = 0o600) -> None:
+    (folder / "token").write_text(text, encoding="ascii")
+    (folder / "token").chmod(mode)
+
+
 def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp_path: Path) -> None:
     certificate(tmp_path)
     token, locked = tmp_path / "token", ["--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "locked.pem")]
@@ -526,8 +490,7 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(tmp
         (["--cert", str(token)], "--cert and --key together", 0o600),
         (locked, "Expected a key without a password", 0o600),
     ):
-        token.write_text("short", encoding="ascii")
-        token.chmod(mode)
+        make_token(tmp_path, "short", mode)
         done = CliRunner().invoke(main, [*serve, *words])
         assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
         assert text in done.output

@@ -2,9 +2,7 @@
 
 import asyncio
 import shutil
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +10,7 @@ import pytest
 from dengine import DataEngine, Dataset, Policy, Reason, Recipe
 from dengine.errors import BusyError, ReportError, StoreError, TraceError
 from dengine.serve.service import CellService
+from tests.support.serving import held
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 
@@ -71,18 +70,6 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(service: CellService, strea
     asyncio.run(cell())
     assert service.reading.status()["decisions"] == 3
     assert service.late == 2
-
-
-@contextmanager
-def held(service: CellService) -> Iterator[None]:
-    """The engine's thread, busy with something else."""
-    begun, free = threading.Event(), threading.Event()
-    service.submit(lambda engine: (begun.set(), free.wait(60)))
-    assert begun.wait(60)
-    try:
-        yield
-    finally:
-        free.set()
 
 
 def test_a_full_line_takes_no_more_and_records_nothing_of_it(stream: Dataset) -> None:

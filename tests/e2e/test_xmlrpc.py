@@ -2,9 +2,9 @@
 
 import asyncio
 import http.client
-import threading
 import xmlrpc.client
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +16,10 @@ from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.errors import DataError
 from dengine.serve.robot_calls import SAMPLES, RobotCalls
 from dengine.serve.service import CellService
+from tests.support.serving import held, served
 
-served = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
-uvicorn = pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
+xml_rpc = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
+pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 Starlette = pytest.importorskip("starlette.applications").Starlette
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
@@ -42,19 +43,10 @@ class Recorder:
 
 
 class Cell:
-    """A server in a thread of its own, on a port of its own, and what is behind it."""
+    """What is behind a server, and how it is asked."""
 
-    def __init__(self, folder: Path) -> None:
-        file = folder / "cell.db"
-        self.service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
-        self.recorder = Recorder()
-        app = Starlette(routes=served.routes(self.service, self.recorder, patience=0.1, most=200_000))
-        self._server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", lifespan="off"))
-        self._thread = threading.Thread(target=self._server.run)
-        self._thread.start()
-        while not self._server.started:
-            self._thread.join(0.01)
-        self.port = self._server.servers[0].sockets[0].getsockname()[1]
+    def __init__(self, service: CellService, recorder: Recorder, port: int) -> None:
+        self.service, self.recorder, self.port = service, recorder, port
 
     def robot(self) -> xmlrpc.client.ServerProxy:
         return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
@@ -70,11 +62,6 @@ class Cell:
     def find(self, id_: str) -> Any:
         return asyncio.run(self.service.find(id_))
 
-    def close(self) -> None:
-        self._server.should_exit = True
-        self._thread.join()
-        self.service.close()
-
 
 @pytest.fixture(scope="module")
 def stream(make_data) -> Dataset:
@@ -83,14 +70,17 @@ def stream(make_data) -> Dataset:
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[Cell]:
-    made = Cell(tmp_path_factory.mktemp("cell"))
-    robot = made.robot()
-    for i in range(50):  # it retrains after 40
-        answer = robot.decide(stream.X[i].tolist())
-        if answer["action"] == VERIFY:
-            assert robot.report(answer["id"], bool(stream.y[i]))
-    yield made
-    made.close()
+    file, recorder = tmp_path_factory.mktemp("cell") / "cell.db", Recorder()
+    service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
+    app = Starlette(routes=xml_rpc.routes(service, recorder, patience=0.1, most=200_000))
+    with closing(service), served(app, lifespan="off") as port:
+        made = Cell(service, recorder, port)
+        robot = made.robot()
+        for i in range(50):  # it retrains after 40
+            answer = robot.decide(stream.X[i].tolist())
+            if answer["action"] == VERIFY:
+                assert robot.report(answer["id"], bool(stream.y[i]))
+        yield made
 
 
 def fault_of(answer: tuple[int, bytes]) -> xmlrpc.client.Fault:
@@ -114,7 +104,7 @@ def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> 
     for i, answer in enumerate(answers):
         assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (f"order-{i}", int, float)
         known = cell.find(f"order-{i}")
-        assert (known.part, np.array_equal(known.trace[0], stream.X[50 + i])) == (f"P{i}", True)
+        assert (known.decision.part, np.array_equal(known.trace[0], stream.X[50 + i])) == (f"P{i}", True)
 
 
 def test_a_request_that_is_asked_again_has_the_same_answer(cell: Cell, stream: Dataset) -> None:
@@ -124,7 +114,7 @@ def test_a_request_that_is_asked_again_has_the_same_answer(cell: Cell, stream: D
     assert robot.action(stream.X[0].tolist(), "again") == first["action"]
     with pytest.raises(xmlrpc.client.Fault, match="got another") as caught:
         robot.decide(stream.X[1].tolist(), "again")
-    assert caught.value.faultCode == served.REFUSED
+    assert caught.value.faultCode == xml_rpc.REFUSED
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
@@ -175,17 +165,13 @@ def test_what_was_not_recorded_is_verified_and_no_fault(cell: Cell, stream: Data
 
 
 def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset, monkeypatch) -> None:
-    robot, free, begun = cell.robot(), threading.Event(), threading.Event()
-    with monkeypatch.context() as patch:
+    robot = cell.robot()
+    with monkeypatch.context() as patch, held(cell.service):
         patch.setattr(cell.service._jobs, "maxsize", 1)
-        held = cell.service.submit(lambda engine: (begun.set(), free.wait(60)))
-        begun.wait(60)
-        waiting = cell.service.submit(lambda engine: None)
+        cell.service.submit(lambda engine: None)
         answer = robot.decide(stream.X[0].tolist(), "too much")
         assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
         assert robot.report("order-1", True) is False
-        free.set()
-        held.result(60), waiting.result(60)
     assert cell.find("too much") is None
 
 
@@ -206,7 +192,7 @@ def test_reports_are_a_bool_and_one_a_decision(cell: Cell, stream: Dataset) -> N
     for said in (False, "OK", -1):
         with pytest.raises(xmlrpc.client.Fault) as caught:
             robot.report("far", said)
-        assert caught.value.faultCode == served.NO_REPORT
+        assert caught.value.faultCode == xml_rpc.NO_REPORT
     assert robot.report("unheard of", True) is False
 
 
@@ -231,14 +217,14 @@ NO_CALLS = [
 ]
 NO_TRACES = [[], [1.0, "2"], [True, 1.0], [[1.0], [1.0, 2.0]], [[[1.0]]], "1,2,3", 5, [1.0] * 10]
 FAULTS = [
-    *((body, served.NOT_XML) for body in NO_CALLS),
-    *((call("decide", trace), served.REFUSED) for trace in NO_TRACES),
-    (INSIDE.replace(b"status", b"decide") % DEEP, served.REFUSED),
-    (call("system.listMethods"), served.NO_METHOD),
-    (call("__init__"), served.NO_METHOD),
-    (call("decide"), served.WRONG_ARGUMENTS),
-    (call("report", "a", True, 1), served.WRONG_ARGUMENTS),
-    (call("decide", [1.0], "a\nb"), served.NO_REPORT),
+    *((body, xml_rpc.NOT_XML) for body in NO_CALLS),
+    *((call("decide", trace), xml_rpc.REFUSED) for trace in NO_TRACES),
+    (INSIDE.replace(b"status", b"decide") % DEEP, xml_rpc.REFUSED),
+    (call("system.listMethods"), xml_rpc.NO_METHOD),
+    (call("__init__"), xml_rpc.NO_METHOD),
+    (call("decide"), xml_rpc.WRONG_ARGUMENTS),
+    (call("report", "a", True, 1), xml_rpc.WRONG_ARGUMENTS),
+    (call("decide", [1.0], "a\nb"), xml_rpc.NO_REPORT),
 ]
 
 
@@ -262,7 +248,7 @@ def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell: Cell,
 
     monkeypatch.setattr(cell.service, "decide", broken)
     fault = fault_of(cell.post(call("decide", [1.0] * 60)))
-    assert fault.faultCode == served.OURS
+    assert fault.faultCode == xml_rpc.OURS
     assert "secret" not in fault.faultString
     assert "a call failed" in caplog.text
 

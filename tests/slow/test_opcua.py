@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import pytest
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.errors import SettingError
 from dengine.serve.service import CellService
+from tests.support.serving import certificate
 
 pytest.importorskip("asyncua", reason="OPC UA needs the extra `opcua`")
 Client, ua = (getattr(pytest.importorskip("asyncua"), name) for name in ("Client", "ua"))
@@ -267,29 +267,11 @@ def test_elsewhere_it_wants_a_token_and_a_certificate(service: CellService, run)
             run(serve(host="0.0.0.0", **options))
 
 
-@pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import rsa
-
-    key = rsa.generate_private_key(65537, 2048)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "dengine")])
-    now = datetime.now(UTC)
-    made = x509.CertificateBuilder(name, name, key.public_key(), 1, now - timedelta(days=1), now + timedelta(days=2))
-    others = [x509.UniformResourceIdentifier("urn:dengine:server"), x509.DNSName("localhost")]
-    signed = made.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(key, hashes.SHA256())
-    folder = tmp_path_factory.mktemp("certificate")
-    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
-    (folder / "cert.pem").write_bytes(signed.public_bytes(pem))
-    (folder / "key.pem").write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
-    return folder / "cert.pem", folder / "key.pem"
-
-
 def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
-    service: CellService, certificate: tuple[Path, Path], run, monkeypatch: pytest.MonkeyPatch
+    service: CellService, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cert, key = certificate
+    certificate(tmp_path, "urn:dengine:server")
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
     encrypted = f"Basic256Sha256,SignAndEncrypt,{cert},{key}"
 
     async def connect(port: int, security: str | None, user: str, password: str) -> int:
