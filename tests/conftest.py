@@ -39,7 +39,6 @@ MERGE = (
     "test_onnx_program",
     "test_estimators",
     "test_store_postgres",
-    "test_store_kill",
     "test_site",
 )
 

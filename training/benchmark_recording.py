@@ -12,7 +12,6 @@ for so many seconds against the same controller.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from common import POLICY, options
 from rich.console import Console
 from rich.table import Table
 
@@ -33,11 +33,11 @@ from dengine import Cell, DataEngine, Dataset, Recipe, ReplayCell, load_dataset
 from dengine.cells import FakeController, UrCell
 from dengine.cells.ur import RobotProgram, Trouble
 from dengine.cli.output import duration
+from dengine.experiments.tables import write_csv
 
 SHARE = 0.5  # of the insertions that something goes wrong in
 LONGEST = {"drop": 60, "hold": 150}  # cycles
 KINDS = ("drop", "hold", "close", "half", "garbage", "repeat")
-POLICY = {"alpha": 0.1, "lower_bound": 0.9}
 MINE = "127.30.0.4"  # an address of the loopback: ur_rtde's port is fixed
 THEIRS = """
 import sys, time, rtde_receive
@@ -151,14 +151,12 @@ def table(found: pd.DataFrame) -> Table:
 
 def main() -> None:
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__, samples=None, out=None)
     parser.add_argument("--insertions", type=int, default=300, help="that the robot makes")
     parser.add_argument("--speed", type=float, default=1.0, help="against real time; 0: as fast as it is read")
-    parser.add_argument("--samples", type=int, default=None, help="of each trace; default: all 1000")
     parser.add_argument("--recipes", default="pca", help="with commas between; each is compared with a replay")
     parser.add_argument("--seed", type=int, default=0, help="of the faults")
     parser.add_argument("--ur-rtde", type=float, default=0.0, metavar="SECONDS", help="measure ur_rtde's recorder too")
-    parser.add_argument("--out", type=Path, default=None, help="folder for recording.csv")
     asked = parser.parse_args()
     if asked.ur_rtde > 0 and find_spec("rtde_receive") is None:
         parser.error('expected ur_rtde for --ur-rtde, it is not installed: pip install "dengine[ur]"')
@@ -174,9 +172,7 @@ def main() -> None:
     if asked.ur_rtde > 0:
         console.print(theirs(asked.ur_rtde))
     if asked.out is not None:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        found.to_csv(asked.out / "recording.csv", index=False)
-        console.print(f"Wrote {asked.out / 'recording.csv'}")
+        console.print(f"Wrote {write_csv(found, asked.out / 'recording.csv', force=True)}")
 
 
 if __name__ == "__main__":

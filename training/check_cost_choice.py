@@ -13,7 +13,6 @@ above, below : of these, how often `elsewhere` was above or below the interval.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +20,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from common import options
 
 from dengine import Dataset, Policy, Replay, load_dataset
 from dengine.experiments.costs import ALPHAS, LOWER_BOUNDS, cost_a_part, cost_tasks, curve_of
 from dengine.experiments.grid import play_tasks
 from dengine.experiments.metrics import Costs
+from dengine.experiments.tables import write_csv
 
 
 def disjoint(data: Dataset, parts: int, seed: int = 0) -> list[Dataset]:
@@ -60,33 +61,25 @@ def mean_cost(replays: Sequence[Replay], policy: Policy, costs: Costs) -> float:
 
 def main() -> None:
     """Parse, play, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--recipe", default="pca", help="a recipe's name, or a TOML file")
+    parser = options(__doc__, data="insertion", samples=None, recipe="pca", n_jobs=2, out=Path("out"))
     parser.add_argument("--parts", type=int, default=300, help="of each set")
     parser.add_argument("--repeats", type=int, default=10, help="shuffles of each set and policy")
     parser.add_argument("--escapes", default="30,60,120,300,600", help="costs of a bad part accepted, each a row")
     parser.add_argument("--check", type=float, default=5.0, help="cost of a check")
     parser.add_argument("--false-reject", type=float, default=47.5, help="cost of a good part rejected")
-    parser.add_argument("--n-jobs", type=int, default=2, help="processes")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for cost_choice.csv")
     args = parser.parse_args()
     tasks = cost_tasks(args.recipe, ALPHAS, LOWER_BOUNDS, range(args.repeats))
-    sets = [
-        play_tasks(each, tasks, n_jobs=args.n_jobs) for each in disjoint(load_dataset(args.data, args.samples), args.parts)
-    ]
+    cut = disjoint(load_dataset(args.data, args.samples), args.parts)
+    sets = [play_tasks(each, tasks, n_jobs=args.n_jobs) for each in cut]
     prices = [Costs(args.check, float(escape), args.false_reject) for escape in args.escapes.split(",")]
     table = pd.DataFrame([row for costs in prices for row in choices(sets, costs)])
-    args.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(args.out / "cost_choice.csv", index=False)
+    write_csv(table, args.out / "cost_choice.csv", force=True)
     shown = table.groupby("escape")[["expected", "reported", "elsewhere", "taken", "best"]].mean().round(2)
     for verdict in ("pays", "may pay"):
         shown[verdict] = (table.verdict == verdict).groupby(table.escape).sum()
-    shown = shown.join(table.groupby("escape")[["above", "below"]].sum())
     of = f"{len(sets)} sets of {args.parts} parts, {args.repeats} shuffles, {2 * len(sets)} choices"
     print(f"{args.data}, {args.recipe}: {of}")
-    print(shown.to_string())
+    print(shown.join(table.groupby("escape")[["above", "below"]].sum()).to_string())
 
 
 if __name__ == "__main__":

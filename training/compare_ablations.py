@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from compare_reducers import span
+from common import POLICY, options
 from matplotlib.figure import Figure
 from rich.console import Console
 
@@ -154,43 +154,30 @@ def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
 
 
 def main() -> None:
-    """Parse, play, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--recipe", default="conv", help="the recipe that is changed; features are conv's")
-    parser.add_argument("--alpha", type=float, default=0.1, help="error level of the interval")
-    parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
+    """Parse, play every axis that was asked for, print, write."""
+    defaults = {"data": "insertion", "samples": None, "recipe": "conv", **POLICY, "seeds": "100:110", "cycles": CYCLES}
+    parser = options(__doc__, **defaults, n_jobs=-1, keep=None, out=Path("out"))
     parser.add_argument("--only", default=",".join(AXES), help="axes, with commas between")
-    parser.add_argument("--seeds", type=span, default="100:110", help="first:last, the last one left out; a replay each")
-    parser.add_argument("--cycles", type=int, default=CYCLES, help="of a replay, at most as many as there are traces")
-    parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; times are honest with 1 only")
-    parser.add_argument("--keep", type=Path, help="folder of finished replays")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the picture")
     args = parser.parse_args()
-    with TemporaryDirectory() as kept:  # what stands on several axes, the recipe as it is, is played once
-        args.keep = args.keep or kept
-        compare(args, parser)
-
-
-def compare(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Play every axis that was asked for, print, write."""
-    unknown = set(args.only.split(",")) - set(AXES)
-    if unknown:
+    axes = args.only.split(",")
+    if unknown := set(axes) - set(AXES):
         parser.error(f"expected axes among {', '.join(AXES)}, got {', '.join(sorted(unknown))}")
     data = load_dataset(args.data, args.samples)
     base = Recipe.load(args.recipe).with_policy(alpha=args.alpha, lower_bound=args.lower_bound)
-    played = {axis: play(axis, data, base, args) for axis in args.only.split(",")}
+    with TemporaryDirectory() as kept:  # what stands on several axes, the recipe as it is, is played once
+        args.keep = args.keep or kept
+        as_it_is = shuffles("as it is", Variant(data, base), args)
+        played = {axis: play(axis, data, base, args) for axis in axes}
     for axis in (axis for axis, some in played.items() if not some):
         print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
-    as_it_is = shuffles("as it is", Variant(data, base), args)
-    replays = [replay for some in played.values() for replay in some]
-    rows = pool(frame_of(as_it_is + replays), as_it_is + replays)
+    replays = as_it_is + [replay for some in played.values() for replay in some]
+    frame = frame_of(replays)
+    rows = pool(frame, replays)
     level, seeds = f"({args.alpha:g}, {100 * args.lower_bound:g} %)", f"seeds {args.seeds[0]} to {args.seeds[-1]}"
     title = f"{args.recipe} on {data.name}, {level}, {seeds}"
     Console(width=100).print(pooled_table(rows, title))
-    print(f"Wrote {write_csv(frame_of(as_it_is + replays), args.out / 'ablations.csv', force=True)}")
-    if replays:
+    print(f"Wrote {write_csv(frame, args.out / 'ablations.csv', force=True)}")
+    if len(rows) > 1:
         print(f"Wrote {save(picture(rows[1:], rows[0]['certain'], title), args.out / 'ablations.png', force=True)}")
 
 

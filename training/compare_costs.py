@@ -9,17 +9,17 @@ honest counting costs is what that seems to gain. Writes costs.csv to --out.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import torch
-from compare_reducers import span
+from common import POLICY, options
 from joblib import Parallel, delayed
 
 from dengine import Dataset, Policy, Recipe, load_dataset, replay
+from dengine.experiments.tables import write_csv
 from dengine.reducers import ConvReducer
 from dengine.reducers.heads import CrossFittedScores, FeatureEmbedding
 
@@ -73,36 +73,23 @@ def play(name: str, data: Dataset, recipe: Recipe, seed: int, cycles: int) -> di
 
 def main() -> None:
     """Parse, play, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, or an .npz file with X and y")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser = options(
+        __doc__, data="insertion", samples=None, **POLICY, seeds="100:130", cycles=1503, n_jobs=2, out=Path("out")
+    )
     parser.add_argument("--part", default="part", help="name of the array of parts' numbers in the file")
-    parser.add_argument("--alpha", type=float, default=0.1, help="error level of the interval")
-    parser.add_argument("--lower-bound", type=float, default=0.9, help="the paper's LB")
-    parser.add_argument("--seeds", type=span, default="100:130", help="first:last, the last one left out; a replay each")
-    parser.add_argument("--cycles", type=int, default=1503, help="of a replay")
-    parser.add_argument("--n-jobs", type=int, default=2, help="processes")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for costs.csv")
     args = parser.parse_args()
     data = load_dataset(args.data, args.samples, args.part)
-    cycles = min(args.cycles, len(data))
-    tasks = [
-        (name, played, recipe, seed, cycles)
-        for name, (played, recipe) in rows(data, args.alpha, args.lower_bound).items()
-        for seed in args.seeds
-    ]
+    cycles, level = min(args.cycles, len(data)), f"({args.alpha:g}, {100 * args.lower_bound:g} %)"
+    configurations = rows(data, args.alpha, args.lower_bound)
+    tasks = [(name, *how, seed, cycles) for name, how in configurations.items() for seed in args.seeds]
     table = pd.DataFrame(Parallel(n_jobs=args.n_jobs)(delayed(play)(*task) for task in tasks))
-    args.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(args.out / "costs.csv", index=False)
-    sums = table.groupby("row", sort=False)[
-        ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel"]
-    ]
-    shown = sums.mean()
-    shown["bad of accepted"] = 100.0 * shown["false_positive"] / shown["accepted"]
-    shown["good of rejected"] = 100.0 * shown["false_negative"] / shown["rejected"]
-    level = f"({args.alpha:g}, {100 * args.lower_bound:g} %)"
+    write_csv(table, args.out / "costs.csv", force=True)
+    counts = ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel"]
+    shown = table.groupby("row", sort=False)[counts].mean()
+    shown["bad of accepted"] = 100.0 * shown.pop("false_positive") / shown["accepted"]
+    shown["good of rejected"] = 100.0 * shown.pop("false_negative") / shown["rejected"]
     print(f"{data.name}, {level}, means of {table.seed.nunique()} runs of {cycles} cycles")
-    print(shown.round(1).drop(columns=["false_positive", "false_negative"]).to_string())
+    print(shown.round(1).to_string())
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import options
 
 from dengine import Replay, load_dataset
 from dengine.experiments.grid import Task, contenders, iterate_replays
@@ -53,12 +54,11 @@ def tries(name: str) -> list[Contender]:
     if name in RIVALS:
         known = RIVALS[name].tries
         different = [params for i, params in enumerate(known) if params not in known[:i]]
-        return [replace(base, name=f"{name} {_said(params)}".strip(), params=params) for params in different]
+        return [
+            replace(base, name=f"{name} {' '.join(f'{k}={v}' for k, v in params.items())}".strip(), params=params)
+            for params in different
+        ]
     return [replace(base, name=f"{name} radius={r:g}", recipe=replace(base.recipe, radius=r)) for r in TRIES[name]]
-
-
-def _said(params: Any) -> str:
-    return " ".join(f"{key}={value}" for key, value in params.items())
 
 
 def play(data: Any, who: Sequence[Contender], seeds: range, args: argparse.Namespace) -> dict[str, list[Replay]]:
@@ -79,26 +79,22 @@ def row_of(name: str, replays: Sequence[Replay]) -> dict[str, str]:
     """A row of the table: means a replay ± their deviation, pooled shares with their interval."""
     (row,) = pool(frame_of(replays))
     kind = RIVALS.get(name.split(" ")[0])
-    return dict(
-        zip(
-            COLUMNS,
-            (
-                name if kind is None else f"{name}: {kind.title}",
-                OURS if kind is None else kind.bound or (SWEPT if any(kind.tries) else "none"),
-                f"{row['certain']:.0f} ± {np.nan_to_num(row['certain_sd']):.0f}",
-                f"{row['accepted']:.0f}",
-                f"{row['false_positive']:.1f}",
-                f"{row['rejected']:.0f}",
-                f"{row['false_negative']:.1f}",
-                _error(replays, "accepted"),
-                _error(replays, "rejected"),
-                f"{row['net_s']:.0f}",
-                "-" if np.isnan(row["retrain_p50_s"]) else f"{row['retrain_p50_s']:.3f} / {row['retrain_max_s']:.3f}",
-                f"{row['decide_p50_us']:.0f}",
-            ),
-            strict=True,
-        )
+    retrain = f"{row['retrain_p50_s']:.3f} / {row['retrain_max_s']:.3f}"
+    cells = (
+        name if kind is None else f"{name}: {kind.title}",
+        OURS if kind is None else kind.bound or (SWEPT if any(kind.tries) else "none"),
+        f"{row['certain']:.0f} ± {np.nan_to_num(row['certain_sd']):.0f}",
+        f"{row['accepted']:.0f}",
+        f"{row['false_positive']:.1f}",
+        f"{row['rejected']:.0f}",
+        f"{row['false_negative']:.1f}",
+        _error(replays, "accepted"),
+        _error(replays, "rejected"),
+        f"{row['net_s']:.0f}",
+        "-" if np.isnan(row["retrain_p50_s"]) else retrain,
+        f"{row['decide_p50_us']:.0f}",
     )
+    return dict(zip(COLUMNS, cells, strict=True))
 
 
 def _error(replays: Sequence[Replay], side: str) -> str:
@@ -123,14 +119,6 @@ def markdown(rows: Sequence[dict[str, str]]) -> str:
     return "\n".join([*head, *(f"| {' | '.join(row[name] for name in COLUMNS)} |" for row in rows)])
 
 
-def span(text: str) -> range:
-    """'100:130' -> the seeds 100 to 129."""
-    first, last = map(int, text.split(":"))
-    if not 0 <= first < last:
-        raise argparse.ArgumentTypeError(f"expected first:last with 0 <= first < last, as 100:130, got {text}")
-    return range(first, last)
-
-
 def policies(text: str) -> list[tuple[float, float]]:
     """'0.1:0.9,0.05:0.95' -> (alpha, LB) of each."""
     return [(float(alpha), float(bound)) for alpha, bound in (pair.split(":") for pair in text.split(","))]
@@ -138,20 +126,13 @@ def policies(text: str) -> list[tuple[float, float]]:
 
 def main() -> None:
     """Parse, replay, show."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("do", choices=["choose", "report"], help="try settings, or report all as they are")
-    parser.add_argument("--data", default="insertion", help="a bundled set, a folder of recordings, or a file")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
-    parser.add_argument("--cycles", type=int, default=1503, help="cycles of a replay, at most as many as there are traces")
-    parser.add_argument("--reducers", default="conv,umap,pca", help="and rivals and TOML files, with commas between")
-    parser.add_argument(
-        "--policies", type=policies, help="alpha:LB with commas between; by default 0.1:0.9, to report 0.05:0.95 too"
+    parser = options(
+        __doc__, data="insertion", samples=None, cycles=1503, seeds=None, n_jobs=-1, keep=None, out=Path("out")
     )
+    parser.add_argument("do", choices=["choose", "report"], help="try settings, or report all as they are")
+    parser.add_argument("--reducers", default="conv,umap,pca", help="and rivals and TOML files, with commas between")
+    parser.add_argument("--policies", type=policies, help="alpha:LB with commas between; 0.1:0.9, to report 0.05:0.95 too")
     parser.add_argument("--confirm", action="store_true", help="good accepted parts are confirmed, not stops alone known")
-    parser.add_argument("--seeds", type=span, help="first:last, the last one left out, instead of 0:5 or 100:130")
-    parser.add_argument("--n-jobs", type=int, default=-1, help="replays at a time; -1: one a core; times are honest with 1")
-    parser.add_argument("--keep", type=Path, help="folder of finished replays")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the CSV and the table")
     args = parser.parse_args()
     choosing, asked = args.do == "choose", args.reducers.split(",")
     unknown = [name for name in asked if name not in TRIES and name not in RIVALS]

@@ -10,7 +10,6 @@ fold. Labels are read there, and never by the encoder. Writes training.png, card
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
 import time
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from compare_reducers import span
+from common import options, span
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -190,7 +189,8 @@ def card(data: Dataset, recipe: Recipe, history: list[Row], replays: list[Replay
     looked = [row["refused"] for row in history[1:] if "refused" in row]
     seeds = f"{replays[0].seed} to {replays[-1].seed}"
     shape = " x ".join(str(n) for n in data.X.shape[1:])
-    gained = last["neighbours agree"] - first["neighbours agree"]
+    more = "More" if last["neighbours agree"] > first["neighbours agree"] else "No more"
+    better = "no worse" if last["log loss"] <= first["log loss"] else "no better"
     return f"""# {recipe.name}, trained on `{data.name}`
 
 The whole decision, raw trace to action, as one TorchScript file: input checks, novelty, encoder, {len(data)} references,
@@ -213,7 +213,7 @@ looked at {len(looked)} times, and refused {sum(looked):.0f} times for doing wor
 
 The losses are VICReg's, on traces that trained the encoder and on as many that never did. `neighbours agree` is the share
 of the traces whose nearest other one, in the encoder's features, has the same label. The rest is of the heads: every trace
-by the one that never saw its fold. {verdict(gained, last["log loss"] - first["log loss"])}
+by the one that never saw its fold. {more} neighbours agree after it, and the heads, with all labels at hand, do {better}.
 
 ![Loss, agreement and the embedding](training.png)
 
@@ -235,13 +235,6 @@ and not against an adversary: load it with `dengine.load_exported`, which checks
 """
 
 
-def verdict(agreement: float, log_loss: float) -> str:
-    """Whether training helped, in words."""
-    one = "More neighbours agree after it" if agreement > 0.0 else "No more neighbours agree after it"
-    other = "do no worse" if log_loss <= 0.0 else "do no better"
-    return f"{one}, and the heads, with all labels at hand, {other}."
-
-
 def said(replays: list[Replay], side: str) -> str:
     """A pooled share of wrong ones, in words."""
     error = pooled_error(replays, side)
@@ -261,20 +254,12 @@ def table_of(history: list[Row], title: str) -> Table:
 
 def main() -> None:
     """Parse, train, show, save."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="a bundled set, a folder of CSV files, an .npz of X and y, ...")
-    parser.add_argument("--samples", type=int, help="use the first so many samples of each trace; all by default")
+    parser = options(__doc__, data="insertion", samples=None, recipe="conv", out=Path("models/conv"))
     parser.add_argument("--simulate", type=int, help="instead of --data: so many simulated insertions of each scenario")
-    parser.add_argument("--recipe", default="conv", help="a recipe's name or TOML file, of conv")
     parser.add_argument("--steps", type=int, default=600, help="label-free steps of the encoder")
     parser.add_argument("--seed", type=int, default=0, help="of the encoder, an integer")
-    parser.add_argument(
-        "--replays", type=span, default="100:104", help="first:last seed of the replays that the card tells of"
-    )
+    parser.add_argument("--replays", type=span, default="100:104", help="first:last seed of the replays of the card")
     parser.add_argument("--weights", type=Path, help="also write what the encoder learned, an .npz for `start` of conv")
-    parser.add_argument(
-        "--out", type=Path, default=Path("models/conv"), help="folder for training.png, model.ts and card.md"
-    )
     args = parser.parse_args()
     data = simulated(args.simulate) if args.simulate else load_dataset(args.data, args.samples)
     recipe = Recipe.load(args.recipe)

@@ -1,15 +1,11 @@
 """A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of orders; over real TCP."""
 
-import csv
 import json
 import socket
 import struct
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +20,7 @@ from dengine.cells.ur.protocol import TYPES, Kind, Package, Packages, Recipe, co
 from dengine.cells.ur.stream import Lateness, RtdeClient, RtdeStream
 from dengine.cli import main
 from dengine.datasets.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger
-from dengine.errors import CellError, SettingError
+from dengine.errors import CellError
 
 SAMPLES = 80
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
@@ -74,11 +70,6 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
 # One connection.
 
 
-def read_on(client: RtdeClient) -> None:
-    while client.rows():
-        pass
-
-
 def test_a_client_gets_every_package_of_what_it_asked_for() -> None:
     with FakeController(speed=None) as fake:
         client = RtdeClient(fake.host, fake.port, ("timestamp", "robot_mode", "actual_TCP_force"))
@@ -111,29 +102,6 @@ def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
             RtdeClient("127.0.0.1", port, timeout=0.1)
     with pytest.raises(CellError, match="cannot be reached"):
         RtdeClient("127.0.0.1", port, timeout=0.1)
-
-
-def test_a_register_that_its_owner_gives_up_is_taken_over_soon_after_and_one_that_is_held_is_said() -> None:
-    with FakeController(speed=20.0) as fake:
-        first = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
-        timer = threading.Timer(0.2, first.close)
-        timer.start()
-        with RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port) as stream:
-            assert stream.after(0, WAIT)[0]
-        timer.join()
-    held = pytest.raises(CellError, match="another client")
-    with FakeController(speed=20.0, held=[ORDER]) as fake, held:
-        RtdeStream(fake.host, ("timestamp",), (ORDER,), port=fake.port).open()
-
-
-def test_the_controllers_own_words_are_in_the_error() -> None:
-    with FakeController(speed=1.0) as fake:
-        client = RtdeClient(fake.host, fake.port)
-        fake.say("the input buffer overflows")
-        fake.hang_up()
-        with pytest.raises(CellError, match=r"hung up.*the input buffer overflows"):
-            read_on(client)
-        client.close()
 
 
 def test_a_package_is_late_by_its_way_and_a_slow_drift_of_clocks_is_none() -> None:
@@ -255,18 +223,6 @@ def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts:
     assert (recorder.spec.samples, recorder.spec.channels, recorder.spec.columns) == (50, 3, tuple(columns))
 
 
-def test_a_trigger_that_never_goes_on_is_said_after_the_time_that_was_given() -> None:
-    said = pytest.raises(CellError, match="the trigger never went on: RegisterTrigger")
-    with FakeController(speed=None) as fake, RtdeRecorder(fake.host, port=fake.port) as recorder, said:
-        recorder.record(timeout=0.05)
-
-
-@pytest.mark.parametrize("name", ["FZ", "actual_TCP_force", "actual_TCP_force[6]", "timestamp[0]", "actual_q[x]"])
-def test_a_channel_that_is_none_is_refused_before_anything_is_asked(name: str) -> None:
-    with pytest.raises(SettingError, match="Expected a channel among FX_Base"):
-        RtdeRecorder("127.0.0.1", channels=(name,))
-
-
 # The cell.
 
 
@@ -315,19 +271,6 @@ def test_a_trace_with_a_gap_is_verified_and_never_learned_from(parts: Dataset) -
     assert broken == [2, 20, 40]
     assert all(cycles[i].decision.action == "verify" for i in broken)
     assert learned == sum(cycle.success is not None for cycle in cycles) - 3
-
-
-def test_a_new_owner_waits_until_an_old_order_is_answered(parts: Dataset) -> None:
-    program = RobotProgram(parts, approach=200)
-    with FakeController(program, speed=20.0) as fake:
-        old = RtdeClient(fake.host, fake.port, ("timestamp",), (ORDER,))
-        old.send((word(41, Verb.INSERT),))
-        while not program.played:
-            old.rows()
-        old.close()
-        with cell_of(fake) as cell:
-            assert program.outputs[ANSWER] == word(41, Answer.DONE)
-            np.testing.assert_array_equal(cell.insert(), parts.X[1])
 
 
 class Deaf(RobotProgram):
@@ -464,18 +407,6 @@ def test_what_is_wrong_with_a_robot_is_one_line(words: tuple[str, ...], said: st
     assert "Traceback" not in done.output
 
 
-def test_a_controller_without_a_robot_is_started_from_the_shell() -> None:
-    words = [sys.executable, "-m", "dengine.cells.ur", "--port", "0", "--speed", "0"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            said = process.stdout.readline()
-            host, port = said.split(" at ")[1].split(",")[0].split(":")
-            with UrCell(host, port=int(port), order_timeout=WAIT, start_timeout=WAIT) as cell:
-                assert cell.insert().shape == (1000,)
-        finally:
-            process.terminate()
-
-
 def test_orders_are_numbered_so_that_they_fit_a_register_for_ever() -> None:
     assert after(0) == 1
     assert after(2 * 10**8) == 1
@@ -491,45 +422,3 @@ def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: 
         assert f"{verb}_integer_register({number}" in text
     for each in (*Verb, *Answer):
         assert f"{type(each).__name__.upper()}_{each.name} = {each.value}\n" in text
-
-
-# Another client than ours, against the same controller.
-
-THEIRS = """
-import sys, time, rtde_io, rtde_receive
-host, path = sys.argv[1:]
-receive = rtde_receive.RTDEReceiveInterface(host, 500.0)
-io = rtde_io.RTDEIOInterface(host, False, True)
-assert io.setInputIntRegister(42, 77)
-end = time.monotonic() + 20.0
-while receive.getOutputDoubleRegister(12) != 77.0 and time.monotonic() < end:
-    time.sleep(0.01)
-print(receive.isConnected(), receive.getOutputDoubleRegister(12), receive.getActualTCPForce()[2], receive.getRobotMode())
-receive.startFileRecording(path, ["timestamp", "actual_TCP_force"])
-time.sleep(0.5)
-receive.stopFileRecording()
-receive.disconnect()
-io.disconnect()
-"""
-
-
-class Echo:
-    """Gives back what register 42 was set to."""
-
-    place = None
-
-    def step(self, inputs: dict) -> dict:
-        return {"output_double_register_12": float(inputs.get("input_int_register_42", 0)), "actual_TCP_force[2]": 12.5}
-
-
-@pytest.mark.skipif(find_spec("rtde_receive") is None, reason='ur_rtde is not installed: pip install "dengine[ur]"')
-def test_ur_rtdes_own_client_takes_the_fake_for_a_controller(tmp_path: Path) -> None:
-    # Its port is fixed, and its constructor holds Python's lock: an address of its own, and a process of its own.
-    host = f"127.77.{np.random.default_rng().integers(256)}.{np.random.default_rng().integers(1, 255)}"
-    with FakeController(Echo(), host=host, port=30004):
-        words = [sys.executable, "-c", THEIRS, host, str(tmp_path / "theirs.csv")]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
-    assert done.stdout.split() == ["True", "77.0", "12.5", "7"], done.stderr
-    with (tmp_path / "theirs.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {float(row["actual_TCP_force_2"]) for row in rows} == {12.5}

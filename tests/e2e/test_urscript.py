@@ -231,16 +231,6 @@ def test_what_is_not_answered_in_time_is_checked(cell: Cell, make_data) -> None:
     assert sum("a label was not kept" in said for said in robot.said) == 2
 
 
-def test_without_a_server_everything_is_checked_and_the_program_goes_on(cell: Cell, make_data) -> None:
-    data = make_data(8, samples=SAMPLES, seed=3)
-    robot = Robot(data, 8, cell)
-    first_look = robot.socket_open
-    robot.socket_open = lambda *where: first_look(*where) if robot.taken < 4 else False
-    robot.play()
-    assert robot.checked == list(range(8))
-    assert cell.service.submit(lambda engine: engine.store.status()).result(60)["decisions"] == 4
-
-
 def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: Cell, make_data) -> None:
     robot = Robot(make_data(2, samples=SAMPLES, seed=3), 1, cell)
     robot.flags[7] = True

@@ -75,13 +75,6 @@ def test_a_controller_in_c_decides_as_python_does_and_its_labels_come_back(
     assert report.quarantined == 2
 
 
-def test_the_installed_programs_run(installed: Path, make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    for name in ("dengine-cell", "dengine-onnx"):
-        done = subprocess.run([installed / "bin" / name], capture_output=True, text=True, check=False)
-        assert done.returncode == 2
-        assert done.stderr.startswith(f"usage: {name} MODEL")
-
-
 def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, ["export", "--cpp", str(tmp_path / "cell")], catch_exceptions=False)
     assert done.exit_code == 0

@@ -11,20 +11,21 @@ of the engine before. Exit code 1 if anything was lost, decided otherwise, or ra
 from __future__ import annotations
 
 import argparse
-import functools
 import logging
 import shutil
 import sys
 import tempfile
 import uuid
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from . import kills, processes, stores
+from . import kills
 from .harness import Outcome, Place
+from .kinds import ON_POSTGRES, ON_SQLITE
 
 Fault = Callable[[Outcome, Place], None]
 
@@ -47,30 +48,23 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
     return outcome
 
 
-def killing(of: Callable[..., None], child: Callable[..., None], words: str, times: int) -> Fault:
-    """Kills as a fault."""
-    fault = functools.partial(of, times=times) if child is None else functools.partial(of, times=times, child=child)
-    fault.__doc__ = words
-    return fault
-
-
-def faults(arguments: argparse.Namespace) -> list[tuple[str, Fault, int]]:
-    """Where, what, and how many trials."""
-    found = [("SQLite", each, arguments.trials) for each in (*stores.ON_SQLITE, *processes.ON_SQLITE)]
-    found += [
-        ("SQLite", killing(kills.kill_cells, kills.cell, "SIGKILL of the cell", arguments.kills), 1),
-        ("SQLite", killing(kills.kill_cells, kills.often, "SIGKILL, mostly as a version is stored", arguments.others), 1),
-        ("SQLite", killing(kills.kill_cells, kills.in_outage, "SIGKILL while the store is locked", arguments.others), 1),
-        ("SQLite", killing(kills.kill_imports, None, "SIGKILL of an import", arguments.others), 1),
-        ("SQLite", killing(kills.kill_exports, None, "SIGKILL of an export", arguments.others), 1),
-    ]
+def faults(arguments: argparse.Namespace) -> list[tuple[str, str, Fault, int]]:
+    """Where, what in words, the fault, and how many trials."""
+    found = [("SQLite", title(each), each, arguments.trials) for each in ON_SQLITE]
+    killed = {
+        "SIGKILL of the cell": partial(kills.kill_cells, times=arguments.kills),
+        "SIGKILL, mostly as a version is stored": partial(kills.kill_cells, times=arguments.others, child=kills.often),
+        "SIGKILL while the store is locked": partial(kills.kill_cells, times=arguments.others, child=kills.in_outage),
+        "SIGKILL of an import": partial(kills.kill_imports, times=arguments.others),
+        "SIGKILL of an export": partial(kills.kill_exports, times=arguments.others),
+    }
     if arguments.program is not None:
-        journal = functools.partial(kills.kill_programs, times=arguments.others, program=arguments.program)
-        journal.__doc__ = "SIGKILL of the C++ program"
-        found.append(("C++", journal, 1))
+        programs = partial(kills.kill_programs, times=arguments.others, program=arguments.program)
+        killed["SIGKILL of the C++ program"] = programs
+    found += [("SQLite", words, fault, 1) for words, fault in killed.items()]
     if arguments.postgres:
-        found += [("PostgreSQL", each, arguments.trials) for each in stores.ON_POSTGRES]
-        found.append(("PostgreSQL", killing(kills.kill_cells, kills.cell, "SIGKILL of the cell", arguments.kills), 1))
+        found += [("PostgreSQL", title(each), each, arguments.trials) for each in ON_POSTGRES]
+        found.append(("PostgreSQL", "SIGKILL of the cell", killed["SIGKILL of the cell"], 1))
     return found
 
 
@@ -90,11 +84,11 @@ def main() -> None:
     console, folder = Console(), Path(tempfile.mkdtemp(prefix="dengine-faults-"))
     columns = ("store", "fault", "times", "labels", "lost", "wrong", "raised", "longest wait")
     rows = []
-    for where, fault, trials in faults(arguments):
-        if arguments.only not in title(fault):
+    for where, words, fault, trials in faults(arguments):
+        if arguments.only not in words:
             continue
         url = arguments.postgres if where == "PostgreSQL" else ""
-        console.print(f"{where}: {title(fault)}", highlight=False)
+        console.print(f"{where}: {words}", highlight=False)
 
         def place(url: str = url) -> Place:
             name = uuid.uuid4().hex[:12]
@@ -102,7 +96,7 @@ def main() -> None:
 
         seen = tried(fault, place, trials, console)
         counts = (seen.injected, seen.labels, seen.lost, seen.wrong, seen.raised)
-        rows.append((where, title(fault), *map(str, counts), f"{1000 * seen.longest:.0f} ms" if seen.longest else "-"))
+        rows.append((where, words, *map(str, counts), f"{1000 * seen.longest:.0f} ms" if seen.longest else "-"))
     shutil.rmtree(folder)
     table = Table(*columns)
     for row in rows:

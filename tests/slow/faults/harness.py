@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,7 +104,7 @@ class Cell:
     def until_back(self) -> None:
         """Wait until the store is there again, and holds what its journal held."""
         end = time.monotonic() + PATIENCE
-        while (fault := self.engine._keeper.fault) and time.monotonic() < end:
+        while (fault := self.engine.store_fault) and time.monotonic() < end:
             time.sleep(0.02)
         self.outcome.must(not fault, fault)
 
@@ -115,6 +116,8 @@ class Cell:
             self.outcome.labels += len(self.acknowledged)
             self.outcome.lost += missing(again.store, self.acknowledged)
             self.outcome.wrong += sum(a != b for a, b in zip(before, bounds(again), strict=True))
+        if "://" not in self.place.url:
+            self.outcome.must(not list(Path(self.place.url).parent.glob("*.journal")), "a journal is left")
 
 
 def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:

@@ -15,17 +15,17 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from dengine import Action, DataEngine, export_torchscript, load_exported
+from dengine import Action, DataEngine, Recipe, export_torchscript, load_exported
 from dengine.datasets.importing import import_labelled
 from dengine.errors import DengineError, ExportError
 from dengine.export import import_journal
 
-from .harness import PROBE, RECIPE, Outcome, Place, missing, stream
+from .harness import PROBE, RECIPE, Cell, Outcome, Place, missing, stream
 
 # The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
 HERE = str(Path(__file__).resolve().parents[3])
@@ -55,40 +55,28 @@ def _acknowledge(path: str, *words: object) -> None:
         file.write(" ".join(map(str, words)) + "\n")
 
 
-def _open(place: Place, recipe: Any) -> DataEngine:
-    return DataEngine.open_or_create(place.store(), recipe=recipe)
+def cell(place: Place, told: str, seed: int, recipe: Recipe = RECIPE, locked_after: int | None = None) -> None:
+    """Decide and report on and on, and tell of each once it was acknowledged.
 
-
-def cell(place: Place, told: str, seed: int, recipe: Any = RECIPE) -> None:
-    """Decide and report on and on; after each report decide on a probe, and tell of all once it was acknowledged."""
-    engine, data, rng = _open(place, recipe), stream(), np.random.default_rng(seed)
-    for _ in _for_a_while():
-        i = int(rng.integers(len(data) - PROBE))
-        decision = engine.decide(data.X[i])
-        if decision.action is Action.VERIFY:
-            engine.report(decision.id, bool(data.y[i]))
-            _acknowledge(told, "label", decision.id, int(data.y[i]))
-        probe = engine.decide(data.X[-1])
-        _acknowledge(told, "probe", engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)
-
-
-def often(place: Place, told: str, seed: int) -> None:
-    """A cell that retrains every three labels."""
-    cell(place, told, seed, OFTEN)
-
-
-def in_outage(place: Place, told: str, seed: int) -> None:
-    """A cell whose store is locked soon after it began."""
-    engine, data, rng = _open(place, RECIPE), stream(), np.random.default_rng(seed)
-    other = sqlite3.connect(place.url, isolation_level=None, timeout=30)
+    After each report it decides on a probe; or, `locked_after` so many parts, its store is locked.
+    """
+    engine, data, rng = DataEngine.open_or_create(place.store(), recipe=recipe), stream(), np.random.default_rng(seed)
+    other = None if locked_after is None else sqlite3.connect(place.url, isolation_level=None, timeout=30)
     for n, _ in enumerate(_for_a_while()):
-        if n == 20:
+        if other is not None and n == locked_after:
             other.execute("BEGIN IMMEDIATE")
         i = int(rng.integers(len(data) - PROBE))
         decision = engine.decide(data.X[i])
         if decision.action is Action.VERIFY:
             engine.report(decision.id, bool(data.y[i]))
             _acknowledge(told, "label", decision.id, int(data.y[i]))
+        if other is None:
+            probe = engine.decide(data.X[-1])
+            _acknowledge(told, "probe", engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)
+
+
+often = partial(cell, recipe=OFTEN)
+in_outage = partial(cell, locked_after=20)
 
 
 def importing(place: Place, told: str, seed: int) -> None:
@@ -193,14 +181,20 @@ def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
             file.unlink()
 
 
+def exported(place: Place) -> Path:
+    """The file of an engine that was told of 100 parts."""
+    cell = Cell(place, Outcome())
+    cell.play(100)
+    cell.engine.close()
+    with DataEngine.open(place.url) as engine:  # which waits longer for its store than a cell does
+        if engine.version == 0:
+            engine.retrain()
+        return export_torchscript(engine, Path(place.url).with_suffix(".ts"))
+
+
 def kill_exports(outcome: Outcome, place: Place, times: int) -> None:
     """Kill exports; after each the file decides as the engine does, or is refused as damaged."""
-    with _open(place, RECIPE) as engine:
-        for x, y in zip(stream().X[:100], stream().y[:100], strict=True):
-            decision = engine.decide(x)
-            if decision.action is Action.VERIFY:
-                engine.report(decision.id, bool(y))
-        known = load_exported(export_torchscript(engine, Path(place.url).with_suffix(".ts"))).decide(stream().X[0])
+    known = load_exported(exported(place)).decide(stream().X[0])
     for seed in range(times):
         killed(exporting, place, seed, most=0.3)
         outcome.injected += 1
@@ -211,15 +205,10 @@ def kill_exports(outcome: Outcome, place: Place, times: int) -> None:
 
 def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> None:
     """Kill the controller's C++ program at random moments of one journal that grows; its labels are imported at the end."""
-    with _open(place, RECIPE) as engine:
-        for x, y in zip(stream().X[:100], stream().y[:100], strict=True):
-            decision = engine.decide(x)
-            if decision.action is Action.VERIFY:
-                engine.report(decision.id, bool(y))
-        model = export_torchscript(engine, Path(place.url).with_suffix(".ts"))
+    model = exported(place)
     journal, acknowledged = Path(place.url).with_suffix(".csv"), {}
     for seed in range(times):
-        acknowledged |= _killed_program([str(program), str(model), "--journal", str(journal)], seed)
+        acknowledged |= killed_program([str(program), str(model), "--journal", str(journal)], seed)
         outcome.injected += 1
     outcome.labels += len(acknowledged)
     try:
@@ -230,7 +219,7 @@ def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> 
         outcome.tell(error)
 
 
-def _killed_program(command: list[str], seed: int) -> dict[str, bool]:
+def killed_program(command: list[str], seed: int) -> dict[str, bool]:
     data, rng, acknowledged = stream(), np.random.default_rng(seed), {}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     process = subprocess.Popen(command, text=True, bufsize=1, **pipes)

@@ -72,7 +72,7 @@ def test_what_changed_is_found(tmp_path: Path) -> None:
 
 
 def test_a_connection_that_is_closed_without_an_answer_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.slow.fuzzing import wire
+    from tests.slow.fuzzing import requests as wire
 
     monkeypatch.setattr(wire, "PATIENCE", 0.2)
     found = []
