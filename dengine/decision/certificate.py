@@ -25,12 +25,11 @@ Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures ov
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 
 from ..errors import SettingError, percent
 
-CONFIRMED_SHARE = 0.1  # of alpha, where audits and confirmations both speak: the former see less and need more
-RARE = 0.02  # the audit rate that is assumed where none is set
 ENDLESS = 10**8  # more audits than that are none
 
 
@@ -38,10 +37,9 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0, 
     """Log capital of a mixture of constant bets that the mean failure probability of n parts is below `tolerance`.
 
     n : parts, looked at or not.  n_bad : those of them that were looked at and were bad.  tolerance : in [0, 1].
-    propensity : in (0, 1], the probability with which each part was looked at; a bad one that was looked at then stands for
-        1 / propensity. Where it changed, the smallest: that is on the safe side.
+    propensity : in (0, 1], with which each part was looked at. Where it changed, the smallest: that is on the safe side.
     bets : in (0, 1), fixed beforehand; None: a grid for any rate. Few are sharper where the rate is about known.
-    It grows with `tolerance` and falls with `n_bad`. Compiles to TorchScript.
+    Compiles to TorchScript.
     """
     if bets is None:
         bets = [0.05, 0.1, 0.2, 0.4, 0.7, 0.98]  # never 1: one bad part would lose all for ever
@@ -59,9 +57,7 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0, 
 def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
     """Upper bound on the mean failure probability of n parts, valid at all moments together with probability 1 - alpha.
 
-    n : parts the claim is about.  n_bad : those of them that were looked at and were bad.
-    propensity : probability with which each was looked at: 1 where every outcome is known, the audit rate where only audits
-        are, 0 where nobody looks. Where it changed, the smallest.
+    n, n_bad, propensity : as in `log_evidence`; propensity 1 where every outcome is known, 0 where nobody looks.
     Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection;
     never less than n_bad / (n propensity). 1 where nothing is known.
     """
@@ -123,37 +119,21 @@ class Bounded:
     upper: float
     shadowed: bool = False
 
-    @property
-    def bad_rate(self) -> float:
-        """Share of those looked at that were decided wrongly; 0 where none was looked at."""
-        return self.n_bad / max(1, self.n_looked_at)
-
     def audits_needed(self, target: float, bad_rate: float = 0.0) -> int | None:
         """About how many more outcomes, of which `bad_rate` are bad, would bring the bound to `target`; None: no number.
 
-        At a propensity below 1 each of them stands for 1 / propensity parts. Where nobody looks it counts from now on, as
-        if one part in fifty were audited.
+        Where nobody looks it counts from now on, as if one part in fifty were audited.
         """
         if not 0.0 < target < 1.0:
             raise SettingError(f"Expected 0 < target < 1, got {target!r}; 0.05 asks for at most 5 % bad.")
-        n, propensity = (self.n, self.propensity) if self.propensity > 0.0 else (0, RARE)
+        n, propensity = (self.n, self.propensity) if self.propensity > 0.0 else (0, 0.02)
 
         def reached(more: int) -> bool:
             n_bad = self.n_bad + math.ceil(bad_rate * more - 1e-9)
             return log_evidence(n + int(more / propensity), n_bad, target, propensity) >= math.log(1.0 / self.alpha)
 
-        if reached(0):
-            return 0
-        high = 1
-        while not reached(high):
-            high *= 2
-            if high > ENDLESS:
-                return None
-        low = high // 2
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if reached(middle) else (middle, high)
-        return high
+        found = bisect_left(range(ENDLESS), True, key=reached)
+        return None if found == ENDLESS else found
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +171,8 @@ class Certificate:
         """How many more audits the tolerance takes, or where it is kept, half of it; the parts being accepted ones."""
         what = "parts" if self.accepted.propensity == 1.0 else "audits"
         target = self.tolerance / 2.0 if self.kept else self.tolerance
-        good, same = self.audits_needed(target), self.audits_needed(target, self.accepted.bad_rate)
+        seen = self.accepted.n_bad / max(1, self.accepted.n_looked_at)
+        good, same = self.accepted.audits_needed(target), self.accepted.audits_needed(target, seen)
         if self.accepted.upper <= target:
             return f"Even {percent(target, '.6g')} is shown."
         if good is None:
@@ -200,10 +181,6 @@ class Certificate:
         if self.accepted.n_bad == 0:
             return f"{asked}."
         return f"{asked}; at the present rate {'no number would do' if same is None else f'about {same:,}'}."
-
-    def audits_needed(self, target: float | None = None, bad_rate: float = 0.0) -> int | None:
-        """`Bounded.audits_needed` of the accepted parts; `target` is by default the tolerance."""
-        return self.accepted.audits_needed(self.tolerance if target is None else target, bad_rate)
 
     def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
         parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
@@ -229,16 +206,13 @@ class Certificate:
 def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audit_rate: float) -> Certificate:
     """The certificate of what became of all certain decisions so far; `Policy.certificate` is the engine's way to it.
 
-    stops : "all" where every bad accepted part stops the system and is reported, so that the outcome of each accepted part
-        is known (leave the newest out while its outcome is open). "some" where silence is no success.
-    audit_rate : probability with which a certain decision is verified all the same. Where it changed since the first of
-        these parts, the smallest.
+    stops : as in `Policy`; under "all" leave the newest part out while its outcome is open.
+    audit_rate : probability with which a certain decision is verified all the same; where it changed, the smallest.
 
-    Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited: the
-    coin does not know the outcome. It never lies below the share known to be bad. A cell that confirmed or stopped every
-    accepted part knows as much as under "all". Where both are possible they share alpha, so that whoever sees now the one
-    and now the other is still wrong with probability alpha at most. Rejected parts are known by audits alone. A label that
-    was forgotten counts as a wrong decision, like an audit whose outcome was lost: forgetting earns nothing.
+    Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited. It
+    never lies below the share known to be bad. A cell that confirmed or stopped every accepted part knows as much as under
+    "all". Where both are possible they share alpha: whoever sees now the one and now the other is wrong with probability
+    alpha at most. Rejected parts are known by audits alone. A label that was forgotten counts as a wrong decision.
     """
     if stops not in ("all", "some"):
         raise SettingError(f"Expected stops among all, some, got {stops!r}.")
@@ -252,7 +226,7 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
         audited_rejects=outcomes.audited_rejects + outcomes.forgotten_audited_rejects,
         audited_rejects_good=outcomes.audited_rejects_good + outcomes.forgotten_audited_rejects,
     )
-    share = 1.0 if stops == "all" or audit_rate == 0.0 else CONFIRMED_SHARE
+    share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1  # of alpha: audits see less and need more
     if stops == "all" or 0 < o.accepted == o.stops + o.confirmed:
         accepted = _bounded(o.accepted, o.accepted, o.stops, 1.0, share * alpha)
     elif audit_rate == 0.0:

@@ -16,8 +16,6 @@ from .policy import Neighbourhood, Policy
 from .references import Counts, RadiusIndex
 from .rule import DecisionRule, RadiusNeighbours
 
-CAPACITY = 10_000
-
 
 class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # scikit-learn ships no types
     """Counts labels around a query and bounds its success probability.
@@ -40,7 +38,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         interval: str = "wilson",
         fraction: float | None = None,
         reject_fraction: float | None = None,
-        capacity: int = CAPACITY,
+        capacity: int = 10_000,
     ) -> None:
         self.radius = radius
         self.alpha = alpha
@@ -71,13 +69,13 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def count(self, Z: ArrayLike) -> Counts:
         """(n_success, n_failure), each (n,) int64: labels in the ball that decides for each row of Z (n, d)."""
-        asked = self._ask(Z)
-        return asked[:, 3].astype(np.int64), asked[:, 4].astype(np.int64)
+        n_success, n_failure = self._ask(Z)[:, 3:].astype(np.int64).T
+        return n_success, n_failure
 
     def predict_interval(self, Z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(lower, upper), each (n,): the bound on the success probability around each row of Z (n, d)."""
-        asked = self._ask(Z)
-        return asked[:, 1], asked[:, 2]
+        lower, upper = self._ask(Z)[:, 1:3].T
+        return lower, upper
 
     def decide(self, Z: ArrayLike) -> NDArray[Any]:
         """(n,) array of `Action`; an empty ball always verifies."""
@@ -93,8 +91,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def predict(self, Z: ArrayLike) -> NDArray[Any]:
         """(n,) the more frequent class in the ball; never abstains."""
-        rates = self.predict_proba(Z)
-        return np.asarray(self.classes_[rates.argmax(axis=1)])
+        return np.asarray(self.classes_[self.predict_proba(Z).argmax(axis=1)])
 
     def policy(self) -> Policy:
         """The user's numbers among the settings; SettingError where one is out of range."""

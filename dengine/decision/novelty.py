@@ -8,13 +8,11 @@
              -> standardised
              -> squared distance to the nearest reference over its limit, of the level, of the texture  (2,)
 
-Hotelling's T^2 (1947, in Techniques of Statistical Analysis) taken from the nearest reference and not from the mean: parts
-that seat, jam and miss lie in clouds apart, and one covariance is at home in the emptiness between them (nearest neighbours
-for batch processes: He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). As with T^2 and the residual Q of Jackson and
-Mudholkar (1979, Technometrics 21), two statistics have a limit each, and either alone tells: hum leaves the level where it
-was. Segments for variables: batch trajectories, Nomikos and MacGregor (1994, AIChE Journal 40). Limits from the references
-themselves, not from a normal law: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is read here, and
-nothing is clipped.
+Hotelling's T^2 (1947), taken from the nearest reference and not from the mean: parts that seat, jam and miss lie in clouds
+apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Two statistics have a limit each, and either alone tells: hum
+leaves the level where it was (Jackson and Mudholkar, 1979, Technometrics 21). Segments: Nomikos and MacGregor (1994, AIChE
+Journal 40). Limits from the references themselves: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is
+read here, and nothing is clipped.
 """
 
 import numpy as np
@@ -28,17 +26,12 @@ REFERENCES = 1000  # searched at each decision
 FEWEST = 20  # traces: fewer cannot say what is usual
 QUANTILE = 0.995
 TAIL_TRACES = 200  # one of so many lies beyond the quantile
-CAP = 6.0  # times the distance of nine references in ten: no limit is wider
-STRANGE = 3.0  # times that: what is a stranger among the references
 LIKE = 3  # strangers that make a kind
-BEYOND = 1e15  # deviations: the square of a distance would overflow
-QUIET = 0.05  # of a channel's roughness: what is quieter is silent
 
 
 class NoveltyGate(nn.Module):
     """(C, T) -> novel? All that it learns is in buffers whose shapes `channels` and `samples` fix.
 
-    channels, samples : C and T.
     asleep : whether nothing is novel, as it is until `fit_novelty` or a stored state wakes it.
     """
 
@@ -93,14 +86,14 @@ def fit_novelty(traces: NDArray[np.float32], margin: float) -> NoveltyGate:
     gate = NoveltyGate(channels, samples)
     if n < FEWEST:
         return gate
-    x = torch.from_numpy(traces[_spread(n)])
+    x = torch.from_numpy(traces[np.linspace(0, n - 1, min(n, REFERENCES)).round().astype(np.intp)])  # evenly in time
     # Of each trace the middle one, (C,). A channel that never moved is silent at the least number: any sound is far away.
     steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values if samples > 1 else torch.zeros(channels)
-    gate.quiet.copy_((QUIET * (gate.length / samples) ** 0.5 * steps).clamp(min=1e-12)[:, None])
+    gate.quiet.copy_((0.05 * (gate.length / samples) ** 0.5 * steps).clamp(min=1e-12)[:, None])
     features = gate.features(x).double()
     offset, gain = _standardising(features)
     standard = torch.addcmul(offset, features, gain).float()
-    standard = standard[standard.abs().amax(1) < BEYOND]
+    standard = standard[standard.abs().amax(1) < 1e15]  # the square of a larger distance would overflow
     texture = torch.arange(3 * gate.quiet.size(1)).ge(2 * gate.quiet.size(1)).repeat(channels)  # (P,)
     for i, group in enumerate((~texture, texture)):
         points = standard[:, group]
@@ -114,11 +107,6 @@ def fit_novelty(traces: NDArray[np.float32], margin: float) -> NoveltyGate:
         gate.norms[i, : len(points)] = points.square().sum(1) / limit - (margin * reach / limit - 1.0).clamp(min=0.0)
     gate.asleep = False
     return gate
-
-
-def _spread(n: int) -> NDArray[np.intp]:
-    """Which of n traces are references: all, or REFERENCES of them, evenly in time."""
-    return np.linspace(0, n - 1, min(n, REFERENCES)).round().astype(np.intp)
 
 
 def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:
@@ -145,9 +133,9 @@ def _limits(points: Tensor) -> tuple[float, Tensor]:
     squared.fill_diagonal_(float("inf"))
     nearest = squared.amin(1)
     nine = float(torch.quantile(nearest, 0.9))
-    usual = max(1e-3, min(float(torch.quantile(nearest, QUANTILE)), CAP * nine))
+    usual = max(1e-3, min(float(torch.quantile(nearest, QUANTILE)), 6.0 * nine))
     reach = torch.full_like(nearest, usual)
-    strange = nearest > max(1e-3, min(usual, STRANGE * nine))
+    strange = nearest > max(1e-3, min(usual, 3.0 * nine))
     if LIKE < int(strange.sum()) < len(points):
         own = squared[strange]
         alike = own[:, strange].kthvalue(LIKE, 1).values

@@ -32,12 +32,10 @@ class Policy:
     lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
     interval : a name in `INTERVALS`.
     guarantee : the rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a `DecisionRule` of your
-        own. "local" is the paper's: it speaks of the ball around one trace, at one look. "pooled" speaks of all parts
-        together, however often one looks: see `guarantee`.
-    stops : "all" where every accepted part that is bad stops the system and is reported before the next decision: then
-        silence until that decision confirms the part. "some", the default, where silence says nothing.
-    audit_rate : share of certain decisions that are verified all the same, in [0, 1]; needed for a guarantee on rejects,
-        since a rejected part gives no feedback of its own.
+        own. "local", the paper's, speaks of the ball around one trace, "pooled" of all parts together: see `rule`.
+    stops : "all" where every bad accepted part stops the system and is reported before the next decision: then silence
+        until that decision confirms the part. "some", the default, where silence says nothing.
+    audit_rate : share of certain decisions that are verified all the same, in [0, 1]; a guarantee on rejects needs it.
     shadow : the shadow mode: everything is verified, and the model only says what it would have done.
     Raises SettingError for a value out of its range.
     """
@@ -64,10 +62,8 @@ class Policy:
         if not 0.0 <= self.audit_rate <= 1.0:
             raise SettingError(f"Expected 0 <= audit_rate <= 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
         if ":" not in self.guarantee and self.guarantee not in RULES:
-            raise SettingError(
-                f"Expected a guarantee among {', '.join(RULES)}, or module:Class, got {shortened(self.guarantee)}."
-            )
-
+            known = ", ".join(RULES)
+            raise SettingError(f"Expected a guarantee among {known}, or module:Class, got {shortened(self.guarantee)}.")
         if self.stops not in get_args(Stops):
             raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
         if not isinstance(self.shadow, bool):
@@ -119,8 +115,8 @@ class Neighbourhood:
 
     radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
     fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
-    reject_fraction : a second, smaller share that a rejection is decided by; None: the same ball for both. Successes and
-        failures rarely come in equal numbers, and a ball wide enough to certify the many blurs the few.
+    reject_fraction : a second, smaller share that a rejection is decided by; None: the same ball for both. A ball wide
+        enough to certify the many successes blurs the few failures.
     """
 
     radius: float = 0.3

@@ -71,10 +71,10 @@ Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 class ReferenceRing(nn.Module):
     """A bounded block of labelled points; the oldest leaves first, whatever its label.
 
-    points (d, capacity) float32, one row a dimension; labels (2, capacity) float32, ones, and 1.0 or 0.0;
-    spaces (capacity,) int64; parts (capacity,) int64, hashes, 0 for a point of no known part; total () int64, points ever
-    added; first (capacity,) int64, the slot that a part's votes are gathered in; repeats () int64, points of parts that are
-    there already; agreement () float64, how far the labels of one part go together (`label_agreement`).
+    points (d, capacity) float32; labels (2, capacity) float32, ones, and 1.0 or 0.0; spaces (capacity,) int64; parts
+    (capacity,) int64 hashes, 0 for no known part; first (capacity,) int64, the slot that a part's votes are gathered in;
+    repeats () int64, points of parts that are there already; agreement () float64, `label_agreement`; total () int64,
+    points ever added.
     """
 
     points: Tensor
@@ -173,9 +173,8 @@ class ReferenceRing(nn.Module):
         """
         slots = inside.nonzero().flatten()
         own = self.first.index_select(0, slots)
-        times = torch.zeros(self.capacity, dtype=torch.float64).index_add_(
-            0, own, torch.ones(own.size(0), dtype=torch.float64)
-        )
+        ones = torch.ones(own.size(0), dtype=torch.float64)
+        times = torch.zeros(self.capacity, dtype=torch.float64).index_add_(0, own, ones)
         worth = 1.0 / (1.0 + (times.index_select(0, own) - 1.0) * self.agreement)
         successes = float((worth * self.labels[1].index_select(0, slots)).sum().item())
         failures = float(worth.sum().item()) - successes
@@ -195,21 +194,12 @@ class RadiusIndex:
     """
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
+        self.dim, self.capacity = dim, capacity
         self.ring = ReferenceRing(dim, capacity)
         self._numbers = np.zeros(capacity, dtype=np.int64)
 
     def __len__(self) -> int:
         return self.ring.size()
-
-    @property
-    def dim(self) -> int:
-        """Dimension of a point."""
-        return self.ring.dim
-
-    @property
-    def capacity(self) -> int:
-        """Points held at most."""
-        return self.ring.capacity
 
     @property
     def points(self) -> NDArray[np.float32]:
@@ -280,24 +270,18 @@ class RadiusIndex:
     def relabel(self, number: int, part: int, label: int | None) -> bool:
         """Give the point of a label another one, or take it out where `label` is None; the others keep their order of age.
 
-        number : of its label.  part : hash of its part.
         A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
         """
         ring = self.ring
         held = np.flatnonzero(self.numbers == number)
         if not len(held):
             return True
-        slot = int(held[0])
+        slot, n = int(held[0]), len(self)
         if int(ring.parts[slot]) != part:
             return False
-        if label is None:
-            self._take_out(slot)
-        else:
+        if label is not None:
             ring.labels[1, slot] = float(label)
-        return True
-
-    def _take_out(self, slot: int) -> None:
-        ring, n = self.ring, len(self)
+            return True
         order = (int(ring.total) - n + torch.arange(n)) % ring.capacity  # oldest first
         order = order[order != slot]
         for held in (ring.points, ring.labels, ring.spaces, ring.parts):
@@ -307,6 +291,7 @@ class RadiusIndex:
         ring.spaces[n - 1 :], ring.parts[n - 1 :], self._numbers[n - 1 :] = 0, 0, 0
         ring.total.fill_(n - 1)
         self._gather_parts()
+        return True
 
     def weigh(self) -> None:
         """Estimate how far the labels of one part go together, for all counts from now on."""
@@ -330,26 +315,28 @@ class RadiusIndex:
         """
         z = torch.from_numpy(np.array(queries, dtype=np.float32))
         z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
-        n_success, n_failure = np.zeros(len(z), dtype=np.int64), np.zeros(len(z), dtype=np.int64)
-        for i in range(len(z)):
-            n_success[i], n_failure[i] = self.ring.count_near(self.ring.squared_distances(z[i]), radius, fraction)
-        return n_success, n_failure
+        found = [self.ring.count_near(self.ring.squared_distances(query), radius, fraction) for query in z]
+        counts = np.array(found, dtype=np.int64).reshape(-1, 2)
+        return counts[:, 0], counts[:, 1]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Plain arrays, copies: points (d, n), labels, spaces, parts and numbers (n,), and total, points ever added."""
-        own: dict[str, NDArray[Any]] = {"points": self.points.T.copy(), "labels": self.labels, "spaces": self.spaces.copy()}
-        whole = {"agreement": self.ring.agreement.numpy().copy(), "total": self.ring.total.numpy().copy()}
-        return own | {"parts": self.parts.copy(), "numbers": self.numbers.copy()} | whole
+        own = {name: getattr(self, name).copy() for name in ("labels", "spaces", "parts", "numbers")}
+        whole = {name: getattr(self.ring, name).numpy().copy() for name in ("agreement", "total")}
+        return {"points": self.points.T.copy()} | own | whole
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
         """The index that `get_state` was taken from: the same points in the same places."""
         index = cls(len(state["points"]), capacity)
         ring, n = index.ring, state["points"].shape[1]
-        ring.points[:, :n] = torch.from_numpy(np.array(state["points"]))
-        ring.labels[1, :n] = torch.from_numpy(np.array(state["labels"], dtype=np.float32))
-        ring.spaces[:n] = torch.from_numpy(np.array(state["spaces"]))
-        ring.parts[:n] = torch.from_numpy(np.array(state["parts"]))
+        for name, own in (
+            ("points", ring.points),
+            ("labels", ring.labels[1]),
+            ("spaces", ring.spaces),
+            ("parts", ring.parts),
+        ):
+            own[..., :n] = torch.from_numpy(np.array(state[name]))
         ring.agreement.fill_(float(state["agreement"]))
         if "numbers" in state:
             index._numbers[:n] = state["numbers"]

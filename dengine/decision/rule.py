@@ -3,8 +3,8 @@
     >>> rule = Policy(alpha=0.1, lower_bound=0.9).rule()
     >>> rule(40, 0)                      # 40 successes, no failure: (1, 0.93..., 1.0), accept
 
-All of it compiles to TorchScript: the engine, the scikit-learn classifier and the exported file run the same lines. A rule
-is asked (`forward`), told what became of a decision (`tell`) and restored (its buffers, by `state_dict`).
+It compiles to TorchScript: the engine, the scikit-learn classifier and the exported file run the same lines. A rule is
+asked (`forward`), told what became of a decision (`tell`) and restored (its buffers, by `state_dict`).
 
 *Local.* The paper's rule, of the ball around one trace; it learns nothing.
 
@@ -47,7 +47,6 @@ LOWEST = 0.3  # no level below: such a ball says little of a part
 BETS = [0.37, 0.72]  # best for failure rates of two thirds and of a third of the tolerance; few, since each costs evidence
 NOBODY = 2.0  # a level that no bound reaches
 FALSE_ALARMS = 100.0  # at the tolerance itself, one in 100 / alpha watched parts on average at most
-NOVEL_SHARE = 0.2  # that a stream may have
 WATCH_BET = 0.5  # of the largest
 
 
@@ -121,7 +120,7 @@ class Evidence(nn.Module):
         self.bets = BETS
         self.nobody = NOBODY
         # A detector bets on too many: steps of its log capital for a wrong part, and for a right one.
-        shares = [tolerance, tolerance, NOVEL_SHARE]
+        shares = [tolerance, tolerance, 0.2]  # the share of novel traces that a stream may have
         self.worse = [math.log1p(WATCH_BET / share * (1.0 - share)) for share in shares]
         self.better = math.log1p(-WATCH_BET)
         self.register_buffer("members", torch.zeros(2, 2, len(levels), 2, dtype=torch.int64))
@@ -146,7 +145,7 @@ class Evidence(nn.Module):
         """Count a part among the members of every level that its scores reach, and ask the levels anew."""
         self.count(0, lower, not success)
         self.count(1, 1.0 - upper, success)
-        if int(self.mode.item()) != 0 and (self.holds(0) or self.holds(1)):
+        if int(self.mode.item()) != 0 and float(self.open.min().item()) < self.nobody:
             self.mode.zero_()
 
     def count(self, side: int, score: float, wrong: bool) -> None:
@@ -181,16 +180,12 @@ class Evidence(nn.Module):
         self.open.fill_(self.nobody)
         self.mode.fill_(mode)
 
-    def holds(self, side: int) -> bool:
-        """Whether any level of a side holds."""
-        return float(self.open[side].item()) < self.nobody
-
     def ask(self, side: int) -> None:
         """Open the lowest level that holds; an assumed one only closes by an alarm, and is shown by members since."""
         ever: list[list[int]] = self.members[side, 0].tolist()
         since: list[list[int]] = self.members[side, 1].tolist()
         if self.assumed:
-            if not self.holds(side) and self.shown(since[0]):
+            if float(self.open[side].item()) >= self.nobody and self.shown(since[0]):
                 self.open[side].fill_(self.levels[0])  # assigned, a scripted float goes through float32
             return
         lowest = self.nobody
@@ -258,9 +253,7 @@ class DecisionRule(nn.Module):
     @torch.jit.export
     def safe_mode(self) -> int:
         """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
-        if self.evidence is not None:
-            return int(self.evidence.mode.item())
-        return 0
+        return 0 if self.evidence is None else int(self.evidence.mode.item())
 
     @torch.jit.unused
     def begin_in(self, mode: int) -> None:

@@ -85,6 +85,8 @@ class Model(Protocol):
 class EngineModel(ABC):
     """What the engine drives: it predicts, takes references, trains a successor, and is stored.
 
+    user_model : what `DataEngine.model` shows, the model as its author knows it.  name : in a status or a table.
+    description : what it is, its numbers included, the same at every start: a store compares it.
     untold : whether its rule missed what became of a part; it then raises instead of predicting.
     keeps_references : whether its state and the points stored with labels restore its references; a rival is refitted.
     """
@@ -92,20 +94,9 @@ class EngineModel(ABC):
     keeps_references = True
     untold = False
 
-    @property
-    @abstractmethod
-    def user_model(self) -> Any:
-        """What `DataEngine.model` shows: the model as its author knows it."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """What to call it in a status or a table."""
-
-    @property
-    @abstractmethod
-    def description(self) -> str:
-        """What it is, its numbers included, as text that is the same at every start: a store compares it."""
+    user_model: Any
+    name: str
+    description: str
 
     def in_force(self, recipe: Recipe) -> Recipe:
         """A recipe with this model's own numbers in the place of those that have no effect on it."""
@@ -137,10 +128,7 @@ class EngineModel(ABC):
 
     @abstractmethod
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
-        """Where a trace (C, T) with this content hash lies as a reference.
-
-        embedding : its (K, d) embedding by this very model, where a prediction has computed it already.
-        """
+        """Where a trace (C, T) with this hash lies as a reference; embedding : (K, d), where it is computed already."""
 
     @abstractmethod
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
@@ -211,12 +199,13 @@ class EngineModel(ABC):
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these six.
 
     def improve_safely(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
-        """`improve`; one that fails at it goes on with what it has."""
-        failed = "the encoder cannot be trained further; it goes on as it is"
-        return _guarded(lambda: self.improve(X, hashes, stop), 0, failed)
+        """`improve`, or 0 where it fails."""
+        return _guarded(
+            lambda: self.improve(X, hashes, stop), 0, "the encoder cannot be trained further; it goes on as it is"
+        )
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
-        """`look_ahead`; what fails at it will say so when it is trained."""
+        """`look_ahead`, or nothing where it fails."""
         _guarded(lambda: self.look_ahead(X), 0, "the traces of the store could not be looked at ahead of a retrain")
 
     def tell_safely(self, told: Told) -> None:
@@ -237,7 +226,7 @@ class EngineModel(ABC):
         return _guarded(lambda: self.reference_point(x, hash_, embedding), None, failed)
 
     def add_safely(self, point: Floats | None, y: int, hash_: int, number: int) -> None:
-        """`add_reference`, where there is a point. A model that fails at it goes on without."""
+        """`add_reference`, where there is a point; nothing where it fails."""
         if point is not None:
             failed = "the model cannot take a labelled trace; the next version learns it from the store"
             _guarded(lambda: self.add_reference(point, y, hash_, number), None, failed)

@@ -121,9 +121,8 @@ def compile_predictor(
     """The fastest form that the reducer and the rule allow; a copy of `like` where that has the same structure."""
     module, compiles = reducer.module(), neighbours.rule.scriptable
     if module is None:
-        return CompiledPredictor(
-            PythonPredictor(reducer, scale, script(novelty), script(neighbours) if compiles else neighbours)
-        )
+        answering = script(neighbours) if compiles else neighbours
+        return CompiledPredictor(PythonPredictor(reducer, scale, script(novelty), answering))
     if not compiles:
         return CompiledPredictor(Predictor(script(module), torch.from_numpy(scale), script(novelty), neighbours).eval())
     eager = Predictor(module, torch.from_numpy(scale), novelty, neighbours).eval()

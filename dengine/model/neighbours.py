@@ -33,12 +33,8 @@ from .base import Embedding, EngineModel, Exportable, Prediction, Told
 from .compiled import CompiledPredictor, compile_predictor
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
-FEWEST = 100
-POINTS = 50  # of each channel, means of equal stretches: the sensor's noise is no difference
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
-SUSPICIOUS = 0.05  # share of such traces
-WARM_UP = 3  # TorchScript's first calls compile; a cell should not wait for that
 
 
 class ModelPrediction(EngineModel):
@@ -66,7 +62,7 @@ class ModelPrediction(EngineModel):
         self.novelty = novelty
         self.reducer = make_reducer(reducer) if isinstance(reducer, str) else reducer
         self.classifier = classifier or WilsonRadiusClassifier()
-        self.folds = folds
+        self.folds, self.name = folds, type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
         self._compiled: CompiledPredictor | None = None
@@ -76,29 +72,18 @@ class ModelPrediction(EngineModel):
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
         """The untrained model that a recipe describes."""
         policy = recipe.policy
-        classifier = WilsonRadiusClassifier(
-            radius=recipe.radius,
-            alpha=policy.alpha,
-            lower_bound=policy.lower_bound,
-            interval=policy.interval,
-            fraction=recipe.fraction,
-            reject_fraction=recipe.reject_fraction,
-            capacity=recipe.window,
-        )
+        near = {name: getattr(recipe, name) for name in ("radius", "fraction", "reject_fraction")}
+        own = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
+        classifier = WilsonRadiusClassifier(**near, **own, capacity=recipe.window)
         return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
-    def user_model(self) -> ModelPrediction:
+    def user_model(self) -> ModelPrediction:  # type: ignore[override]  # itself: an attribute would be a circle
         """Itself."""
         return self
 
     @property
-    def name(self) -> str:
-        """Its reducer."""
-        return type(self.reducer).__name__
-
-    @property
-    def description(self) -> str:
+    def description(self) -> str:  # type: ignore[override]  # asked when the rule may be another
         """Its reducer, its classifier and its folds, with their settings."""
         own = f"{described(self.reducer)} under {described(self.classifier)}"
         return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
@@ -121,18 +106,10 @@ class ModelPrediction(EngineModel):
         own = self.spaces.report
         return replace(own, note="; ".join(filter(None, (own.note, self._note))))
 
-    def fit(
-        self,
-        X: ArrayLike,
-        y: ArrayLike,
-        *,
-        hashes: Ints | None = None,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
         self.spaces = as_reducer(clone(self.reducer), self.folds)
-        return self.train(X, y, hashes=hashes, stop=stop, numbers=numbers)
+        return self.train(X, y, hashes=hashes)
 
     def train(
         self,
@@ -181,7 +158,7 @@ class ModelPrediction(EngineModel):
         around = self.classifier.around(self.index, self.rule)
         self._compiled = compile_predictor(self.spaces, self.scale, self.gate, around, mould)
         if self._compiled.structure is not None and (mould is None or mould.structure != self._compiled.structure):
-            for _ in range(WARM_UP):
+            for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
                 self.predict_one(np.zeros(self.trace_shape, dtype=np.float32))
         return self._compiled
 
@@ -337,16 +314,15 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
     """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such (`part=`). This notices
-    the plain cases where it is not; it reads no label and changes no decision. Repeats that look as different as parts do,
-    and those of which there are more than `NEIGHBOURS`, are not seen.
+    the plain cases where it is not; it changes no decision. More repeats than `NEIGHBOURS` are not seen.
     """
-    x, own = traces[-NEWEST:], parts[-NEWEST:]
-    if len(x) < FEWEST:
-        return 0
-    n, channels, samples = x.shape
-    length = max(1, samples // POINTS)
     from scipy.spatial.distance import cdist
 
+    x, own = traces[-NEWEST:], parts[-NEWEST:]
+    if len(x) < 100:
+        return 0
+    n, channels, samples = x.shape
+    length = max(1, samples // 50)  # means of equal stretches: the sensor's noise is no difference
     whole = x[:, :, : samples // length * length].astype(np.float64)
     means = whole.reshape(n, channels, -1, length).mean(3)
     scale = means.std((0, 2), keepdims=True)
@@ -361,8 +337,7 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
     """What to say of near repeats; "" where there are few."""
     n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
-    if n <= SUSPICIOUS * looked_at:
-        return ""
-    return (
+    said = (
         f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
     )
+    return said if n > 0.05 * looked_at else ""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingError, shortened
 from ..records import Action, Reason
-from ..reducers.base import Floats, Ints, StopRule
+from ..reducers.base import Floats
 from .base import Embedding, EngineModel, Model, Prediction
 
 
@@ -29,32 +29,10 @@ class RivalAdapter(EngineModel):
     keeps_references = False
 
     def __init__(self, model: Model) -> None:
-        self.model = model
+        self.model = self.user_model = model
+        self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
-    @property
-    def user_model(self) -> Any:
-        """The rival itself."""
-        return self.model
-
-    @property
-    def name(self) -> str:
-        """Its class."""
-        return type(self.model).__name__
-
-    @property
-    def description(self) -> str:
-        """Its class: its settings are its author's affair."""
-        return type(self.model).__qualname__
-
-    def train(
-        self,
-        X: ArrayLike,
-        y: ArrayLike,
-        *,
-        hashes: Ints | None = None,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Self:
+    def train(self, X: ArrayLike, y: ArrayLike, **_: object) -> Self:
         """Train the rival; it sets its own stop."""
         self.model.fit(X, y)
         return self
@@ -66,7 +44,9 @@ class RivalAdapter(EngineModel):
         (n_success,), (n_failure,) = self.model.count(X)
         action = Action(self.model.decide(X)[0])
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
-        counts = _whole(n_success), _whole(n_failure)
+        counts = int(n_success), int(n_failure)
+        if counts != (n_success, n_failure):
+            raise ValueError(f"Expected whole numbers of labels, got {shortened((n_success, n_failure))}.")
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
@@ -80,11 +60,3 @@ class RivalAdapter(EngineModel):
     def successor(self) -> RivalAdapter:
         """A deep copy, to train while this one answers."""
         return RivalAdapter(copy.deepcopy(self.model))
-
-
-def _whole(count: Any) -> int:
-    """A rival's count as an integer; ValueError for one that is not whole."""
-    whole = int(count)
-    if whole != count:
-        raise ValueError(f"Expected a whole number of labels, got {shortened(count)}.")
-    return whole

@@ -37,7 +37,6 @@ class StopRule:
     """When an iterative fit must stop; asked before each step.
 
     deadline : reading of `clock` after which no step may begin; None: time decides nothing, so that a seed repeats exactly.
-    max_steps : steps at most; None: no limit.
     asked_at : reading of `clock` when last asked; after the fit, the end of its last step.
     """
 
@@ -68,8 +67,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
-    single_tolerance : how far a trace may move when it is embedded alone instead of in a batch, in units of the embedding's
-        root mean square radius.
+    single_tolerance : how far a trace may move when embedded alone, in the embedding's root mean square radii.
     """
 
     uses_labels = False
@@ -146,35 +144,20 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         if not reset:
             check_is_fitted(self)
-        x = np.asarray(
-            check_array(
-                X,
-                dtype=np.float32,
-                order="C",
-                allow_nd=True,
-                force_writeable=True,  # torch warns of an array that it could not write to
-                ensure_min_samples=int(reset),
-                estimator=self,
-                input_name="X",
-            )
-        )
+        said = {"ensure_min_samples": int(reset), "estimator": self, "input_name": "X"}
+        # Writeable, since torch warns of an array that it could not write to.
+        x = np.asarray(check_array(X, dtype=np.float32, order="C", allow_nd=True, force_writeable=True, **said))
         if x.ndim > 3 or 0 in x.shape[1:]:
             raise TraceError(f"Expected traces (n, samples) or (n, channels, samples) with samples, got shape {x.shape}.")
         traces = x[:, None, :] if x.ndim == 2 else x
         if reset or x.ndim == 2:  # only a table's columns have names and a number to compare
             validate_data(self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True)
-        self._match_shape(traces, reset)
-        return traces
-
-    def _match_shape(self, traces: Floats, reset: bool) -> None:
         if reset:
             self.trace_shape_ = traces.shape[1:]
         elif traces.shape[1:] != self.trace_shape_:
-            channels, samples = self.trace_shape_
-            raise TraceError(
-                f"Expected traces of {channels} channels x {samples} samples, as in fit, got {traces.shape[1]} x "
-                f"{traces.shape[2]}; resample, or fit anew."
-            )
+            wanted, got = ("{} channels x {} samples".format(*shape) for shape in (self.trace_shape_, traces.shape[1:]))
+            raise TraceError(f"Expected traces of {wanted}, as in fit, got {got}; resample, or fit anew.")
+        return traces
 
     @property
     def _n_features_out(self) -> int:  # scikit-learn's name, for get_feature_names_out
@@ -221,7 +204,13 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     """Labels (n,) of two classes as 1, the larger one, and 0; those of 0 and 1 as they are. SettingError for others."""
     if y is None:
         raise SettingError(f"{name} uses labels: requires y to be passed, but the target y is None.")
-    labels = _class_labels(y)
+    try:
+        labels = column_or_1d(y, warn=True)
+        assert_all_finite(labels, input_name="y")
+        check_classification_targets(labels)
+    except ValueError as error:  # scikit-learn's words for one that is continuous, not finite or not one column
+        raise SettingError(str(error)) from error
+    labels = np.asarray(labels)
     if len(labels) != n:
         raise SettingError(f"Expected a label for each of {n} traces, got inconsistent numbers of samples: {len(labels)}.")
     classes = np.unique(labels)
@@ -235,34 +224,22 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     return np.asarray(labels == classes[-1], dtype=np.int64)
 
 
-def _class_labels(y: Any) -> NDArray[Any]:
-    """Y as (n,) labels of classes; scikit-learn's words where it is continuous, not finite or not one column."""
-    try:
-        labels = column_or_1d(y, warn=True)
-        assert_all_finite(labels, input_name="y")
-        check_classification_targets(labels)
-    except ValueError as error:
-        raise SettingError(str(error)) from error
-    return np.asarray(labels)
-
-
 def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
     """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
+    got = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
-        return SettingError(
-            f"Expected both classes outside fold {fold}, got 0 traces: all share one fold, since they are the same to "
-            "1/65536 of their unit; look at the sensor, or give the traces in a smaller unit."
+        got = (
+            "0 traces: all share one fold, as they are the same to 1/65536 of their unit; look at the sensor, or the unit."
         )
-    return SettingError(
-        f"Expected both classes outside fold {fold}, got {n} traces of {classes} class; "
-        "collect more labels before the first fit."
-    )
+    return SettingError(f"Expected both classes outside fold {fold}, got {got}")
 
 
 def seed_of(random_state: Any) -> int | None:
     """scikit-learn's `random_state` (None, an integer or a RandomState) as a seed for NumPy's and torch's generators."""
-    if random_state is None or isinstance(random_state, int | np.integer):
-        return None if random_state is None else int(random_state)
+    if random_state is None:
+        return None
+    if isinstance(random_state, int | np.integer):
+        return int(random_state)
     if isinstance(random_state, np.random.RandomState):
         return int(random_state.randint(2**31 - 1))
     raise SettingError(f"Expected random_state None, an integer or a RandomState, got {random_state!r}.")

@@ -6,9 +6,8 @@
     trace ──► encoder: convolutions, ramps, means over ──► head k ──► axis 1: P(success), from outside fold k
     (C, T)    regions, a linear layer; label-free           (2*W,)  └► axis 2: principal direction
 
-A label counts only in a space that never saw it (honest counting), so a network trained on labels would exist K times, each
-on few labels. One trained without labels is shared by all K spaces and may train as long as a cell idles
-(`encoder_budget`); only the last layer, convex, is cross-fitted.
+A network trained on labels would exist K times, each on few labels. One trained without labels is shared by all K spaces
+and may train as long as a cell idles (`encoder_budget`); only the last layer, convex, is cross-fitted.
 
 Cross-fitting: Wolpert (1992), Neural Networks 5; Chernozhukov et al. (2018), Econometrics Journal 21.
 """
@@ -31,7 +30,6 @@ from .features import KeptFeatures
 from .heads import FeatureReducer, in_chunks
 from .training import AUGMENTATIONS, EncoderTraining
 
-MOST_REGIONS = 16
 AT_ONCE = 60_000  # places of traces that a retrain looks at anew, so that it ends in time however many references there are
 HELD_OUT = 8  # one trace in so many is never trained on, by the hash of its part
 
@@ -142,8 +140,8 @@ class ConvReducer(FeatureReducer):
     def get_state(self) -> dict[str, NDArray[Any]]:
         """What every reducer by features gives, and the encoder's training with its optimiser."""
         trained = {} if self.training_ is None else self.training_.get_state()
-        own = {f"training.{name}": value for name, value in trained.items()} | {"average": np.array(self.average_)}
-        return super().get_state() | own
+        own = {f"training.{name}": value for name, value in trained.items()}
+        return super().get_state() | own | {"average": np.array(self.average_)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Become what `get_state` was taken from; the parameters must be the same."""
@@ -161,8 +159,8 @@ class ConvReducer(FeatureReducer):
             value = getattr(self, name)
             if not isinstance(value, int | np.integer) or value < 1:
                 raise SettingError(f"Expected {name} >= 1, an integer, got {value!r}.")
-        if self.regions > MOST_REGIONS:
-            raise SettingError(f"Expected regions <= {MOST_REGIONS}, got {self.regions!r}.")
+        if self.regions > 16:
+            raise SettingError(f"Expected regions <= 16, got {self.regions!r}.")
         unknown = sorted(set(str(self.augmentations).split()) - set(AUGMENTATIONS))
         if unknown:
             raise SettingError(f"Expected augmentations among {', '.join(AUGMENTATIONS)}, got {', '.join(unknown)}.")

@@ -6,11 +6,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.base import clone
 from sklearn.utils import get_tags
 from sklearn.utils.validation import check_is_fitted
@@ -107,7 +106,8 @@ class CrossFitted(_Wrapping):
         labels = binary_labels(y, len(traces), type(self.reducer).__name__)
         folds = content_fold(traces, self.folds) if folds is None else folds
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
-        for k, outside in self._outside(folds):
+        for k in range(self.folds):
+            outside = folds != k
             # Fold k never trains clone k, or its labels would count themselves.
             classes = len(np.unique(labels[outside]))
             if classes < 2:
@@ -115,9 +115,6 @@ class CrossFitted(_Wrapping):
             self.clones_[k].fit(self.handed(traces[outside]), labels[outside])
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
-
-    def _outside(self, folds: Ints) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-        return ((k, folds != k) for k in range(self.folds))
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
         """Fit the clones afresh: they are somebody else's, and have no steps to stop."""

@@ -6,10 +6,10 @@
       -> standardised, clipped
       -> linear: W principal components of these, and W directions that `training.py` trains     (B, 2*W)
 
-It starts as MiniRocket does, from kernels of fixed weights and thresholds drawn from what they give on the first traces, so
-it is of use before anything was trained; then kernels, thresholds and half of the linear layer are trained without labels,
-so one encoder is honest for every fold. Instead of a hard share of positive values it counts by a ramp two deviations wide:
-that has a gradient, and measured better untrained (docs/explanation/measured.md).
+It starts as MiniRocket does, from kernels of fixed weights and thresholds drawn from what they give on the first traces;
+then kernels, thresholds and half of the linear layer are trained without labels, so one encoder is honest for every fold.
+Instead of a hard share of positive values it counts by a ramp two deviations wide: that has a gradient, and measured better
+untrained (docs/explanation/measured.md).
 
 Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, for kernels, dilations and thresholds; Tan,
 Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36, for several channels.
@@ -26,15 +26,9 @@ from ..errors import SettingError
 from ..files import read_archive
 from .features import CLIP, TAPS, Carry, Features, dilations_of, rocket_kernels
 
-FRAMES = 200  # a trace is averaged to about so many samples
-KEPT = 0.8  # share of the traces' variance that averaging must leave, or less is averaged
-PLACES = 600  # of each kernel and dilation, at most; else one at each frame: on traces that oscillate fewer say less
 WHOLE = 2.0  # weight of the mean over the whole trace beside that over a region: where it does not matter when
-RAMP = 2.0  # deviations of a kernel's output from 0 to 1
 SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
 START = 4.0  # size of the trained directions before they are trained: outputs of about one deviation
-SCALE_TRACES = 2000  # that set scales and centres
-BASIS_TRACES = 1000  # that set the principal components
 LEARNED = ("kernel", "threshold", "slope", "unit", "middle", "mix")  # what a start from another encoder takes over
 
 
@@ -57,7 +51,7 @@ class ConvEncoder(Features):
         self, channels: int, samples: int, average: int, kernels: int, dilations: int, regions: int, width: int
     ) -> None:
         frames = samples // average
-        places = max(1, min(frames, PLACES) // regions) * regions
+        places = max(1, min(frames, 600) // regions) * regions  # on traces that oscillate fewer say less
         taps = _taps(frames, dilations, places)
         n_pooled = len(taps) * regions * kernels
         super().__init__(channels, samples, n_pooled)
@@ -140,7 +134,7 @@ class ConvEncoder(Features):
         quantiles = 0.05 + 0.9 * (np.arange(1, h[..., 0].numel() + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
         place = torch.from_numpy((quantiles * (h.size(2) - 1)).astype(np.int64)).view(*h.shape[:2], 1)
         deviation = h.std(2, unbiased=False)
-        self.slope.copy_((1.0 / (RAMP * deviation + 1e-6))[:, None])
+        self.slope.copy_((1.0 / (2.0 * deviation + 1e-6))[:, None])  # a ramp two deviations wide
         self.threshold.copy_(0.5 - h.gather(2, place).permute(0, 2, 1) * self.slope)
         pooled = self.pooled(a, self.taps, self.pool)
         self.middle.copy_(pooled.mean(0))
@@ -153,7 +147,7 @@ class ConvEncoder(Features):
 
     def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
         """Set scale, principal axes and centre from pooled outputs (n, D*R*F); returns features (n, 2*W), and a `Carry`."""
-        some = raw[:: 1 + (len(raw) - 1) // SCALE_TRACES]
+        some = raw[:: 1 + (len(raw) - 1) // 2000]
         g, carry = super().standardise(some)
         before, centre = self.basis.double(), self.centre.clone()
         width = self.mix.size(1)
@@ -204,26 +198,25 @@ def start_from(encoder: ConvEncoder, path: str) -> None:
         shape = tuple(getattr(encoder, name).shape)
         if value.shape != shape or value.dtype != np.float32 or not np.isfinite(value).all():
             raise SettingError(f"Expected {name} in {path!r} as {shape} finite float32, got {value.shape} {value.dtype}.")
-    for name, value in found.items():
         getattr(encoder, name).data.copy_(torch.from_numpy(value))
 
 
 def averaging(traces: Tensor) -> int:
-    """How many samples of traces (n, C, T) to average: so many that 200 are left, fewer where that loses an oscillation."""
+    """Samples of traces (n, C, T) to average: so many that 200 are left and a share 0.8 of the variance, or fewer."""
     samples = traces.size(2)
     centred = traces.double() - traces.double().mean((0, 2), keepdim=True)
     whole = centred.square().mean((0, 2))
-    for average in range(samples // FRAMES, 1, -1):
+    for average in range(samples // 200, 1, -1):
         frames = samples // average
         means = centred[:, :, samples - frames * average :].reshape(len(traces), -1, frames, average).mean(3)
-        if bool((means.square().mean((0, 2)) >= KEPT * whole).all()):
+        if bool((means.square().mean((0, 2)) >= 0.8 * whole).all()):
             return average
     return 1
 
 
 def principal_axes(g: Tensor, width: int) -> Tensor:
     """(P, width) principal directions of features (n, P), the first ones; zeros where there are no more."""
-    some = g[:: 1 + (len(g) - 1) // BASIS_TRACES].double()
+    some = g[:: 1 + (len(g) - 1) // 1000].double()
     centred = some - some.mean(0)
     sizes, axes = torch.linalg.eigh(centred.T @ centred)
     n = min(width, int((sizes > 1e-9 * sizes[-1].clamp(min=1e-12)).sum()))

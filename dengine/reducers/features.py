@@ -18,8 +18,6 @@ from .base import Floats
 
 # Weights (m, P), biases (m,) of scores on features as they were -> those that say the same on features as they are.
 Carry = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-FILTER_TRACES = 256  # that filters are learned from
-LEARN_TRACES = 1000  # that set channel scales: more tell no more
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 TAPS = 9  # of MiniRocket's kernels; 84 = 9 choose 3 ways to place its three 2s among -1s
 
@@ -51,7 +49,7 @@ class Features(nn.Module):
         return len(self.gain)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, P), standardised."""
+        """(B, C, T) -> (B, n_out), standardised."""
         return self.clipped(x)
 
     def clipped(self, x: Tensor) -> Tensor:
@@ -74,14 +72,14 @@ class Features(nn.Module):
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
-        if len(X) > LEARN_TRACES:
-            X = X[torch.from_numpy(rng.permutation(len(X))[:LEARN_TRACES])]
+        if len(X) > 1000:  # more tell no more
+            X = X[torch.from_numpy(rng.permutation(len(X))[:1000])]
         wide = X.double()
         centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
         self.scale.copy_(scale[:, None])
         self.shift.copy_((-centre * scale)[:, None])
-        some = X[torch.from_numpy(rng.permutation(len(X))[:FILTER_TRACES])]
+        some = X[torch.from_numpy(rng.permutation(len(X))[:256])]
         self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
 
     def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
@@ -100,10 +98,8 @@ class Features(nn.Module):
 
 def rocket_kernels() -> Tensor:
     """(84, 9): every way to place three 2s among -1s; each kernel sums to zero, so offsets do not matter."""
-    kernels = torch.full((84, TAPS), -1.0)
-    for row, places in enumerate(combinations(range(TAPS), 3)):
-        kernels[row, list(places)] = 2.0
-    return kernels
+    places = torch.tensor(list(combinations(range(TAPS), 3)))
+    return torch.full((84, TAPS), -1.0).scatter_(1, places, 2.0)
 
 
 def dilations_of(samples: int, n: int) -> list[int]:
@@ -113,10 +109,7 @@ def dilations_of(samples: int, n: int) -> list[int]:
 
 
 class KeptFeatures:
-    """A row of features (P,) a trace, found by its key.
-
-    compute : traces (n, C, T) -> features (n, P).
-    """
+    """A row of features (P,) a trace, found by its key; `compute` gives those of traces (n, C, T), (n, P)."""
 
     def __init__(self, width: int) -> None:
         self.places: dict[bytes, int] = {}
@@ -130,10 +123,7 @@ class KeptFeatures:
         return copy.copy(self)
 
     def of(self, traces: Floats, compute: Callable[[Tensor], Tensor], keys: Sequence[bytes] | None = None) -> Tensor:
-        """(n, C, T) -> (n, P); what is not among these traces is forgotten, as it has left the window.
-
-        keys : `keys_of` the traces, where they are known.
-        """
+        """(n, C, T) -> (n, P); what is not among these traces is forgotten, as it has left the window."""
         keys = keys_of(traces) if keys is None else keys
         self.add(traces, keys, len(traces), compute)
         self.features = self.features[[self.places[key] for key in keys]]
@@ -151,8 +141,5 @@ class KeptFeatures:
 
 
 def keys_of(traces: Floats) -> list[bytes]:
-    """What each trace (n, C, T) is found by: a digest of its exact samples, where a fold's hash is of rounded ones.
-
-    SHA-1 is the fastest in the standard library where the processor has instructions for it, and no secret is kept.
-    """
+    """What each trace (n, C, T) is found by: the fastest digest of its exact samples; a fold's hash is of rounded ones."""
     return [sha1(trace, usedforsecurity=False).digest() for trace in traces]

@@ -5,6 +5,7 @@ fits, warm-starts, stores and restores it; a kind of reducer gives its features.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -23,7 +24,6 @@ MIN_TRACES = 20  # that an engine's first model is trained on
 FIRST_STEPS = 3  # of the heads, however late: without any, a first model would hold all parts for alike
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
-CONVERGED = 1e-5  # largest change of a weight
 
 
 class CrossFittedScores(nn.Module):
@@ -133,7 +133,7 @@ class _NewtonHead:
                 break
             d = d / 2.0
         # Each head stops on its own: a common test would let fold k's labels choose head k's last step.
-        self.done = bool(d.abs().max() < CONVERGED)
+        self.done = bool(d.abs().max() < 1e-5)
 
     def base_rate_loss(self) -> float:
         """Mean log loss of the labels' own mean: what knowing nothing of a trace costs."""
@@ -155,18 +155,14 @@ def _interleave(heads: Sequence[_NewtonHead], max_iter: int, stop: StopRule | No
     while step < max_iter and not all(h.done for h in heads):
         if stop is not None and stop.exhausted(step, least):
             break
-        for head in heads:
-            if not head.done:
-                head.step()
+        for head in (h for h in heads if not h.done):
+            head.step()
         step += 1
     return step
 
 
 class FeatureEmbedding(nn.Module):
-    """(B, C, T) raw traces -> (B, K, d).
-
-    A linear layer at the end of the features and the heads are one matrix here, `fold` says which.
-    """
+    """(B, C, T) raw traces -> (B, K, d): a linear layer at the end of the features and the heads are one matrix."""
 
     weight: Tensor
     bias: Tensor
@@ -223,7 +219,6 @@ class FeatureReducer(Reducer):
     ) -> Self:
         """Fit afresh.
 
-        X : (n, T) or (n, C, T).  y : (n,) of two classes, the larger one being the success.
         folds : (n,) permanent folds; None: by content.  stop : asked before each step; None: until done.
         Raises SettingError where a setting is out of range, or a head would see one class alone.
         """
@@ -272,7 +267,10 @@ class FeatureReducer(Reducer):
             note = self._take_over(traces, keys)
             g, carry = self.net_.features.standardise(self.raw_features(traces, keys))
             head.carry_over(carry)  # a warm start begins where the last fit ended
-            rows = torch.from_numpy(self._sample(len(g)))
+            rows = torch.arange(len(g))
+            if len(g) > self.train_traces:  # a draw that is blind to labels, another at each fit
+                rng = np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_])
+                rows = torch.from_numpy(rng.permutation(len(g))[: self.train_traces])
             y, k = torch.from_numpy(labels)[rows], torch.from_numpy(folds)[rows]
             least = 0 if self.n_fits_ else FIRST_STEPS
             self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop, least)
@@ -283,20 +281,11 @@ class FeatureReducer(Reducer):
 
     def raw_features(self, traces: Floats, keys: Sequence[bytes] | None = None) -> Tensor:
         """(n, C, T) -> (n, P), not standardised, computed once a trace.  keys : `keys_of` the traces, where known."""
-        return self.kept_.of(traces, self._computed, keys)
-
-    def _computed(self, traces: Tensor) -> Tensor:
-        return in_chunks(self.net_.features.raw, traces)
+        return self.kept_.of(traces, partial(in_chunks, self.net_.features.raw), keys)
 
     def _take_over(self, traces: Floats, keys: Sequence[bytes]) -> str:
         """Let features that were trained apart answer from now on; what is to be said of it, "" where none were."""
         return ""
-
-    def _sample(self, n: int) -> Ints:
-        """Rows that train the heads: all, or of many a draw that is blind to labels and another at each fit."""
-        if n <= self.train_traces:
-            return np.arange(n)
-        return np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_]).permutation(n)[: self.train_traces]
 
     def _observe(self, losses: NDArray[Any], kept: list[int], note: str = "") -> None:
         self.holdout_losses_ = np.array(losses, dtype=np.float64)
@@ -357,14 +346,14 @@ class FeatureReducer(Reducer):
         for name in ("n_components", "folds", "max_iter"):
             if not isinstance(getattr(self, name), int | np.integer):
                 raise SettingError(f"Expected {name} to be an integer, got {getattr(self, name)!r}.")
-        if self.n_components not in (1, 2):
-            raise SettingError(f"Expected n_components 1 or 2, got {self.n_components!r}.")
-        if self.l2 <= 0:
-            raise SettingError(f"Expected l2 > 0, got {self.l2!r}; without a ridge separable labels have no solution.")
-        if self.folds < 2:
-            raise SettingError(f"Expected folds >= 2 where labels are used, got {self.folds!r}.")
-        if self.max_iter < 1:
-            raise SettingError(f"Expected max_iter >= 1, got {self.max_iter!r}.")
+        for fits, expected, value in (
+            (self.n_components in (1, 2), "n_components 1 or 2", self.n_components),
+            (self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2),
+            (self.folds >= 2, "folds >= 2 where labels are used", self.folds),
+            (self.max_iter >= 1, "max_iter >= 1", self.max_iter),
+        ):
+            if not fits:
+                raise SettingError(f"Expected {expected}, got {value!r}.")
 
     def _build(self, channels: int, samples: int) -> None:
         features = self.make_features(channels, samples)

@@ -28,14 +28,9 @@ class PcaReducer(Reducer):
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for no more traces than dimensions."""
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:
-            raise SettingError(
-                f"PCA to {self.n_components} dimensions needs more than {self.n_components} traces, "
-                f"got n_samples = {len(rows)}."
-            )
+            raise SettingError(f"PCA needs more than {self.n_components} traces, got n_samples = {len(rows)}.")
         if rows.shape[1] < self.n_components:
-            raise SettingError(
-                f"PCA to {self.n_components} dimensions needs as many samples, got n_features = {rows.shape[1]}."
-            )
+            raise SettingError(f"PCA needs {self.n_components} samples or more, got n_features = {rows.shape[1]}.")
         pca = PCA(n_components=self.n_components, svd_solver="randomized", random_state=self.random_state).fit(rows)
         self.mean_ = pca.mean_.astype(np.float32)
         self.components_ = pca.components_.astype(np.float32)

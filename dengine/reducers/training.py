@@ -4,11 +4,11 @@
     >>> training.run(traces, held_out, StopRule(max_steps=30))      # warm: the next run goes on where this one ended
 
 A step draws 64 traces, distorts each twice, and lowers the VICReg loss of the two embeddings behind a projector: the mean
-squared distance of the pairs (invariance), a hinge that keeps every dimension's deviation above 1 (variance), and the
-squared covariances of dimensions (covariance), so that nothing collapses and nothing is said twice.
+squared distance of the pairs, a hinge that keeps every dimension's deviation above 1, and the squared covariances of
+dimensions, so that nothing collapses and nothing is said twice. No label is read, so it is honest for every fold. Whether
+a training may answer is asked of traces that it never saw, by the same loss.
 
-No label is read, so what is learned is honest for every fold. Whether a training may answer is asked of traces that it
-never saw, by the same loss. Source: Bardes, Ponce and LeCun (2022), VICReg, ICLR, arXiv:2105.04906.
+Source: Bardes, Ponce and LeCun (2022), VICReg, ICLR, arXiv:2105.04906.
 """
 
 from __future__ import annotations
@@ -28,12 +28,7 @@ from .base import StopRule
 from .encoder import ConvEncoder
 
 BETA_1, BETA_2 = 0.9, 0.999  # what a step leaves of the means of gradients and of their squares
-EPSILON = 1e-8
-BATCH = 64
-LOOKED_AT = 33  # places of a kernel, about, in a step; others in the next
 PROJECTED = 128  # dimensions of the projector
-RATE = 1e-3  # of Adam
-KERNEL_RATE = 1e-4  # of kernels and thresholds: trained faster, they cost the principal axes what these were worth
 INVARIANCE, VARIANCE, COVARIANCE = 25.0, 25.0, 1.0  # weights of the loss, as in its paper
 FEWEST = 8  # held-out traces that can say whether a training did well
 WORSE = 1.1  # times the held-out loss that a training may have, against the one that answers
@@ -61,7 +56,7 @@ class Adam:
             assert parameter.grad is not None  # for the type checker: every parameter is part of the loss
             mean.lerp_(parameter.grad, 1.0 - BETA_1)
             square.lerp_(parameter.grad.square(), 1.0 - BETA_2)
-            parameter.addcdiv_(mean, (square / of_squares).sqrt_().add_(EPSILON), value=-rate / unbiased)
+            parameter.addcdiv_(mean, (square / of_squares).sqrt_().add_(1e-8), value=-rate / unbiased)
             parameter.grad = None
 
     def get_state(self) -> dict[str, NDArray[Any]]:
@@ -78,28 +73,12 @@ class Adam:
         self._steps = int(state["steps"])
 
 
-def scaled(a: Tensor, g: torch.Generator) -> Tensor:
-    """Each channel a tenth stronger or weaker."""
-    return a * (1.0 + 0.1 * torch.randn(*a.shape[:2], 1, generator=g))
-
-
-def offset(a: Tensor, g: torch.Generator) -> Tensor:
-    """Each channel up or down by a tenth of its deviation."""
-    return a + 0.1 * torch.randn(*a.shape[:2], 1, generator=g)
-
-
 def shifted(a: Tensor, g: torch.Generator) -> Tensor:
     """Up to a twentieth earlier or later; what comes in repeats the end."""
     frames = a.size(2)
     most = max(1, frames // 20)
     by = torch.randint(-most, most + 1, (len(a), 1, 1), generator=g)
-    places = (torch.arange(frames) + by).clamp(0, frames - 1)
-    return a.gather(2, places.expand_as(a))
-
-
-def jittered(a: Tensor, g: torch.Generator) -> Tensor:
-    """Noise of a twentieth of a deviation."""
-    return a + 0.05 * torch.randn(a.shape, generator=g)
+    return a.gather(2, (torch.arange(frames) + by).clamp(0, frames - 1).expand_as(a))
 
 
 def masked(a: Tensor, g: torch.Generator) -> Tensor:
@@ -113,9 +92,9 @@ def masked(a: Tensor, g: torch.Generator) -> Tensor:
 
 AUGMENTATIONS: dict[str, Callable[[Tensor, torch.Generator], Tensor]] = {
     "shift": shifted,
-    "scale": scaled,
-    "offset": offset,
-    "jitter": jittered,
+    "scale": lambda a, g: a * (1.0 + 0.1 * torch.randn(*a.shape[:2], 1, generator=g)),  # each channel, by a tenth
+    "offset": lambda a, g: a + 0.1 * torch.randn(*a.shape[:2], 1, generator=g),  # each channel, by a tenth of a deviation
+    "jitter": lambda a, g: a + 0.05 * torch.randn(a.shape, generator=g),
     "mask": masked,
 }
 
@@ -139,10 +118,7 @@ class _Learner(nn.Module):
         super().__init__()
         self.encoder = encoder.requires_grad_(True)
         self.project = nn.Sequential(
-            nn.Linear(encoder.mix.size(1), PROJECTED),
-            nn.BatchNorm1d(PROJECTED),
-            nn.ReLU(),
-            nn.Linear(PROJECTED, PROJECTED),
+            nn.Linear(encoder.mix.size(1), PROJECTED), nn.BatchNorm1d(PROJECTED), nn.ReLU(), nn.Linear(PROJECTED, PROJECTED)
         )
 
     def forward(self, a: Tensor, taps: Tensor, pool: Tensor) -> Tensor:
@@ -161,9 +137,9 @@ class _Learner(nn.Module):
 class Release:
     """What became of a training that wanted to answer.
 
-    encoder : that may; None: it does worse than the one that answers, and is given up.
+    encoder : None: it does worse than the one that answers, and is given up.
     loss : held-out loss, NaN where too few traces are held out.
-    moved : how far it moved the embedding of the held-out traces, 0 to 1: one minus the linear centred kernel alignment.
+    moved : how far it moved their embedding, 0 to 1: one minus the linear centred kernel alignment.
     """
 
     encoder: ConvEncoder | None
@@ -193,7 +169,8 @@ class EncoderTraining:
     def _optimiser(self) -> Adam:
         encoder = self.learner.encoder
         linear = [encoder.mix, *self.learner.project.parameters()]
-        return Adam([([encoder.kernel, encoder.threshold], KERNEL_RATE), (linear, RATE)])
+        # Kernels trained faster cost the principal axes what these were worth.
+        return Adam([([encoder.kernel, encoder.threshold], 1e-4), (linear, 1e-3)])
 
     @property
     def waits(self) -> bool:
@@ -214,10 +191,13 @@ class EncoderTraining:
             return 0
         with torch.no_grad():
             averaged, self.held_out = self.encoder.averaged(traces), self.encoder.averaged(held_out)
-        step, thin = 0, max(1, self.encoder.n_places // LOOKED_AT)
+        step, thin = (
+            0,
+            max(1, self.encoder.n_places // 33),
+        )  # a step looks at about 33 places
         while not stop.exhausted(step):
             g = self._generator(self.steps)
-            drawn = torch.randperm(len(averaged), generator=g)[:BATCH]
+            drawn = torch.randperm(len(averaged), generator=g)[:64]
             places = self.encoder.thinned(self.steps % thin, thin)
             loss = self.learner.loss(averaged[drawn], self.augmentations, g, places)
             loss.backward()  # type: ignore[no-untyped-call]  # torch's own

@@ -67,8 +67,7 @@ class UmapReducer(Reducer):
 class _Contained(warnings.catch_warnings):
     """Keep umap-learn's warnings and its number of threads out of the process.
 
-    It warns that a seed means one thread, which is what is asked for; spectral fallbacks are its own. Its first kernel
-    makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others on a busy machine.
+    Its first kernel makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others.
     """
 
     def __enter__(self) -> None:

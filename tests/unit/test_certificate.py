@@ -1,8 +1,10 @@
-"""What is certified of accepted and rejected parts: the bound, what counts as known, and the words."""
+"""Evidence by betting, and what is certified of accepted and rejected parts: the bound, what is known, the words."""
 
 import math
+from typing import Any
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -19,9 +21,6 @@ def certificate(stops: str = "all", audit_rate: float = 0.0, alpha: float = 0.05
     return certify(Outcomes(**counts), alpha, 0.05, stops, audit_rate)
 
 
-# --------------------------------------------------------------------------------------------------- the bound
-
-
 @given(counts, alphas, propensities)
 def test_the_bound_is_the_largest_rate_not_refuted(c: tuple[int, int], alpha: float, q: float) -> None:
     upper = failure_bound(*c, alpha, q)
@@ -36,17 +35,6 @@ def test_the_bound_rises_with_a_bad_part_and_falls_with_a_good_one(c: tuple[int,
     upper = failure_bound(n, n_bad, alpha, q)
     assert failure_bound(n + 1, n_bad, alpha, q) <= upper <= failure_bound(n + 1, n_bad + 1, alpha, q)
     assert failure_bound(n, n_bad, alpha / 2, q) >= upper
-
-
-@pytest.mark.parametrize("n_bad", [0, 5, 40])
-def test_looking_at_any_time_costs_more_than_looking_once(n_bad: int) -> None:
-    once = stats.beta.ppf(0.95, n_bad + 1, 2000 - n_bad)  # Clopper-Pearson, one-sided
-    assert once < failure_bound(2000, n_bad, 0.05) < 1.8 * once
-
-
-def test_the_same_number_of_audits_says_nearly_the_same_at_any_rate() -> None:
-    uppers = [failure_bound(round(400 / q), 4, 0.05, q) for q in (1.0, 0.1, 0.02)]
-    assert max(uppers) < 1.05 * min(uppers)
 
 
 def test_where_nothing_is_known_the_bound_is_one() -> None:
@@ -66,64 +54,11 @@ def test_settings_and_counts_out_of_range_are_named() -> None:
         certify(Outcomes(), 0.05, 0.0, "all", 0.0)
 
 
-# --------------------------------------------------------------------------------------------- what counts as known
-
-
-def test_where_every_bad_part_stops_the_system_all_accepted_are_known() -> None:
-    found = certificate("all", accepted=1203, stops=24).accepted
-    assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == (1203, 1203, 24, 1.0)
-    assert found.upper == failure_bound(1203, 24, 0.05) == pytest.approx(0.0349, abs=5e-5)  # golden
-
-
-def test_silence_is_no_success() -> None:
-    found = certificate("some", accepted=1203, stops=24, confirmed=1178).accepted
-    assert (found.upper, found.propensity, found.n_looked_at) == (1.0, 0.0, 0)
-
-
-def test_parts_that_were_all_confirmed_or_stopped_are_known() -> None:
-    known = certificate("some", accepted=1203, stops=24, confirmed=1179).accepted
-    assert known == certificate("all", accepted=1203, stops=24).accepted
-
-
-def test_audits_speak_for_all_the_model_was_certain_of() -> None:
-    found = certificate("some", 0.02, accepted=9800, audited_accepts=200, audited_accepts_bad=3).accepted
-    assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == (10_000, 200, 3, 0.02)
-    assert found.upper == failure_bound(10_000, 3, found.alpha, 0.02)
-
-
 def test_what_is_known_one_way_and_the_other_spends_alpha_once() -> None:
     audits = certificate("some", 0.02, accepted=980, audited_accepts=20).accepted
     confirmed = certificate("some", 0.02, accepted=980, confirmed=980, audited_accepts=20).accepted
     assert audits.alpha + confirmed.alpha == pytest.approx(0.05)
     assert confirmed.upper < audits.upper
-
-
-def test_audits_do_not_certify_less_than_the_share_known_to_be_bad() -> None:
-    assert certificate("some", 0.1, accepted=900, stops=450, audited_accepts=100).accepted.upper == 0.45
-
-
-def test_rejected_parts_are_known_by_audits_alone() -> None:
-    assert certificate("all", rejected=400).rejected.upper == 1.0
-    found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
-    assert (found.n, found.n_looked_at, found.n_bad) == (4000, 400, 2)
-    assert found.upper == failure_bound(4000, 2, 0.05, 0.1)
-
-
-# ------------------------------------------------------------------------------------------------------ the words
-
-
-def test_one_sentence_says_what_was_kept() -> None:
-    assert certificate("all", accepted=1203, stops=24).sentence == (
-        "Of 1,203 parts that went on without a check, at most 3.5 % were bad on average, with 95 % confidence, "
-        "however often one looks; the tolerance is 5 %."
-    )
-
-
-def test_one_sentence_says_what_audits_tell() -> None:
-    assert certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20).sentence == (
-        "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 % were bad on average, with "
-        "95 % confidence, however often one looks; the tolerance is 5 %."
-    )
 
 
 def test_where_nothing_can_be_said_the_sentence_says_what_to_set() -> None:
@@ -144,15 +79,6 @@ def test_a_sentence_never_promises_more_than_the_bound(c: tuple[int, int], alpha
         assert found.accepted.upper - 1e-12 <= said <= found.accepted.upper * 1.11
 
 
-def test_kept_means_the_bound_lies_within_the_tolerance() -> None:
-    assert certificate("all", accepted=1203, stops=24).kept
-    assert not certificate("all", accepted=1203, stops=60).kept
-    assert not certificate("some", accepted=1203).kept
-
-
-# -------------------------------------------------------------------------------------------- how many audits more
-
-
 @pytest.mark.parametrize("target", [0.05, 0.025, 0.01])
 def test_as_many_more_audits_as_are_asked_for_bring_the_bound_to_the_target(target: float) -> None:
     found = certificate("some", 0.1, accepted=900, audited_accepts=100, audited_accepts_bad=1).accepted
@@ -163,14 +89,10 @@ def test_as_many_more_audits_as_are_asked_for_bring_the_bound_to_the_target(targ
 
 
 def test_at_the_present_rate_it_takes_more_audits_or_no_number_would_do() -> None:
-    found = certificate("all", accepted=500, stops=10)
+    found = certificate("all", accepted=500, stops=10).accepted
     assert found.audits_needed(0.03) < found.audits_needed(0.03, 0.02)
     assert found.audits_needed(0.02, 0.02) is None
     assert found.audits_needed(0.9) == 0
-
-
-def test_without_audits_it_counts_those_from_now_on() -> None:
-    assert certificate("some", accepted=5000).audits_needed() == pytest.approx(73, abs=3)
 
 
 def test_the_advice_says_how_many() -> None:
@@ -181,4 +103,132 @@ def test_the_advice_says_how_many() -> None:
     assert certificate("all", accepted=1203, stops=60).advice.endswith("at the present rate no number would do.")
     assert certificate("all", accepted=1203, stops=0).advice == "Even 2.5 % is shown."
     with pytest.raises(SettingError, match="0 < target < 1"):
-        certificate().audits_needed(1.0)
+        certificate().accepted.audits_needed(1.0)
+
+
+BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)
+
+tolerances = st.floats(0.001, 0.999)
+
+
+@pytest.mark.parametrize(("n", "tolerance", "alpha"), [(28, 0.1, 0.1), (73, 0.05, 0.05)])
+def test_parts_that_were_all_good_are_soon_enough(n: int, tolerance: float, alpha: float) -> None:
+    assert log_evidence(n - 1, 0, tolerance) < math.log(1 / alpha) <= log_evidence(n, 0, tolerance)
+
+
+def test_no_parts_are_no_evidence() -> None:
+    assert log_evidence(0, 0, 0.1) == 0.0
+    assert log_evidence(0, 0, 0.1, 0.02) == 0.0
+
+
+@given(counts, tolerances, propensities)
+def test_it_is_the_log_of_the_capital_as_the_docstring_has_it(c: tuple[int, int], theta: float, q: float) -> None:
+    n, n_bad = c[0] % 200, c[1] % (c[0] % 200 + 1)
+    capitals = [b * (1 - b) ** n_bad / (1 - b * q * theta) ** n for b in BETS]
+    assert log_evidence(n, n_bad, theta, q) == pytest.approx(math.log(sum(capitals) / sum(BETS)), abs=1e-9)
+
+
+@given(counts, tolerances, propensities)
+def test_a_bad_part_lowers_the_evidence_and_a_good_one_raises_it(c: tuple[int, int], theta: float, q: float) -> None:
+    n, n_bad = c
+    assert (
+        log_evidence(n + 1, n_bad + 1, theta, q) < log_evidence(n, n_bad, theta, q) < log_evidence(n + 1, n_bad, theta, q)
+    )
+
+
+@given(counts.filter(lambda c: c[0] > 0), tolerances, tolerances, propensities)
+def test_evidence_grows_with_the_tolerance(c: tuple[int, int], one: float, other: float, q: float) -> None:
+    low, high = sorted((one, other))
+    assert log_evidence(*c, low, q) <= log_evidence(*c, high, q)
+
+
+@pytest.mark.parametrize("p", [0.01, 0.1, 0.5, 0.9])
+@pytest.mark.parametrize("q", [1.0, 0.3, 0.02])
+@pytest.mark.parametrize("n", [1, 2, 7, 30, 200])
+def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: float, p: float) -> None:
+    def mean_capital(truth: float) -> float:
+        seen = stats.binom.pmf(range(n + 1), n, q * truth)
+        return math.fsum(seen[k] * math.exp(log_evidence(n, k, p, q)) for k in range(n + 1))
+
+    assert mean_capital(p) == pytest.approx(1.0, abs=1e-9)
+    assert mean_capital(p + 0.05) < 1.0 < mean_capital(p - 0.005)
+
+
+def ever_refuted(alpha: float, rates: list[float], q: float) -> float:
+    """Probability, exact, that the running mean of these rates is ever refuted."""
+    alive, ever = {0: 1.0}, 0.0
+    for n, p in enumerate(rates, 1):
+        after: dict[int, float] = {}
+        for n_bad, mass in alive.items():
+            for k, chance in ((n_bad, 1 - q * p), (n_bad + 1, q * p)):
+                after[k] = after.get(k, 0.0) + mass * chance
+        mean = sum(rates[:n]) / n
+        wrong = {k for k in after if log_evidence(n, k, mean, q) >= math.log(1 / alpha)}
+        ever += sum(after.pop(k) for k in wrong)
+        alive = after
+    return ever
+
+
+STREAMS = {
+    "constant": [0.3] * 150,
+    "rising": [0.02 + 0.004 * i for i in range(150)],
+    "falling": [0.6 - 0.004 * i for i in range(150)],
+    "first bad, then good": [0.9] * 10 + [0.0] * 140,
+    "to and fro": [0.5 + 0.4 * math.sin(i / 5) for i in range(150)],
+}
+
+
+@pytest.mark.parametrize("q", [1.0, 0.3])
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_running_mean_that_moves_is_ever_refuted_with_probability_alpha_at_most(name: str, q: float) -> None:
+    for alpha in (0.05, 0.1, 0.3):
+        assert 0.0 < ever_refuted(alpha, STREAMS[name], q) <= alpha or STREAMS[name][-1] == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:.*torch.jit.*")
+def test_scripted_it_is_the_same_bit_for_bit() -> None:
+    scripted = torch.jit.script(log_evidence)
+    for n in (0, 1, 2, 17, 300, 1503, 100_000, 10_000_000):
+        for n_bad in {0, n // 1000, n // 50, n // 3, n}:
+            for tolerance in (0.001, 0.02, 0.05, 0.1, 0.5, 0.999):
+                for propensity in (1.0, 0.1, 0.02, 1 / 3):
+                    assert scripted(n, n_bad, tolerance, propensity) == log_evidence(n, n_bad, tolerance, propensity)
+
+
+@pytest.mark.parametrize(
+    ("stops", "audit_rate", "seen", "known"),
+    [
+        ("all", 0.0, {"accepted": 1203, "stops": 24}, (1203, 1203, 24, 1.0)),
+        ("some", 0.0, {"accepted": 1203, "stops": 24, "confirmed": 1179}, (1203, 1203, 24, 1.0)),  # of each is known
+        ("some", 0.0, {"accepted": 1203, "stops": 24, "confirmed": 1178}, (1203, 0, 0, 0.0)),  # silence is no success
+        ("some", 0.02, {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3}, (10_000, 200, 3, 0.02)),
+    ],
+)
+def test_what_is_known_of_accepted_parts(
+    stops: str, audit_rate: float, seen: dict[str, int], known: tuple[Any, ...]
+) -> None:
+    found = certificate(stops, audit_rate, **seen).accepted
+    assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == known
+    assert found.upper == failure_bound(found.n, found.n_bad, found.alpha, found.propensity)
+
+
+def test_audits_do_not_certify_less_than_the_share_known_to_be_bad() -> None:
+    assert certificate("some", 0.1, accepted=900, stops=450, audited_accepts=100).accepted.upper == 0.45
+
+
+def test_rejected_parts_are_known_by_audits_alone() -> None:
+    assert certificate("all", rejected=400).rejected.upper == 1.0
+    found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
+    assert (found.n, found.n_looked_at, found.n_bad) == (4000, 400, 2)
+
+
+def test_one_sentence_says_what_was_kept_or_what_audits_tell() -> None:
+    end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
+    kept = certificate("all", accepted=1203, stops=24)
+    assert kept.kept
+    assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden
+    assert kept.sentence == "Of 1,203 parts that went on without a check, at most 3.5 %" + end
+    audited = certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20)
+    of = "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 %"
+    assert audited.sentence == of + end
+    assert not certificate("all", accepted=1203, stops=60).kept

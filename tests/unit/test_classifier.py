@@ -16,9 +16,6 @@ def blobs(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return (rng.normal(0, 0.4, (n, 2)) + np.where(y, 1.0, -1.0)[:, None]).astype(np.float32), y
 
 
-# --------------------------------------------------------------------------------------------------- decisions
-
-
 @pytest.mark.parametrize("settings_", [{}, {"interval": "binomial"}, {"interval": "jeffreys"}, {"alpha": 0.9}])
 def test_an_empty_ball_abstains_in_decide_and_never_in_predict(settings_) -> None:
     Z, y = blobs()
@@ -44,12 +41,6 @@ def test_decisions_follow_from_the_interval_and_the_interval_from_the_counts(int
     assert set(decisions) == set(Action)
 
 
-def test_the_clean_sides_are_decided_and_the_middle_is_verified() -> None:
-    Z, y = blobs()
-    model = WilsonRadiusClassifier(radius=0.5, alpha=0.1, lower_bound=0.9).fit(Z, y)
-    assert list(model.decide([[1.0, 1.0], [-1.0, -1.0], [0.0, 0.0]])) == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
-
-
 def test_the_narrow_ball_may_reject_where_the_wide_one_cannot() -> None:
     rng = np.random.default_rng(0)
     Z = np.concatenate([rng.normal(0, 0.1, (40, 2)), rng.normal(3, 0.1, (360, 2))])
@@ -69,9 +60,6 @@ def test_predictions_are_those_of_scikit_learns_radius_neighbours() -> None:
     np.testing.assert_allclose(ours.predict_proba(queries), theirs.predict_proba(queries), atol=1e-12)
 
 
-# -------------------------------------------------------------------------------------------------- one bound
-
-
 @pytest.mark.parametrize("shares", [{}, {"fraction": 0.2}, {"fraction": 0.3, "reject_fraction": 0.05}])
 def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does(shares) -> None:
     Z, y = blobs()
@@ -81,9 +69,6 @@ def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does(shares) 
     assert [scripted(q) for q in queries] == [model.neighbours_(q) for q in queries]
 
 
-# ---------------------------------------------------------------------------------------------------- learning
-
-
 def test_learning_in_parts_is_learning_at_once() -> None:
     Z, y = blobs()
     whole = WilsonRadiusClassifier().fit(Z, y)
@@ -91,18 +76,6 @@ def test_learning_in_parts_is_learning_at_once() -> None:
     for start in range(0, len(Z), 37):
         parts.partial_fit(Z[start : start + 37], y[start : start + 37], classes=[0, 1])
     np.testing.assert_array_equal(parts.count(Z), whole.count(Z))
-
-
-def test_fit_forgets_what_was_held() -> None:
-    Z, y = blobs()
-    model = WilsonRadiusClassifier(radius=100.0).fit(Z, y).fit(Z[:10], y[:10])
-    assert sum(int(c[0]) for c in model.count(Z[:1])) == 10
-
-
-def test_beyond_capacity_the_oldest_leave_whatever_their_label() -> None:
-    Z, y = blobs()
-    model = WilsonRadiusClassifier(radius=100.0, capacity=50).fit(Z, y)
-    assert tuple(int(c[0]) for c in model.count(Z[:1])) == (y[-50:].sum(), 50 - y[-50:].sum())
 
 
 @pytest.mark.parametrize(("label", "counts"), [(1, (5, 0)), (0, (0, 5))])

@@ -6,6 +6,9 @@ import copy
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +18,11 @@ from dengine import ConvReducer, DataEngine, Dataset, Recipe
 from dengine.datasets.importing import import_labelled
 from dengine.decision.rule import script
 from dengine.engine.trainer import STEP_SECONDS, EncoderTime
+from dengine.errors import SettingError
 from dengine.folds import content_fold, content_hash
 from dengine.reducers.base import StopRule
-from dengine.reducers.encoder import ConvEncoder, averaging
+from dengine.reducers.encoder import ConvEncoder, averaging, weights_of
+from dengine.reducers.features import KeptFeatures
 from dengine.reducers.training import AUGMENTATIONS, Adam, vicreg_loss
 
 SMALL = {"kernels": 6, "dilations": 3, "width": 8}
@@ -127,18 +132,6 @@ def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(cha
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
         whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
         torch.testing.assert_close(found[d], whole[:, :, middle[d]].transpose(1, 2))
-
-
-def test_a_ramp_is_pooled_over_its_region_and_twice_over_the_whole_trace() -> None:
-    reducer, _, _ = fitted()
-    encoder = reducer.net_.features
-    per_region = encoder.pool.size(1) // 3
-    inside = torch.zeros(encoder.pool.size(1))
-    inside[:per_region] = 1.0  # above every threshold in the first third, below in the others
-    torch.testing.assert_close(encoder.pool @ inside, torch.tensor([1.0, 0.0, 0.0]) + 2.0 / 3.0)
-    taps, pool = encoder.thinned(1, 6)
-    assert pool.size(1) * 9 * encoder.n_dilations == len(taps)
-    torch.testing.assert_close(pool.sum(1), encoder.pool.sum(1))
 
 
 def test_adam_steps_as_torchs_does() -> None:
@@ -251,28 +244,10 @@ def test_the_encoder_trains_between_two_cycles_and_the_next_version_has_it() -> 
         assert any("encoder after" in report.reason for report in engine.store.retrains())
 
 
-def test_a_replaying_engine_repeats_exactly_with_its_encoder() -> None:
-    with engine_after(120, replaying=True) as one, engine_after(120, replaying=True) as two:
-        assert [r.reason for r in one.store.retrains()] == [r.reason for r in two.store.retrains()]
-        np.testing.assert_array_equal(one.model.index.points, two.model.index.points)
-
-
 def test_a_live_engine_ends_a_slice_by_the_clock() -> None:
     with engine_after(90) as engine:
         assert engine.encoder_time.steps > 0
         assert 0.0 < engine.encoder_time.longest < 0.45
-
-
-def test_a_reopened_engine_answers_the_same_and_goes_on_training(tmp_path) -> None:
-    url = str(tmp_path / "cell.sqlite")
-    X, _ = resonances(20, seed=5)
-    with engine_after(120, store=url, replaying=True) as engine:
-        steps = engine.model.spaces.training_.steps
-        asked = [engine.decide(x).lower for x in X]
-    with DataEngine.open(url, replaying=True) as again:
-        assert [again.decide(x).lower for x in X] == asked
-        kept = again.model.spaces.training_.steps
-        assert 0 < kept <= steps  # what was trained since the last version was not stored
 
 
 @pytest.mark.parametrize("retrained_before", [True, False])
@@ -287,7 +262,8 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path,
         raise AssertionError("computed in the retrain")
 
     with DataEngine.open(url, replaying=True) as engine:
-        monkeypatch.setattr(ConvReducer, "_computed", too_late)
+        add = KeptFeatures.add
+        monkeypatch.setattr(KeptFeatures, "add", lambda self, x, keys, most, _: add(self, x, keys, most, too_late))
         assert engine.retrain().accepted
 
 
@@ -316,3 +292,107 @@ def test_where_there_are_many_references_an_encoder_waits_until_all_are_embedded
     assert not torch.equal(reducer.net_.features.kernel, kernel)
     fresh = reducer.net_.features.raw(torch.from_numpy(X))
     np.testing.assert_allclose(reducer.raw_features(X), fresh, atol=1e-5)
+
+
+SHIPPED = Path(__file__).parents[2] / "models" / "encoder" / "encoder.npz"
+SIZES: dict[str, Any] = {**SMALL, "regions": 2}
+
+
+def traces(n: int = 80, channels: int = 1, seed: int = 0) -> tuple[Any, Any]:
+    """Traces (n, C, 120) in two easy shapes, and labels."""
+    rng = np.random.default_rng(seed)
+    y = (np.arange(n) % 5 < 3).astype(np.int64)
+    x = np.linspace(0, 5, 120)
+    X = np.where(y[:, None], x, x[::-1])[:, None] + rng.normal(0, 0.3, (n, channels, 120))
+    return X.astype(np.float32), y
+
+
+def started(start: str | None = None, channels: int = 1, seed: int = 0, **sizes: int) -> ConvReducer:
+    return ConvReducer(start=start, **(SIZES | sizes)).fit(*traces(80, channels, seed))
+
+
+def learned(reducer: ConvReducer) -> dict[str, Any]:
+    return weights_of(reducer.encoder_)
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> str:
+    """The weights of an encoder that took ten steps, as a file."""
+    X, y = traces()
+    reducer = started()
+    reducer.improve(X, np.arange(80), StopRule(max_steps=10))
+    reducer.train(X, y, np.arange(80) % 5)
+    path = tmp_path / "encoder.npz"
+    np.savez(path, **learned(reducer))
+    return str(path)
+
+
+def test_an_encoder_starts_exactly_from_the_weights(trained: str) -> None:
+    found, untrained = learned(started(trained, seed=1)), learned(started(seed=1))
+    with np.load(trained) as stored:
+        assert all(np.array_equal(found[name], stored[name]) for name in stored.files)
+    assert not np.array_equal(found["kernel"], untrained["kernel"])
+
+
+@pytest.mark.parametrize(
+    ("own", "said"),
+    [
+        ({"width": 9, "kernels": 7}, "kernels 6 instead of 7, width 8 instead of 9"),
+        ({"dilations": 2}, "dilations 3 instead of 2"),
+        ({"channels": 2}, "1 channel to start from weights, got 2"),
+    ],
+)
+def test_weights_of_other_sizes_are_refused_by_name(trained: str, own: dict[str, int], said: str) -> None:
+    with pytest.raises(SettingError, match=said):
+        started(trained, **own)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"mix": np.zeros((3, 3), np.float32)},
+        {"mix": np.zeros((36, 8), np.float64)},
+        {"kernel": np.full((9, 6), np.nan, np.float32)},
+        {"unit": np.array([None, "pickled"])},
+        {"width": np.zeros(2)},
+        {"slope": None},
+    ],
+    ids=["shape", "dtype", "NaN", "pickle", "sizes", "missing"],
+)
+def test_an_archive_of_something_else_is_refused(trained: str, change: dict[str, Any]) -> None:
+    with np.load(trained) as stored:
+        arrays = {name: value for name, value in (dict(stored) | change).items() if value is not None}
+    np.savez(trained, **arrays)
+    with pytest.raises(SettingError, match=r"encoder\.npz"):
+        started(trained)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no archive", b"PK\x03\x04 and no more"])
+def test_a_file_that_is_missing_or_broken_is_refused_by_its_name(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "broken.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SettingError, match=r"Cannot read start .*broken\.npz"):
+        started(str(path))
+
+
+def test_a_stored_engine_opens_without_the_file_and_decides_alike(trained: str, tmp_path: Path) -> None:
+    X, y = traces(120)
+    recipe = replace(Recipe.load("conv"), params={**SIZES, "start": trained}, retrain_every=30)
+    with DataEngine.from_recipe(recipe, store=str(tmp_path / "engine.db")) as engine:
+        for x, good in zip(X[:100], y[:100], strict=True):
+            engine.report(engine.decide(x[0]).id, success=bool(good))
+        engine.retrain()
+        before = [engine.decide(x[0]).embedding for x in X[100:]]
+    Path(trained).unlink()
+    with DataEngine.open(str(tmp_path / "engine.db")) as engine:
+        assert [engine.decide(x[0]).embedding for x in X[100:]] == before
+        assert engine.retrain().accepted
+
+
+def test_the_shipped_weights_start_an_encoder_of_the_defaults() -> None:
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(40, 1000)).cumsum(1).astype(np.float32)
+    found = learned(ConvReducer(start=str(SHIPPED)).fit(X, np.arange(40) % 2))
+    with np.load(SHIPPED) as stored:
+        assert all(np.array_equal(found[name], stored[name]) for name in stored.files)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dengine.decision.references import RadiusIndex, ReferenceRing
+from dengine.decision.references import FEWEST_PARTS, RadiusIndex, ReferenceRing, label_agreement
 from dengine.decision.rule import script
 
 
@@ -34,15 +34,6 @@ def filled(Z: np.ndarray, y: np.ndarray, spaces: np.ndarray | None = None, capac
     return index
 
 
-@settings(deadline=None)
-@given(n=st.integers(1, 200), d=st.integers(1, 5), radius=st.floats(0.01, 5.0), seed=st.integers(0, 2**16))
-def test_counts_equal_brute_force_in_float32(n: int, d: int, radius: float, seed: int) -> None:
-    Z, y = points(n, d, seed)
-    queries = np.concatenate([points(5, d, seed + 1)[0], Z[:3]])
-    expected = [brute(Z, y, q, radius) for q in queries]
-    assert list(zip(*filled(Z, y).count(queries, radius), strict=True)) == expected
-
-
 def test_the_surface_of_the_ball_counts() -> None:
     index = filled(np.array([[3.0, 4.0], [0.0, 5.0], [0.0, 5.001]]), np.array([1, 0, 1]))
     n_success, n_failure = index.count(np.zeros((1, 2)), radius=5.0)
@@ -63,9 +54,6 @@ def test_counts_do_not_depend_on_the_order_of_the_points(fraction: float) -> Non
     order = np.random.default_rng(1).permutation(100)
     one, other = filled(Z, y), filled(Z[order], y[order])
     np.testing.assert_array_equal(one.count(Z, 0.5, fraction), other.count(Z, 0.5, fraction))
-
-
-# ------------------------------------------------------------------------------------------------------- ring
 
 
 @settings(deadline=None)
@@ -95,38 +83,24 @@ def test_adding_one_by_one_is_adding_at_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("Z", "y", "spaces"),
-    [(np.zeros((2, 3)), [0, 1], None), (np.zeros((2, 2)), [0], None), (np.zeros((2, 2)), [0, 1], [0])],
+    ("Z", "y", "spaces"), [(np.zeros((2, 3)), [0, 1], None), (np.zeros((2, 2)), [0], None), (np.zeros((2, 2)), [0, 1], [0])]
 )
 def test_points_labels_and_spaces_that_do_not_fit_together_are_refused(Z, y, spaces) -> None:
     with pytest.raises(ValueError, match=r"Expected points \(n, 2\)"):
         RadiusIndex(2).add(Z, y, spaces)
 
 
-# ------------------------------------------------------------------------------------------------------ spaces
-
-
 @settings(deadline=None)
-@given(K=st.integers(1, 4), radius=st.floats(0.1, 3.0), seed=st.integers(0, 2**16))
-def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, radius: float, seed: int) -> None:
-    Z, y = points(80, seed=seed)
+@given(K=st.integers(1, 4), d=st.integers(1, 5), radius=st.floats(0.1, 3.0), seed=st.integers(0, 2**16))
+def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, d: int, radius: float, seed: int) -> None:
+    Z, y = points(80, d, seed)
     spaces = np.random.default_rng(seed).integers(0, K, 80)
-    queries = np.random.default_rng(seed + 1).normal(0, 1, (6, K, 2)).astype(np.float32)
+    queries = np.random.default_rng(seed + 1).normal(0, 1, (6, K, d)).astype(np.float32)
     index = filled(Z, y, spaces)
     for i, query in enumerate(queries):
         each = [brute(Z[spaces == k], y[spaces == k], query[k], radius) for k in range(K)]
         n_success, n_failure = index.count(queries[i : i + 1], radius)
         assert (n_success[0], n_failure[0]) == tuple(np.sum(each, axis=0))
-
-
-def test_a_reference_is_never_met_in_another_space() -> None:
-    index = filled(np.zeros((10, 2)), np.ones(10), np.zeros(10, dtype=int))
-    far_in_0, far_in_1 = np.array([[[9.0, 9.0], [0.0, 0.0]]]), np.array([[[0.0, 0.0], [9.0, 9.0]]])
-    assert index.count(far_in_0, 1.0)[0][0] == 0
-    assert index.count(far_in_1, 1.0)[0][0] == 10
-
-
-# ---------------------------------------------------------------------------------------------------- fraction
 
 
 @settings(deadline=None)
@@ -148,26 +122,55 @@ def test_a_query_beyond_all_measure_has_no_neighbours_even_by_fraction() -> None
         assert (n_success[0], n_failure[0]) == (0, 0)
 
 
-# ---------------------------------------------------------------------------------------------------- scripted
-
-
 @pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])
 def test_the_scripted_ring_counts_as_the_eager_one(fraction: float) -> None:
     Z, y = points(200)
     eager = filled(Z, y, np.arange(200) % 2, capacity=150).ring
-    scripted = script(eager)
+    scripted = script(filled(Z, y, np.arange(200) % 2, capacity=150).ring)
+    for ring in (eager, scripted):
+        for i, z in enumerate(torch.from_numpy(Z[:8])):
+            ring.put(z, float(i % 2), i % 2, i % 3)
     for query in torch.randn(20, 2, 2, generator=torch.Generator().manual_seed(0)):
         one, other = eager.squared_distances(query), scripted.squared_distances(query)
         assert torch.equal(one, other)
         assert eager.count_near(one, 0.7, fraction) == scripted.count_near(other, 0.7, fraction)
 
 
-def test_the_scripted_ring_learns_as_the_eager_one() -> None:
-    eager, scripted = ReferenceRing(2, 5), script(ReferenceRing(2, 5))
-    for i, z in enumerate(torch.randn(8, 2, generator=torch.Generator().manual_seed(0))):
-        eager.put(z, float(i % 2), i % 3)
-        scripted.put(z, float(i % 2), i % 3)
-    assert scripted.size() == 5
-    learned = dict(scripted.named_buffers())
-    for name, buffer in eager.named_buffers():
-        assert torch.equal(buffer, learned[name]), name
+def repeats(n_parts: int, times: int, agree: float, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Points in no order, labels 80 % good; each is its part's common draw with probability `agree`, else its own."""
+    rng = np.random.default_rng(seed)
+    part = np.repeat(np.arange(1, n_parts + 1), times)
+    common, own = rng.random(n_parts) < 0.8, rng.random(n_parts * times) < 0.8
+    labels = np.where(rng.random(n_parts * times) < agree, common[part - 1], own).astype(np.int8)
+    return rng.normal(size=(len(part), 2)).astype(np.float32), labels, part % 3, part
+
+
+def test_labels_of_a_part_that_always_agree_leave_it_one_vote() -> None:
+    assert label_agreement(*repeats(80, 5, agree=1.0)) > 0.9
+
+
+def test_labels_that_go_their_own_ways_are_nearly_independent() -> None:
+    assert label_agreement(*repeats(300, 5, agree=0.0)) < 0.1
+
+
+def test_the_bound_lies_above_the_truth_in_nearly_all_draws() -> None:
+    # Both labels of a pair are the common draw with probability agree squared: that is their correlation.
+    bounds = [label_agreement(*repeats(60, 4, agree=0.6, seed=seed)) for seed in range(40)]
+    assert np.mean(np.array(bounds) >= 0.6**2) >= 0.85
+
+
+def test_few_repeated_parts_and_points_of_no_known_part_say_nothing() -> None:
+    points, labels, spaces, part = repeats(80, 5, agree=0.0)
+    assert label_agreement(points, labels, spaces, np.zeros_like(part)) == 1.0
+    assert label_agreement(*repeats(FEWEST_PARTS - 1, 5, agree=0.0)) == 1.0
+
+
+@pytest.mark.parametrize(("agreement", "votes"), [(1.0, (1, 0)), (0.0, (6, 0)), (0.2, (3, 0))])
+def test_m_points_of_a_part_are_worth_m_over_one_plus_m_minus_one_times_its_agreement(
+    agreement: float, votes: tuple[int, int]
+) -> None:
+    index = RadiusIndex(dim=1)
+    index.add(np.zeros((6, 1)), np.ones(6), parts=np.full(6, 7))
+    index.ring.agreement.fill_(agreement)
+    n_success, n_failure = index.count(np.zeros((1, 1)), radius=1.0)
+    assert (int(n_success[0]), int(n_failure[0])) == votes

@@ -1,6 +1,5 @@
 """The novelty gate: what is like no reference is called novel, what is like one is not, and no label is asked."""
 
-import inspect
 from collections.abc import Callable
 
 import numpy as np
@@ -93,12 +92,6 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
         assert np.mean(list(others.values())) >= 0.75, (kind, others)
 
 
-def test_no_label_is_asked_and_nothing_is_random() -> None:
-    assert list(inspect.signature(fit_novelty).parameters) == ["traces", "margin"]
-    one, two = (fit_novelty(KNOWN[:60], 1.5).state_dict() for _ in range(2))
-    assert all(torch.equal(one[name], two[name]) for name in one)
-
-
 @pytest.mark.parametrize("size", [1e6, 1e30, 3e38, -3e38])
 def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate: NoveltyGate, size: float) -> None:
     x = torch.from_numpy(HELD_OUT[0].copy())
@@ -148,12 +141,6 @@ def test_a_dead_channel_that_comes_alive_is_novel(value: float) -> None:
     assert share(gate, moved) == 1.0
 
 
-def test_references_all_alike_know_only_themselves() -> None:
-    gate = fit_novelty(np.repeat(KNOWN[:1], 40, 0), 1.5)
-    assert share(gate, KNOWN[:1]) == 0.0
-    assert share(gate, KNOWN[1:20]) == 1.0
-
-
 @pytest.mark.parametrize("n", [0, 1, FEWEST - 1])
 def test_few_traces_call_nothing_novel(n: int) -> None:
     assert share(fit_novelty(KNOWN[:n], 1.5), noise(KNOWN[:5], np.random.default_rng(0))) == 0.0
@@ -174,12 +161,6 @@ def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int
         gate = fit_novelty(traces, 1.5)
         assert {name: t.shape for name, t in gate.state_dict().items()} == fresh
         assert gate.scores(torch.from_numpy(traces[0])).shape == (2,)
-
-
-def test_a_margin_lets_more_traces_pass() -> None:
-    narrow, wide = (fit_novelty(KNOWN, margin) for margin in (1.0, 2.0))
-    x = torch.from_numpy(HELD_OUT[0].copy())
-    assert wide.scores(x) == pytest.approx(narrow.scores(x) / 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("n", [4, 8, 40])

@@ -15,24 +15,11 @@ unit = st.floats(0.0, 1.0)
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "action"),
-    [
-        (0.90, 1.00, Action.ACCEPT),
-        (0.899, 1.00, Action.VERIFY),
-        (0.00, 1.00, Action.VERIFY),
-        (0.00, 0.125, Action.VERIFY),
-        (0.00, 0.05, Action.REJECT),
-    ],
-)
-def test_accept_from_the_lower_bound_on_and_reject_from_its_complement_down(lower, upper, action) -> None:
-    assert Policy(lower_bound=0.9).action(lower, upper) is action
-
-
 def test_both_thresholds_are_met_with_equality() -> None:
     policy = Policy(lower_bound=0.75)  # exact in binary, so is its complement
     assert policy.action(0.75, 1.0) is Action.ACCEPT
     assert policy.action(0.0, 0.25) is Action.REJECT
+    assert {policy.action(math.nextafter(0.75, 0), 1.0), policy.action(0.0, 0.2500001)} == {Action.VERIFY}
 
 
 @given(policies, st.lists(st.tuples(unit, unit), max_size=8))
@@ -41,15 +28,6 @@ def test_actions_of_arrays_are_the_actions_one_by_one(policy: Policy, bounds: li
     actions = policy.actions(pairs[:, 0], pairs[:, 1])
     assert actions.dtype == object
     assert list(actions) == [policy.action(lower, upper) for lower, upper in pairs]
-
-
-@given(policies, unit, unit)
-def test_swapping_success_and_failure_swaps_accept_and_reject(policy: Policy, a: float, b: float) -> None:
-    lower, upper = min(a, b), max(a, b)
-    if min(abs(lower - policy.lower_bound), abs(upper - (1 - policy.lower_bound))) < 1e-9:
-        return  # rounding may decide the very edge
-    swapped = {Action.ACCEPT: Action.REJECT, Action.REJECT: Action.ACCEPT, Action.VERIFY: Action.VERIFY}
-    assert policy.action(1.0 - upper, 1.0 - lower) is swapped[policy.action(lower, upper)]
 
 
 @given(policies)

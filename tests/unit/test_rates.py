@@ -67,12 +67,6 @@ def test_no_error_leaves_what_as_many_different_traces_leave() -> None:
     assert error.upper == pytest.approx(wilson_interval(0, 50)[1])
 
 
-def test_nothing_accepted_says_nothing() -> None:
-    error = pooled_error([played(np.full(5, "verify"), np.ones(5, bool), np.arange(5))])
-    assert (error.decided, error.lower, error.upper) == (0, 0.0, 1.0)
-    assert math.isnan(error.rate)
-
-
 def test_rejects_are_a_side_of_their_own() -> None:
     truth = np.array([True, False, False, False])
     one = played(np.array(["reject", "reject", "reject", "accept"]), truth, np.arange(4))

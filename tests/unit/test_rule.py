@@ -1,6 +1,5 @@
 """The decision rule: one formula in every form it takes, and an object that is asked, told and restored."""
 
-import math
 import sys
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript, load_exported
-from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of, script
+from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
 
 counts = st.integers(0, 5000)
@@ -37,49 +36,12 @@ def test_every_interval_gives_a_rule(interval: str) -> None:
     assert ACTIONS[action] is Action.ACCEPT
 
 
-def test_the_compiled_rule_answers_to_the_bit_as_the_one_in_python() -> None:
-    for interval in SCALAR_BOUNDS:
-        rule = Policy(0.1, 0.9, interval).rule()
-        compiled = script(rule)
-        for n_success in (0, 1, 7, 24, 25, 26, 72, 73, 400):
-            for n_failure in (0, 1, 3, 30, 73):
-                assert compiled(n_success, n_failure) == rule(n_success, n_failure)
-
-
-def test_the_onnx_twin_bounds_as_the_rule_does() -> None:
-    from dengine.export.onnx import Twin
-
-    for interval in SCALAR_BOUNDS:
-        rule = Policy(0.05, 0.95, interval).rule()
-        twin = Twin.__new__(Twin)
-        torch.nn.Module.__init__(twin)
-        twin.rule = rule
-        for n_success in (0, 1, 24, 73, 1000):
-            for n_failure in (0, 1, 30):
-                found = [
-                    float(v)
-                    for v in twin.bound(torch.tensor(float(n_success)).double(), torch.tensor(float(n_failure)).double())
-                ]
-                assert found == pytest.approx(rule.bound(n_success, n_failure, rule.z), abs=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("lower", "upper", "expected"),
-    [(0.9, 1.0, 1), (math.nextafter(0.9, 0), 1.0, 0), (0.0, 0.1, 2), (0.0, 0.11, 0), (0, 1, 0)],
-)
-def test_a_bound_that_just_meets_the_tolerance_decides(lower: float, upper: float, expected: int) -> None:
-    assert action_of(lower, upper, 0.9, 0.1) == expected
-
-
 def test_the_fewest_all_good_neighbours_that_accept_are_those_of_the_field() -> None:
     # 25 at (0.1, 90 %), 73 at (0.05, 95 %), 7 at (0.2, 80 %): lower = n / (n + z^2) >= LB.
     for alpha, lower_bound, fewest in ((0.1, 0.9, 25), (0.05, 0.95, 73), (0.2, 0.8, 7)):
         rule = Policy(alpha, lower_bound).rule()
         assert [rule(n, 0)[0] for n in (fewest - 1, fewest)] == [0, 1]
         assert [rule(0, n)[0] for n in (fewest - 1, fewest)] == [0, 2]
-
-
-# ------------------------------------------------------------------------------------- a rule from outside the package
 
 
 class FuseRule(DecisionRule):

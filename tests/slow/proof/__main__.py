@@ -3,7 +3,7 @@
     python -m tests.slow.proof --out out/proof --repeats 200
     python -m tests.slow.proof --out out/proof --repeats 4 --only planted,noise --jobs 2 --docs out/proof
 
-Writes proof.csv (a row a configuration), proof.md (the tables) and proof.png into the folder that `--docs` names.
+Writes proof.csv (a row a configuration) and proof.md (the tables) into the folder that `--docs` names.
 """
 
 from __future__ import annotations
@@ -63,9 +63,7 @@ def main() -> None:
     """Parse, finish every piece, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/proof"), help="folder for the finished pieces")
-    parser.add_argument(
-        "--docs", type=Path, help="folder for proof.csv, proof.md, proof.png; by default that of the pieces"
-    )
+    parser.add_argument("--docs", type=Path, help="folder for proof.csv and proof.md; by default that of the pieces")
     parser.add_argument("--repeats", type=int, default=200, help="replays of a main configuration; others have a share")
     parser.add_argument("--only", default=",".join(PARTS), help=f"parts to do, of {', '.join(PARTS)}")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

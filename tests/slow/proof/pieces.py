@@ -43,13 +43,8 @@ def _counted(seed: int, reducer: str, data: str, p: float) -> list[Row]:
 
 def _certified(seed: int, stream: str, propensity: float, alpha: float) -> list[Row]:
     streams = 100  # a seed
-    return [
-        {
-            "seed": seed,
-            "streams": streams,
-            "wrong": round(streams * ever_wrong(stream, propensity, alpha, streams, 2000, seed)),
-        }
-    ]
+    share = ever_wrong(stream, propensity, alpha, streams, 2000, seed)
+    return [{"seed": seed, "streams": streams, "wrong": round(streams * share)}]
 
 
 FUNCTIONS: dict[str, Callable[..., list[Row]]] = {
@@ -72,7 +67,7 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """Its configuration's, for the progress line and the estimate."""
+        """Its configuration's, for the progress line."""
         return f"{self.kind}: {self.settings.get('name') or ', '.join(map(str, self.settings.values()))}"
 
     def key(self, sources: str) -> str:
@@ -88,16 +83,13 @@ def sources_digest() -> str:
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
-def run_piece(piece: Piece, path: Path) -> float:
-    """Do a piece and write its file; returns seconds of one seed."""
-    begin = time.perf_counter()
+def run_piece(piece: Piece, path: Path) -> Piece:
+    """Do a piece and write its file."""
     rows = [row for seed in piece.seeds for row in FUNCTIONS[piece.kind](seed=seed, **piece.settings)]
-    seconds = (time.perf_counter() - begin) / len(piece.seeds)
-    whole = {"piece": asdict(piece), "rows": rows, "seconds": seconds}
     half = path.with_suffix(".tmp")
-    half.write_text(json.dumps(whole))
+    half.write_text(json.dumps({"piece": asdict(piece), "rows": rows}))
     half.replace(path)  # a file is there as a whole or not at all
-    return seconds
+    return piece
 
 
 def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print) -> list[tuple[Piece, list[Row]]]:
@@ -106,40 +98,11 @@ def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None
     sources = sources_digest()
     paths = {piece: out / f"{piece.key(sources)}.json" for piece in pieces}
     todo = [piece for piece in pieces if not paths[piece].is_file()]
-    spent = {piece.name: _read(path)["seconds"] for piece, path in paths.items() if path.is_file()}
     tell(f"{len(pieces) - len(todo)} of {len(pieces)} pieces are there already.")
-    begin, left = time.perf_counter(), list(todo)
-    results: Iterable[tuple[Piece, float]] = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(
-        delayed(_do)(piece, paths[piece]) for piece in todo
+    begin = time.perf_counter()
+    results: Iterable[Piece] = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(
+        delayed(run_piece)(piece, paths[piece]) for piece in todo
     )
-    for piece, seconds in results:
-        left.remove(piece)
-        spent[piece.name] = seconds
-        done = len(pieces) - len(left)
-        took, more = time.perf_counter() - begin, _seconds_left(left, spent) / jobs
-        tell(
-            f"[{done}/{len(pieces)}] {piece.name}: {seconds:.2f} s a seed; "
-            f"{took / 60:.1f} min done, about {more / 60:.1f} to go"
-        )
-    return [(piece, _read(paths[piece])["rows"]) for piece in pieces]
-
-
-def _do(piece: Piece, path: Path) -> tuple[Piece, float]:
-    return piece, run_piece(piece, path)
-
-
-def _seconds_left(left: list[Piece], spent: dict[str, float]) -> float:
-    kinds: dict[str, list[float]] = {}
-    for name, seconds in spent.items():
-        kinds.setdefault(name.split(":")[0], []).append(seconds)
-    usual = sum(spent.values()) / len(spent)
-    total = 0.0
-    for piece in left:
-        own = kinds.get(piece.kind, [usual])
-        total += len(piece.seeds) * spent.get(piece.name, sum(own) / len(own))
-    return total
-
-
-def _read(path: Path) -> Row:
-    whole: Row = json.loads(path.read_text())
-    return whole
+    for done, piece in enumerate(results, len(pieces) - len(todo) + 1):
+        tell(f"[{done}/{len(pieces)}] {piece.name}; {(time.perf_counter() - begin) / 60:.1f} min")
+    return [(piece, json.loads(paths[piece].read_text())["rows"]) for piece in pieces]

@@ -59,8 +59,9 @@ class Side:
         return word if self.claimed else f"({word.lower()})"
 
 
-def replay_row(case: Case, rows: list[Row]) -> Row:
+def replay_row(settings: Row, rows: list[Row]) -> Row:
     """One configuration of replays."""
+    case = Case(**settings)
     out: Row = {"configuration": case.name, "alpha": case.alpha, "LB": case.lower_bound, "replays": len(rows)}
     out |= {
         "cycles": case.cycles,
@@ -120,6 +121,16 @@ def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
     ]
 
 
+ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
+    "planted": replay_row,
+    "noise": replay_row,
+    "counts": counts_row,
+    "certificate": certificate_row,
+    "collapse": collapse_row,
+    "garbage": garbage_rows,
+}
+
+
 def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
     """Part -> a row a configuration."""
     gathered: dict[tuple[str, str], tuple[Row, list[Row]]] = {}
@@ -127,22 +138,13 @@ def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
         gathered.setdefault((piece.kind, piece.name), (piece.settings, []))[1].extend(rows)
     found: dict[str, list[Row]] = {}
     for (kind, _), (settings, rows) in gathered.items():
-        made: Any
-        if kind in ("planted", "noise"):
-            made = [replay_row(Case(**settings), rows)]
-        else:
-            made = {
-                "counts": counts_row,
-                "certificate": certificate_row,
-                "collapse": collapse_row,
-                "garbage": garbage_rows,
-            }[kind](settings, rows)
+        made = ROWS[kind](settings, rows)
         found.setdefault(kind, []).extend(made if isinstance(made, list) else [made])
     return {kind: pd.DataFrame(rows) for kind, rows in found.items()}
 
 
 def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
-    """Write the three files; returns what they come to, in a few lines."""
+    """Write both files; returns what they come to, in a few lines."""
     docs.mkdir(parents=True, exist_ok=True)
     found = tables(done)
     whole = pd.concat([frame.assign(part=kind) for kind, frame in found.items()], ignore_index=True)
@@ -151,9 +153,7 @@ def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
     replays = [found[kind] for kind in ("planted", "noise") if kind in found]
     if not replays:
         return f"Written to {docs}."
-    frame = pd.concat(replays, ignore_index=True)
-    picture(frame, docs / "proof.png")
-    return f"{summary(frame)}\nWritten to {docs}."
+    return f"{summary(pd.concat(replays, ignore_index=True))}\nWritten to {docs}."
 
 
 def summary(frame: pd.DataFrame) -> str:
@@ -199,31 +199,6 @@ def _table(frame: pd.DataFrame) -> str:
         *([cell(v) for v in row] for row in frame.to_numpy(dtype=object)),
     ]
     return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
-
-
-def picture(frame: pd.DataFrame, path: Path) -> None:
-    """The share of replays that broke the tolerance, with its interval; alpha is a tick."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(11, 1.2 + 0.2 * len(frame)), sharey=True, layout="constrained")
-    rows = np.arange(len(frame))
-    for axis, verb in zip(axes, ("accepted", "rejected"), strict=True):
-        share, low, high = (frame[f"{verb}, {key}"].to_numpy(float) for key in ("broke", "low", "high"))
-        for claimed, colour, label in ((True, "tab:blue", "called a guarantee"), (False, "0.6", "promises nothing")):
-            own = frame[f"{verb}, guarantee"].to_numpy(bool) == claimed
-            whiskers = np.clip([share - low, high - share], 0.0, None)[:, own]
-            axis.errorbar(share[own], rows[own], xerr=whiskers, fmt="o", ms=4, color=colour, label=label)
-        axis.plot(frame["alpha"], rows, "|", color="tab:red", ms=9, mew=1.5, label="alpha")
-        axis.set(xlabel=f"share of replays in which the {verb} broke the tolerance", xlim=(-0.02, 1.02))
-        axis.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(rows, frame["configuration"], fontsize=7)
-    axes[0].invert_yaxis()
-    axes[1].legend(loc="lower right")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -66,7 +66,7 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     assert all(file.stat().st_mtime_ns == time for file, time in times.items())
     text = write_report(both, tmp_path / "docs")
     assert "Guarantees on accepted parts: 1" in text
-    assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md", "proof.png"}
+    assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md"}
 
 
 def _plain(rows: list[dict[str, Any]]) -> str:
