@@ -79,12 +79,10 @@ class ModelPrediction(EngineModel):
 
     @property
     def user_model(self) -> ModelPrediction:  # type: ignore[override]  # itself: an attribute would be a circle
-        """Itself."""
         return self
 
     @property
     def description(self) -> str:  # type: ignore[override]  # asked when the rule may be another
-        """Its reducer, its classifier and its folds, with their settings."""
         own = f"{described(self.reducer)} under {described(self.classifier)}"
         return f"{own}, {self.folds} folds, {type(self.rule).__name__}"
 
@@ -97,12 +95,10 @@ class ModelPrediction(EngineModel):
 
     @property
     def n_spaces(self) -> int:
-        """K, embedding spaces."""
         return self.spaces.n_spaces
 
     @property
     def report(self) -> FitReport:
-        """What the last fit says of itself, and of the traces."""
         own = self.spaces.report
         return replace(own, note="; ".join(filter(None, (own.note, self._note))))
 
@@ -142,7 +138,6 @@ class ModelPrediction(EngineModel):
         return self
 
     def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
-        """Train the reducer's encoder further, apart from what answers."""
         return self.spaces.improve(as_traces(X), hashes, stop)
 
     def look_ahead(self, X: NDArray[np.float32]) -> int:
@@ -177,14 +172,12 @@ class ModelPrediction(EngineModel):
         return self
 
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
-        """(C, T) -> (d,): where the trace lives as a reference, in its own fold's space."""
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
         with torch.inference_mode():
             return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        """Add a labelled point in its own fold's space; the oldest reference leaves where the block is full."""
         self.index.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number)
 
     def renumber_reference(self, was: int, number: int) -> None:
@@ -228,7 +221,6 @@ class ModelPrediction(EngineModel):
 
     @property
     def safe_mode(self) -> str:
-        """Why the rule lets nothing pass at present; "" where it does."""
         return SAFE_MODE[self.rule.safe_mode()]
 
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
@@ -265,7 +257,6 @@ class ModelPrediction(EngineModel):
         return new
 
     def defect(self) -> str:
-        """Whether a reference has no finite place."""
         return "" if np.isfinite(self.index.points).all() else "the embedding of a reference is not finite"
 
     def get_state(self) -> State:
@@ -280,7 +271,6 @@ class ModelPrediction(EngineModel):
         return state | {f"reducer.{name}": value for name, value in (self.spaces.get_state() or {}).items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore references and rule, and the reducer unless it was refitted, so that decisions repeat bit for bit."""
         if not self.needs_refit(state):
             self.spaces.set_state(part(state, "reducer."))
         self.trace_shape = tuple(int(n) for n in state["trace_shape"])
@@ -300,7 +290,6 @@ class ModelPrediction(EngineModel):
         return not part(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
-        """The model as an exporter takes it; without a contract, one of its traces' shape."""
         if "trace_shape" not in vars(self):
             raise ExportError("Nothing was trained yet; report labels until the first retrain, then export.")
         return Exportable(self, trace or TraceSpec(channels=self.trace_shape[0], samples=self.trace_shape[1]))

@@ -33,7 +33,6 @@ class RivalAdapter(EngineModel):
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
     def train(self, X: ArrayLike, y: ArrayLike, **_: object) -> Self:
-        """Train the rival; it sets its own stop."""
         self.model.fit(X, y)
         return self
 
@@ -50,13 +49,10 @@ class RivalAdapter(EngineModel):
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
-        """The trace itself: a rival keeps what it likes of it."""
         return x
 
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        """Hand one labelled trace over."""
         self.model.add(point, y)
 
     def successor(self) -> RivalAdapter:
-        """A deep copy, to train while this one answers."""
         return RivalAdapter(copy.deepcopy(self.model))

@@ -81,9 +81,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         Starts afresh: what an earlier fit learned is forgotten. `train` is the engine's way, which may go on from it.
         """
 
-    @abstractmethod
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d); of several spaces their mean, for pictures, never counted in."""
+        """(n, T) or (n, C, T) -> (n, d); of several spaces their mean, for pictures, never counted in.
+
+        Give this or `embed`. Each trace alone, as a cell decides: in a batch its last bits depend on what is beside it.
+        """
+        traces = self.check_traces(X)
+        return np.concatenate([self.embed(traces[i : i + 1]).mean(axis=1) for i in range(max(1, len(traces)))])
 
     @property
     def n_spaces(self) -> int:

@@ -85,7 +85,6 @@ class ConvReducer(FeatureReducer):
         self.random_state = random_state
 
     def make_features(self, channels: int, samples: int) -> ConvEncoder:
-        """The encoder, untrained."""
         sizes = (self.kernels, self.dilations, self.regions, self.width)
         return ConvEncoder(channels, samples, self.average_, *sizes)
 
@@ -138,13 +137,11 @@ class ConvReducer(FeatureReducer):
         return f"encoder {said}"
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """What every reducer by features gives, and the encoder's training with its optimiser."""
         trained = {} if self.training_ is None else self.training_.get_state()
         own = {f"training.{name}": value for name, value in trained.items()}
         return super().get_state() | own | {"average": np.array(self.average_)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Become what `get_state` was taken from; the parameters must be the same."""
         self.average_ = int(state["average"])
         super().set_state(state)
         trained = part(state, "training.")

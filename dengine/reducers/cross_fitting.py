@@ -65,14 +65,12 @@ class LabelFree(_Wrapping):
         self.reducer = reducer
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit on the traces alone."""
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.handed(traces))
         self.dim_ = as_points(self.reducer_.transform(self.handed(traces[:1]))).shape[1]
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d)."""
         handed = self.handed(self.check_traces(X))
         return as_points(self.reducer_.transform(handed))
 
@@ -92,7 +90,6 @@ class CrossFitted(_Wrapping):
 
     @property
     def n_spaces(self) -> int:
-        """K."""
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
@@ -117,21 +114,8 @@ class CrossFitted(_Wrapping):
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
-        """Fit the clones afresh: they are somebody else's, and have no steps to stop."""
         return self.fit(X, y, folds=folds).embed_own(X, folds)
 
     def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, K, d)."""
-        return self._in_every_space(self.handed(self.check_traces(X)))
-
-    def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in.
-
-        Each trace alone, as a cell decides: in a batch its last bits would depend on what is beside it.
-        """
         handed = self.handed(self.check_traces(X))
-        alone = (handed[i : i + 1] for i in range(max(1, len(handed))))
-        return np.concatenate([self._in_every_space(x).mean(axis=1) for x in alone])
-
-    def _in_every_space(self, handed: Any) -> Floats:
         return np.stack([as_points(each.transform(handed)) for each in self.clones_], axis=1)

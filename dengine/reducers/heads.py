@@ -207,7 +207,6 @@ class FeatureReducer(Reducer):
 
     @property
     def n_spaces(self) -> int:
-        """K."""
         return int(self.folds)
 
     def make_features(self, channels: int, samples: int) -> Features:
@@ -296,41 +295,26 @@ class FeatureReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Newton steps, held-out loss, and which heads kept their weights."""
         check_is_fitted(self, "net_")
         return FitReport(self.n_iter_, self.holdout_loss_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, K, d) float32: every trace in every space."""
         traces = self.check_traces(X)
         with torch.inference_mode():
             out: Floats = in_chunks(self.net_, torch.from_numpy(traces)).numpy()
         return out
 
-    def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, d): the mean over the K spaces, for pictures; never counted in.
-
-        Each trace alone, as a cell decides: in a batch its last bits would depend on what is beside it.
-        """
-        traces = torch.from_numpy(self.check_traces(X))
-        alone = (traces[i : i + 1] for i in range(max(1, len(traces))))
-        with torch.inference_mode():
-            return np.asarray(torch.cat([self.net_(x).mean(1) for x in alone]).numpy())
-
     def module(self) -> nn.Module:
-        """The embedding, (B, C, T) -> (B, K, d), ready to be scripted and frozen."""
         check_is_fitted(self, "net_")
         return self.net_
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Plain arrays: all that answers and goes on training, bit for bit."""
         check_is_fitted(self, "net_")
         own = {"shape": np.array(self.trace_shape_), "n_fits": np.array(self.n_fits_), "n_steps": np.array(self.n_iter_)}
         own["holdout_losses"] = np.array(self.holdout_losses_)
         return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Become what `get_state` was taken from; the parameters must be the same."""
         self.check()
         channels, samples = (int(v) for v in state["shape"])
         self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples

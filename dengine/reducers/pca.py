@@ -36,30 +36,18 @@ class PcaReducer(Reducer):
         self.components_ = pca.components_.astype(np.float32)
         return self
 
-    def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, n_components) float32; each trace alone, so that none moves by what is beside it."""
-        rows = as_rows(self.check_traces(X))
-        return np.array([self._project(row) for row in rows], dtype=np.float32).reshape(len(rows), len(self.components_))
-
     def embed(self, X: Floats) -> Floats:
-        """(n, C, T) -> (n, 1, n_components) float32, in one product."""
-        return self._project(as_rows(self.check_traces(X)))[:, None, :]
-
-    def _project(self, rows: Floats) -> Floats:
-        return np.asarray((rows - self.mean_) @ self.components_.T)
+        return np.asarray((as_rows(self.check_traces(X)) - self.mean_) @ self.components_.T)[:, None, :]
 
     def module(self) -> nn.Module:
-        """(B, C, T) -> (B, 1, n_components)."""
         check_is_fitted(self, "components_")
         return _Projection(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Mean and components, and the shape of a trace."""
         check_is_fitted(self, "components_")
         return {"mean": self.mean_, "components": self.components_, "shape": np.array(self.trace_shape_)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
-        """Restore mean and components."""
         self.mean_, self.components_ = np.array(state["mean"]), np.array(state["components"])
         self.n_features_in_ = len(self.mean_)
         self.trace_shape_ = tuple(int(n) for n in state["shape"])

@@ -81,5 +81,4 @@ class RocketReducer(FeatureReducer):
         self.random_state = random_state
 
     def make_features(self, channels: int, samples: int) -> Features:
-        """Shares of positive values."""
         return RocketFeatures(channels, samples, self.dilations)

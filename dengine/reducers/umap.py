@@ -57,7 +57,6 @@ class UmapReducer(Reducer):
         return as_points(self.fit(X).umap_.embedding_)
 
     def transform(self, X: ArrayLike) -> Floats:
-        """(n, T) or (n, C, T) -> (n, n_components) float32."""
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
         with _Contained():

@@ -128,20 +128,6 @@ def test_it_is_the_log_of_the_capital_as_the_docstring_has_it(c: tuple[int, int]
     assert log_evidence(n, n_bad, theta, q) == pytest.approx(math.log(sum(capitals) / sum(BETS)), abs=1e-9)
 
 
-@given(counts, tolerances, propensities)
-def test_a_bad_part_lowers_the_evidence_and_a_good_one_raises_it(c: tuple[int, int], theta: float, q: float) -> None:
-    n, n_bad = c
-    assert (
-        log_evidence(n + 1, n_bad + 1, theta, q) < log_evidence(n, n_bad, theta, q) < log_evidence(n + 1, n_bad, theta, q)
-    )
-
-
-@given(counts.filter(lambda c: c[0] > 0), tolerances, tolerances, propensities)
-def test_evidence_grows_with_the_tolerance(c: tuple[int, int], one: float, other: float, q: float) -> None:
-    low, high = sorted((one, other))
-    assert log_evidence(*c, low, q) <= log_evidence(*c, high, q)
-
-
 @pytest.mark.parametrize("p", [0.01, 0.1, 0.5, 0.9])
 @pytest.mark.parametrize("q", [1.0, 0.3, 0.02])
 @pytest.mark.parametrize("n", [1, 2, 7, 30, 200])

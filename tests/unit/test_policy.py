@@ -1,7 +1,6 @@
 """The user's two numbers: a bound becomes an action."""
 
 import math
-from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -58,8 +57,3 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         Policy(**settings)  # type: ignore[arg-type]
-
-
-def test_a_policy_cannot_be_changed_under_an_engine() -> None:
-    with pytest.raises(FrozenInstanceError):
-        Policy().alpha = 0.5  # type: ignore[misc]

@@ -6,14 +6,12 @@ from multiprocessing import get_context
 import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
-from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 
-from dengine import CrossFitted, DataEngine, Dataset, ModelPrediction, Policy, Recipe, ReplayCell, WilsonRadiusClassifier
+from dengine import Dataset, ModelPrediction, WilsonRadiusClassifier
 from dengine.errors import SettingError
 from dengine.folds import content_fold, content_hash
-from dengine.reducers.cross_fitting import LabelFree, as_reducer, uses_labels
 
 
 def classifier(**changes) -> WilsonRadiusClassifier:
@@ -90,13 +88,6 @@ def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Da
     assert model.spaces.reducer_.n_ == 200
 
 
-def test_the_tag_decides_between_one_space_and_cross_fitting() -> None:
-    assert uses_labels(LinearDiscriminantAnalysis())
-    assert not uses_labels(PCA())
-    assert isinstance(as_reducer(LinearDiscriminantAnalysis(), 3), CrossFitted)
-    assert isinstance(as_reducer(PCA(), 3), LabelFree)
-
-
 def test_one_class_outside_a_fold_is_a_setting_error_that_says_so(data: Dataset) -> None:
     with pytest.raises(SettingError, match="Expected both classes outside fold 0"):
         lda().fit(data.X[:20], np.ones(20))
@@ -111,14 +102,6 @@ def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
     smaller = ModelPrediction(reducer, classifier()).fit(1024 * X, y, hashes=hashes)  # a power of two: exact in floats
     assert newtons.predict_interval(queries)[0].max() > 0.8
     np.testing.assert_array_equal(smaller.count(1024 * queries), newtons.count(queries))
-
-
-@pytest.mark.parametrize("reducer", ["pca", LinearDiscriminantAnalysis()], ids=["pca", "lda"])
-def test_references_are_scaled_to_a_radius_of_one_in_each_space(reducer, data: Dataset) -> None:
-    index = (model := ModelPrediction(reducer, classifier()).fit(data.X, data.y)).index
-    for k in range(model.n_spaces):
-        own = index.points[index.spaces == k]
-        assert np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean()) == pytest.approx(1.0, rel=1e-4)
 
 
 def test_an_unfitted_model_says_what_to_do(data: Dataset) -> None:
@@ -167,12 +150,3 @@ def test_a_model_trained_in_a_spawned_process_judges_as_one_trained_here(data: D
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         there = pool.submit(lda().fit, data.X, data.y).result()
     assert there.predict_many(data.X) == here.predict_many(data.X)
-
-
-def test_a_rival_that_predicts_by_neighbours_decides_as_the_engines_own(data: Dataset) -> None:
-    recipe = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9))
-    own = list(DataEngine(recipe=recipe, replaying=True).run(ReplayCell(data), len(data)))
-    rival = ModelPrediction("pca", WilsonRadiusClassifier(0.5, 0.1, 0.9))
-    same = list(DataEngine(recipe=recipe, model=rival, replaying=True).run(ReplayCell(data), len(data)))
-    assert [c.decision.action for c in same] == [c.decision.action for c in own]
-    assert [(c.decision.lower, c.decision.upper) for c in same] == [(c.decision.lower, c.decision.upper) for c in own]

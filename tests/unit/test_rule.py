@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript, load_exported
+from dengine import INTERVALS, Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, export_torchscript
 from dengine.decision.rule import SCALAR_BOUNDS, DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
 
@@ -133,17 +133,6 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(ou
             if decision.action is Action.VERIFY:
                 engine.report(decision.id, bool(y))
         assert engine.decide(good(data)).action is Action.ACCEPT
-
-
-def test_a_rule_from_outside_is_exported_with_what_it_was_told(outside, data, tmp_path: Path) -> None:
-    with DataEngine(recipe=recipe_with(outside), replaying=True) as engine:
-        list(engine.run(ReplayCell(data, confirm=True), 150))
-        accepted = engine.decide(good(data))
-        before = load_exported(export_torchscript(engine, tmp_path / "before.ts"))
-        engine.report(accepted.id, success=False)
-        after = load_exported(export_torchscript(engine, tmp_path / "after.ts"))
-        assert before.decide(good(data)).action is Action.ACCEPT
-        assert after.decide(good(data)).action is engine.decide(good(data)).action is Action.VERIFY
 
 
 def test_a_rule_that_does_not_compile_decides_and_is_not_exported(outside, data, tmp_path: Path) -> None:

