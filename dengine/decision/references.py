@@ -4,12 +4,10 @@
     >>> index.add(points, labels, spaces)
     >>> n_success, n_failure = index.count(queries, radius=0.3)
 
-Brute force over at most `capacity` points takes tens of microseconds, needs no rebuilding, and scripts to TorchScript: one
-implementation counts in the engine, in the scikit-learn classifier and in the exported file. All is float32.
-
-Trials must be independent to be counted. A part, known by a hash of its number or of its trace, has one vote in a ball
-however often it came, and none where it is asked about itself. With an intraclass correlation rho of its labels, m trials
-are worth m / (1 + (m - 1) rho): rho is an upper confidence bound, and 1 while few parts came twice.
+Brute force, in float32, takes tens of microseconds and scripts to TorchScript: one implementation counts in the engine, in
+the scikit-learn classifier and in the exported file. Trials must be independent to be counted. A part, known by a hash of
+its number or of its trace, has no vote on itself, and m trials of it are worth m / (1 + (m - 1) rho): rho, the intraclass
+correlation of its labels, is an upper confidence bound, and 1 while few parts came twice.
 
 Sources: Kish (1965), Survey Sampling, the design effect; Rao and Scott (1992), Biometrics 48, for counts of clusters.
 """

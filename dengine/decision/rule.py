@@ -8,14 +8,12 @@ asked (`forward`), told what became of a decision (`tell`) and restored (its buf
 
 *Local.* The paper's rule, of the ball around one trace; it learns nothing.
 
-*Pooled.* One scale serves every reducer and interval: the local lower bound. Levels go down from LB in steps of half the
-tolerance. The members of a level are all traces whose lower bound reached it when they were decided, before their label was
-known: predict, then learn, which is honest under any model. A level holds while its members' known outcomes say, at level
-alpha however often one looks, that their mean failure probability is at most the tolerance (`certificate.log_evidence`).
-Levels are asked in order, the strictest first, each only while the stricter ones hold: the first untrue claim ends the
-search, and alpha is spent once (fixed-sequence testing: Maurer, Hothorn and Lehmacher, 1995). A part is accepted where its
-lower bound reaches the lowest level that holds. Rejections are the mirror image, on 1 - upper; since a rejected part tells
-nothing of itself, theirs is a guarantee only as far as audits go.
+*Pooled.* Levels of the local lower bound go down from LB in steps of half the tolerance. The members of a level are all
+traces whose lower bound reached it when they were decided, before their label was known. A level holds while its members'
+known outcomes say, at level alpha however often one looks, that their mean failure probability is at most the tolerance
+(`certificate.log_evidence`). Levels are asked in order, the strictest first, each only while the stricter ones hold: alpha
+is spent once (fixed-sequence testing: Maurer, Hothorn and Lehmacher, 1995). A part is accepted where its lower bound
+reaches the lowest level that holds. Rejections are the mirror image, on 1 - upper, and a guarantee as far as audits go.
 
 *Safe mode.* A claim on the mean of all members is slow to notice drift. So what is accepted is watched by a restarting
 test (an e-detector of the CUSUM kind: Shin, Ramdas and Rinaldo, 2023, arXiv:2203.03532), and so is the share of novel
@@ -206,10 +204,9 @@ class DecisionRule(nn.Module):
     alpha, lower_bound, interval : as in `Policy`.  evidence : what opens and closes levels in place of LB; None: nothing.
     compiles : whether TorchScript can compile the class; one that says False answers in Python and is not exported.
 
-    A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers of a fixed shape: the
-    compiled module shares them, a store keeps them with each version, and `DataEngine.open` restores them and tells what
-    came afterwards. A rule whose `tell` raises is not asked any more: every part is verified until the engine is opened
-    again, which tells it everything from the beginning.
+    A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers of a fixed shape, which a
+    store keeps with each version. A rule whose `tell` raises is not asked any more: every part is verified until the engine
+    is opened again, which tells it everything from the beginning.
     """
 
     compiles = True

@@ -63,23 +63,18 @@ class Model(Protocol):
 
     def fit(self, X: Any, y: Any) -> Any:
         """Train anew on labelled traces."""
-        ...
 
     def add(self, x: Any, y: Any) -> Any:
         """Take in one labelled trace (C, T) between two trainings."""
-        ...
 
     def count(self, X: Any) -> tuple[Any, Any]:
         """(n_success, n_failure) behind each prediction."""
-        ...
 
     def predict_interval(self, X: Any) -> tuple[Any, Any]:
         """(lower, upper) of each success probability."""
-        ...
 
     def decide(self, X: Any) -> Any:
         """An `Action` for each trace."""
-        ...
 
 
 class EngineModel(ABC):

@@ -1,9 +1,8 @@
-"""The proof's rows as a table a part: proof.csv, proof.md and proof.png."""
+"""The proof's rows as a table a part: proof.csv and proof.md."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,21 +41,11 @@ def clopper_pearson(k: int, n: int) -> tuple[float, float]:
     return low, float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
 
 
-@dataclass(frozen=True)
-class Side:
-    """One side of a case: what was claimed of it and what came of it."""
-
-    claimed: bool
-    k: int
-    n: int
-    alpha: float
-
-    @property
-    def verdict(self) -> str:
-        """Kept or BROKEN by the whole interval, or within error; in brackets where nothing was promised."""
-        low, high = clopper_pearson(self.k, self.n)
-        word = "BROKEN" if low > self.alpha else "kept" if high <= self.alpha else "within error"
-        return word if self.claimed else f"({word.lower()})"
+def verdict(k: int, n: int, alpha: float, claimed: bool = True) -> str:
+    """Kept or BROKEN by the whole interval, or within error; in brackets where nothing was promised."""
+    low, high = clopper_pearson(k, n)
+    word = "BROKEN" if low > alpha else "kept" if high <= alpha else "within error"
+    return word if claimed else f"({word.lower()})"
 
 
 def replay_row(settings: Row, rows: list[Row]) -> Row:
@@ -71,24 +60,19 @@ def replay_row(settings: Row, rows: list[Row]) -> Row:
         ("accepted", "accepted_failure", case.claims_accepts),
         ("rejected", "rejected_success", case.claims_rejects),
     ):
-        side = Side(claimed, broken(rows, wrong, case.tolerance), len(rows), case.alpha)
-        low, high = clopper_pearson(side.k, side.n)
+        k, n = broken(rows, wrong, case.tolerance), len(rows)
+        low, high = clopper_pearson(k, n)
         out |= {verb: _mean(r[verb] for r in rows), f"{verb}, mean wrong": _mean(r[wrong] for r in rows)}
-        out |= {f"{verb}, broke": side.k / side.n, f"{verb}, low": low, f"{verb}, high": high}
-        out |= {f"{verb}, guarantee": claimed, f"{verb}, verdict": side.verdict}
+        out |= {f"{verb}, broke": k / n, f"{verb}, low": low, f"{verb}, high": high}
+        out |= {f"{verb}, guarantee": claimed, f"{verb}, verdict": verdict(k, n, case.alpha, claimed)}
     return out
 
 
 def counts_row(settings: Row, rows: list[Row]) -> Row:
     """Mean z^2 over all balls."""
-    balls = sum(r["balls"] for r in rows)
+    balls, about = sum(r["balls"] for r in rows), f"{settings['reducer']}, {settings['data']}"
     z2 = sum(r["sum_z2"] for r in rows) / max(1, balls)
-    return {
-        "configuration": f"{settings['reducer']}, {settings['data']}",
-        "runs": len(rows),
-        "balls": balls,
-        "mean z^2": z2,
-    }
+    return {"configuration": about, "runs": len(rows), "balls": balls, "mean z^2": z2}
 
 
 def certificate_row(settings: Row, rows: list[Row]) -> Row:
@@ -96,28 +80,24 @@ def certificate_row(settings: Row, rows: list[Row]) -> Row:
     n, k = sum(r["streams"] for r in rows), sum(r["wrong"] for r in rows)
     low, high = clopper_pearson(k, n)
     name = f"{settings['stream']}, propensity {settings['propensity']:g}"
-    side = Side(True, k, n, settings["alpha"])
-    return {"configuration": name, "streams": n, "ever wrong": k / n, "low": low, "high": high, "verdict": side.verdict}
+    said = verdict(k, n, settings["alpha"])
+    return {"configuration": name, "streams": n, "ever wrong": k / n, "low": low, "high": high, "verdict": said}
 
 
 def collapse_row(settings: Row, rows: list[Row]) -> Row:
     """Means, and in how many runs either never happened."""
-    never = {f"never {key}": sum(np.isnan(r[f"{key}_after"]) for r in rows) for key in ("quiet", "back")}
-    keys = ("usual", "bad_accepts", "quiet_after", "back_after")
-    worst = {"worst bad_accepts": max(r["bad_accepts"] for r in rows)}
-    means = {key: _mean(r[key] for r in rows) for key in keys}
-    return (
-        {"configuration": f"{settings['guarantee']}, stops {settings['stops']}", "runs": len(rows)} | means | worst | never
-    )
+    out: Row = {"configuration": f"{settings['guarantee']}, stops {settings['stops']}", "runs": len(rows)}
+    out |= {key: _mean(r[key] for r in rows) for key in ("usual", "bad_accepts", "quiet_after", "back_after")}
+    out |= {"worst bad_accepts": max(r["bad_accepts"] for r in rows)}
+    return out | {f"never {key}": sum(np.isnan(r[f"{key}_after"]) for r in rows) for key in ("quiet", "back")}
 
 
 def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
     """A row a kind."""
-    kinds = dict.fromkeys(r["kind"] for r in rows)
-    of: Callable[[str, str], float] = lambda kind, key: _mean(r[key] for r in rows if r["kind"] == kind)  # noqa: E731
+    means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "open"]].mean()
     return [
-        {"configuration": f"{settings['reducer']}, {kind}", "with the gate": of(kind, "gated"), "without": of(kind, "open")}
-        for kind in kinds
+        {"configuration": f"{settings['reducer']}, {kind}", "with the gate": gated, "without": open_}
+        for kind, gated, open_ in means.itertuples()
     ]
 
 
@@ -193,11 +173,8 @@ def _table(frame: pd.DataFrame) -> str:
             return "" if np.isnan(value) else f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
         return str(value)
 
-    rows = [
-        list(frame.columns),
-        ["---"] * len(frame.columns),
-        *([cell(v) for v in row] for row in frame.to_numpy(dtype=object)),
-    ]
+    body = [[cell(v) for v in row] for row in frame.to_numpy(dtype=object)]
+    rows = [list(frame.columns), ["---"] * len(frame.columns), *body]
     return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
 
 
