@@ -43,12 +43,6 @@ def test_one_successful_neighbour_satisfies_the_binomial_interval_and_not_wilson
     assert (truncated(low, 1), high) == (0.2, 1.0)
 
 
-@pytest.mark.parametrize(("interval", "enough"), [(wilson_interval, 73), (clopper_pearson_interval, 72)])
-def test_all_successful_neighbours_needed_at_95_percent(interval, enough: int) -> None:
-    assert interval(enough, 0, 0.05)[0] > 0.95
-    assert interval(enough - 1, 0, 0.05)[0] <= 0.95
-
-
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize(
     ("interval", "method"),

@@ -29,13 +29,6 @@ def test_the_scalar_rule_is_the_interval_and_the_policy(interval, n_success, n_f
     assert 0.0 <= lower <= upper <= 1.0
 
 
-@pytest.mark.parametrize("interval", INTERVALS)
-def test_every_interval_gives_a_rule(interval: str) -> None:
-    action, lower, upper = Policy(0.1, 0.9, interval).rule()(300, 0)
-    assert (lower, upper) == pytest.approx(INTERVALS[interval](300, 0, 0.1), abs=1e-12)
-    assert ACTIONS[action] is Action.ACCEPT
-
-
 def test_the_fewest_all_good_neighbours_that_accept_are_those_of_the_field() -> None:
     # 25 at (0.1, 90 %), 73 at (0.05, 95 %), 7 at (0.2, 80 %): lower = n / (n + z^2) >= LB.
     for alpha, lower_bound, fewest in ((0.1, 0.9, 25), (0.05, 0.95, 73), (0.2, 0.8, 7)):

@@ -24,8 +24,7 @@ from dengine.recipe import RECIPES
 from dengine.records import Reason
 from dengine.reducers import heads
 from dengine.reducers.heads import CrossFittedScores
-from tests.slow.proof.blindness import moved, places, weak_signal
-from tests.slow.proof.counts import count_noise, mean_square, relabelled, white_noise
+from tests.slow.proof.counts import count_noise, mean_square, moved, places, relabelled, weak_signal, white_noise
 from tests.slow.proof.replays import Case, broken, judge
 
 HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
