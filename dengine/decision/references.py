@@ -282,8 +282,8 @@ class RadiusIndex:
             return True
         order = (int(ring.total) - n + torch.arange(n)) % ring.capacity  # oldest first
         order = order[order != slot]
-        for held in (ring.points, ring.labels, ring.spaces, ring.parts):
-            held[..., : n - 1] = held[..., order]
+        for block in (ring.points, ring.labels, ring.spaces, ring.parts):
+            block[..., : n - 1] = block[..., order]
         self._numbers[: n - 1] = self._numbers[order.numpy()]
         ring.points[:, n - 1 :], ring.labels[1, n - 1 :] = 0.0, 1.0
         ring.spaces[n - 1 :], ring.parts[n - 1 :], self._numbers[n - 1 :] = 0, 0, 0
