@@ -35,6 +35,7 @@ from .compiled import CompiledPredictor, compile_predictor
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
+SUSPICIOUS = 0.05  # share of such traces
 
 
 class ModelPrediction(EngineModel):
