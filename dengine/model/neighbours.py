@@ -330,4 +330,4 @@ def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
     said = (
         f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
     )
-    return said if n > 0.05 * looked_at else ""
+    return said if n > SUSPICIOUS * looked_at else ""
