@@ -119,6 +119,11 @@ class Bounded:
     upper: float
     shadowed: bool = False
 
+    @property
+    def bad_rate(self) -> float:
+        """Share of those looked at that were decided wrongly; 0 where none was looked at."""
+        return self.n_bad / max(1, self.n_looked_at)
+
     def audits_needed(self, target: float, bad_rate: float = 0.0) -> int | None:
         """About how many more outcomes, of which `bad_rate` are bad, would bring the bound to `target`; None: no number.
 
@@ -171,8 +176,7 @@ class Certificate:
         """How many more audits the tolerance takes, or where it is kept, half of it; the parts being accepted ones."""
         what = "parts" if self.accepted.propensity == 1.0 else "audits"
         target = self.tolerance / 2.0 if self.kept else self.tolerance
-        seen = self.accepted.n_bad / max(1, self.accepted.n_looked_at)
-        good, same = self.accepted.audits_needed(target), self.accepted.audits_needed(target, seen)
+        good, same = (self.accepted.audits_needed(target, rate) for rate in (0.0, self.accepted.bad_rate))
         if self.accepted.upper <= target:
             return f"Even {percent(target, '.6g')} is shown."
         if good is None:

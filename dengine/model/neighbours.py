@@ -327,7 +327,6 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
     """What to say of near repeats; "" where there are few."""
     n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
-    said = (
-        f"{n} of the newest {looked_at} traces nearly repeat another one: if parts come twice, give their numbers (part=)"
-    )
-    return said if n > SUSPICIOUS * looked_at else ""
+    if n <= SUSPICIOUS * looked_at:
+        return ""
+    return f"{n} of the newest {looked_at} traces nearly repeat another: if parts come twice, give their numbers (part=)"
