@@ -31,7 +31,8 @@ WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int) -> list[dict[str, Any]]:
     """Every quantity, a row each."""
     played = [replay(data, recipe, seed) for seed in range(replays)]
-    retrains, slices = np.concatenate([one.retrain_seconds for one in played]), [one.slice_max_s for one in played]
+    retrains = np.array([each.seconds for one in played for each in one.retrains])
+    slices = [one.slice_max_s for one in played]
     engine = filled_engine(data, recipe)
     whole = np.array([engine.retrain().seconds for _ in range(repeats)])  # as the last one of a long run sees it
     rows = [

@@ -37,7 +37,7 @@ def data(source: DataChoice, out: OutFolder | None, as_json: bool) -> None:
     with X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
     is labelled in it; or the bundled set, insertion.
     """
-    from ..experiments.pictures import data_picture
+    from ..experiments.figures import data_picture
     from ..experiments.survey import survey
 
     dataset = source.load(quiet=True)

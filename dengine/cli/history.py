@@ -177,8 +177,7 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, force:
         found = explain_stored(opened, decision, neighbours)
     files = []
     if out is not None:
-        from ..experiments.figures import save
-        from ..experiments.pictures import explained_picture
+        from ..experiments.figures import explained_picture, save
 
         files = [save(explained_picture(found), out, force=force)]
     if as_json:

@@ -97,8 +97,7 @@ def _read(store: str, last: int, out: Path | None) -> Status:
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
         if out is not None:
-            from ..experiments.figures import save
-            from ..experiments.pictures import status_picture
+            from ..experiments.figures import save, status_picture
 
             title = f"{found.cell}: {found.recipe.name}"
             save(status_picture(course(opened, found.recipe, last), title), out, force=True)

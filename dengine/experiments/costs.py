@@ -4,21 +4,20 @@
     print(curve.sentence)
     curve.policy, curve.to_frame()
 
-Costs are in one unit of the user's, and a part's mean cost is check x verified + escape x accepted and bad + false_reject x
-rejected and good, over all parts of a replay, its beginning included, where everything is verified. Verifying everything
-costs `check` a part; it is always among the candidates.
+A part's mean cost, in one unit of the user's, is check x verified + escape x accepted and bad + false_reject x rejected and
+good, over all parts of a replay, its beginning included. Verifying everything costs `check` a part.
 
-The cheapest of many candidates is partly the luckiest. So it is chosen on one half of the shuffles, with half an error
-added to each count of them, and reported on the other. That takes the luck of the order out, and not that of the
-recordings: every shuffle plays the same parts. The interval's unit is a part and not a decision; it is a little too narrow
-for a policy picked among many. Only parts recorded later, which played no role in the choice, are a clean test.
+The cheapest of many candidates is partly the luckiest: it is chosen on one half of the shuffles, with half an error added
+to each count of them, and reported on the other. That takes the luck of the order out, not that of the recordings: every
+shuffle plays the same parts. The interval is a little too narrow for a policy picked among many; only parts recorded later
+are a clean test.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,7 +47,7 @@ class PolicyCost:
     lower, upper : the cost with both shares of wrong decisions at the ends of their intervals, together 95 %.
     late : mean cost a part over the last third of each shuffle, once something was learned.
     verified, accepted, rejected : shares of all parts.  bad : bad parts among the accepted.  good : good ones among the
-    rejected. Both with an interval that is honest of shuffles, see `rates.pooled_error`.
+    rejected.
     """
 
     policy: Policy
@@ -93,16 +92,14 @@ class CostCurve:
 
     @property
     def cheapest(self) -> PolicyCost:
-        """The policy that was cheapest in the shuffles that choose, of those that decided anything; of equal ones the
-        strictest.
-        """
+        """Cheapest in the shuffles that choose, of those that decided anything; of equal ones the strictest."""
         decided = [row for row in self.rows if row.certain] or self.rows
         return min(decided, key=lambda row: (row.chosen_by, -row.policy.lower_bound, row.policy.alpha))
 
     @property
     def verdict(self) -> str:
-        """Of the cheapest policy: "pays", where its whole interval is below verifying everything; "may pay", where its
-        mean is; "does not pay".
+        """Of the cheapest policy: "pays" (its whole interval is below verifying everything), "may pay" (its mean is), or
+        "does not pay".
         """
         row = self.cheapest
         if max(row.chosen_by, row.cost) >= self.baseline:
@@ -125,31 +122,27 @@ class CostCurve:
         if self.policy is None:
             seen = f"is expected to cost {row.chosen_by:.3g} and cost {row.cost:.3g} in other shuffles, {between}"
             return f"Nothing pays: {every}; the cheapest policy, {who}, {seen}. Go on verifying, or record more."
-        may = MAY.format(bad=percent(row.bad.upper, ".3g"), worst=percent(self.costs.worst_accept, ".3g"))
-        return f"{who} {self.verdict}: {row.cost:.3g} a part, {between}; {every}.{may if self.verdict == 'may pay' else ''}"
+        said = f"{who} {self.verdict}: {row.cost:.3g} a part, {between}; {every}."
+        if self.verdict == "pays":
+            return said
+        bad, worst = (percent(share, ".3g") for share in (row.bad.upper, self.costs.worst_accept))
+        return (
+            f"{said} Not certainly: of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}. "
+            "More recordings narrow that; in production audits and stops do."
+        )
 
     def to_frame(self) -> pd.DataFrame:
         """A row a policy; shares from 0 to 1, costs in the user's unit."""
         import pandas as pd
 
-        return pd.DataFrame([_record(row) | {"chosen": row.policy == self.policy} for row in self.rows])
-
-
-MAY = (
-    " Not certainly: of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}. More recordings "
-    "narrow that; in production audits and stops do."
-)
-PLAIN = ("chosen_by", "cost", "sd", "lower", "upper", "late", "verified", "accepted", "rejected")
-
-
-def _record(row: PolicyCost) -> dict[str, Any]:
-    told = {"alpha": row.policy.alpha, "lower_bound": row.policy.lower_bound}
-    wrong = {
-        f"{side}_{each.name}": getattr(rate, each.name)
-        for side, rate in (("bad", row.bad), ("good", row.good))
-        for each in fields(rate)
-    }
-    return told | {name: getattr(row, name) for name in PLAIN} | wrong
+        rows = []
+        for row in self.rows:
+            told = asdict(row)
+            wrong = {f"{side}_{name}": value for side in ("bad", "good") for name, value in told.pop(side).items()}
+            policy = told.pop("policy")
+            about = {"alpha": policy["alpha"], "lower_bound": policy["lower_bound"]}
+            rows.append(about | told | wrong | {"chosen": row.policy == self.policy})
+        return pd.DataFrame(rows)
 
 
 def cost_curve(
@@ -229,22 +222,23 @@ def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay]
     }
     # Each at half the level: together they hold at LEVEL.
     bad, good = (pooled_error(reporting, side, LEVEL / 2) for side in ("accepted", "rejected"))
-    ends = {
-        end: costs.check * shares["verified"]
+    lower, upper = (
+        costs.check * shares["verified"]
         + costs.escape * shares["accepted"] * getattr(bad, end)
         + costs.false_reject * shares["rejected"] * getattr(good, end)
         for end in ("lower", "upper")
-    }
+    )
     return PolicyCost(
         policy=policy,
         chosen_by=_expected(choosing, costs),
         cost=float(np.mean(means)),
         sd=float(np.std(means, ddof=1)) if len(means) > 1 else math.nan,
+        lower=lower,
+        upper=upper,
         late=float(np.mean([cost_a_part(each, costs, slice(2 * len(each) // 3, None)) for each in reporting])),
         bad=bad,
         good=good,
         **shares,
-        **ends,
     )
 
 
@@ -253,8 +247,7 @@ def _expected(replays: Sequence[Replay], costs: Costs) -> float:
 
     No error among 25 accepted parts is not no error ever: by the plain mean the few would look free, whatever one costs.
     """
-    names = ("accepted", "false_positive", "rejected", "false_negative")
-    counts = [each.stretch(slice(None)) for each in replays]
+    counts, names = [each.stretch() for each in replays], ("accepted", "false_positive", "rejected", "false_negative")
     accepted, bad, rejected, good = (float(np.mean([each[name] for each in counts])) for name in names)
     wrong = (accepted * (bad + 0.5) / (accepted + 1.0), rejected * (good + 0.5) / (rejected + 1.0))
     return costs.check - costs.saved(accepted + rejected, *wrong) / len(replays[0])

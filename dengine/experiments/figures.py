@@ -1,29 +1,36 @@
-"""Pictures of replays, grids, runs and costs, as matplotlib figures that are saved and forgotten; and how all of them look.
+"""Pictures as matplotlib figures, without pyplot, whose global state leaks into notebooks: of replays, grids and costs;
+of a run, a data set, one decision among its neighbours, and a store over all of its cycles.
 
     save(curves({"conv": replays}), "out/curves.png")
 
-No pyplot: its global state would leak figures into a user's notebook. Colours: Okabe and Ito (2008), distinct to all eyes.
+Colours: Okabe and Ito (2008), distinct to all eyes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets import Dataset
 from ..errors import OutputError
 from ..files import write_output
+from ..history.explain import Explanation
+from ..history.sentences import Bound
+from ..history.status import Course
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import reducer_class
-from .costs import CostCurve, PolicyCost
+from ..store.records import SAFE_MODE_ENDED
+from ..traces import as_traces
+from .costs import CostCurve
 from .replay import Replay
+from .survey import levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,10 +44,13 @@ GOOD, BAD, VERIFIED = BLUE, RED, GREY  # of parts, and of the decisions that cal
 RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first those that mean nothing else
 LIMIT: dict[str, Any] = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound, or a moment, that is given
 SMALL = 9  # points: legends and notes
+WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
+KINDS = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
+CLEAR = 0.1  # band widths below which leaving the band is not marked
+FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
 
 
-@dataclass(frozen=True)
-class Mark:
+class Mark(NamedTuple):
     """How one kind of part is drawn on a map."""
 
     name: str
@@ -63,6 +73,11 @@ def sliding_sum(values: NDArray[Any], window: int) -> Floats:
     out = total.copy()
     out[..., window:] -= total[..., :-window]
     return out
+
+
+def sliding_mean(values: NDArray[Any], window: int) -> Floats:
+    """(..., n) -> (..., n): mean over the last `window` values, over all so far where there are fewer."""
+    return sliding_sum(values, window) / sliding_sum(np.ones(values.shape[-1]), window)
 
 
 def blank(width: float, height: float) -> Figure:
@@ -94,16 +109,13 @@ def note(axes: Axes, text: str, colour: str = BLACK) -> None:
 
 def whole_numbers(axes: Axes) -> None:
     """Ticks of counts."""
-    from matplotlib.ticker import MaxNLocator
-
-    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+    axes.locator_params(axis="y", nbins=6, integer=True)
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend above the axes: inside, it would lie on one curve or another."""
-    axes.legend(
-        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize=SMALL, borderaxespad=0.2
-    )
+    look: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": SMALL, "borderaxespad": 0.2}
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), **look)
 
 
 def draw_errors(axes: Axes, false_positive: NDArray[np.bool_], false_negative: NDArray[np.bool_]) -> None:
@@ -118,8 +130,7 @@ def draw_verified(
     axes: Axes, verified: NDArray[np.bool_], window: int, colour: str = VERIFIED, label: str = "verified"
 ) -> None:
     """Share of the parts that were checked, (n,), over the last `window` cycles."""
-    x, seen = np.arange(1, len(verified) + 1), sliding_sum(np.ones(len(verified)), window)
-    axes.plot(x, 100 * sliding_sum(verified, window) / seen, color=colour, label=label)
+    axes.plot(np.arange(1, len(verified) + 1), 100 * sliding_mean(verified, window), color=colour, label=label)
     axes.set(ylim=(0, 104))
 
 
@@ -133,62 +144,57 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
-NEWEST = 300  # parts drawn, as many as the paper's window
-
-
-def embedding_map(replay: Replay, last: int = NEWEST, title: str = "") -> Figure:
-    """Where the newest parts of a replay lie: once by what they were, once by what was decided.
-
-    Only the newest, since each retrain moves the map. The first two dimensions are drawn, the mean over the spaces. The
-    circle is the ball around the newest part, where the recipe fixes its radius. Units are equal on both axes, but where
-    the first is a probability: there the second is for the eye, and the ball is cut off above and below.
-    """
-    figure = blank(10.0, 5.4)
-    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    z = _plane(replay.position[-last:])
-    for axes, kinds, marks in ((left, replay.truth, TRUTH_MARKS), (right, replay.action, ACTION_MARKS)):
-        _scatter(axes, z, kinds[-last:], marks)
-        plain(axes)
-        legend_above(axes)
-    left.set_title("what the parts were", pad=24)
-    right.set_title("what was decided", pad=24)
-    _label_axes(left, right, z, replay.recipe)
-    _draw_balls(figure, z, replay.recipe)
-    figure.suptitle(title)
-    return figure
-
-
 def is_probability(recipe: Recipe) -> bool:
     """Whether the recipe's first axis is a predicted probability of success, which is never scaled."""
     kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
     return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
 
 
-def _plane(positions: Floats) -> Floats:
-    """(n, d) -> (n, 2): zeros where a reducer has but one dimension."""
-    return np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]
+def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
+    """Where the newest parts of a replay lie, by what they were and by what was decided; each retrain moves the map.
+
+    The first two dimensions are drawn, the mean over the spaces. The circle is the ball around the newest part, where the
+    recipe fixes its radius. Units are equal on both axes, unless the first is a probability: then the second is for the
+    eye, and the ball is cut off above and below.
+    """
+    figure = blank(10.0, 5.4)
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    positions = replay.position[-last:]
+    z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
+    known = np.isfinite(z).all(axis=1)
+    truth, action = (left, "what the parts were", replay.truth), (right, "what was decided", replay.action)
+    for (axes, name, kinds), marks in ((truth, TRUTH_MARKS), (action, ACTION_MARKS)):
+        for kind, mark in marks.items():
+            points = z[known & (kinds[-last:] == kind)]
+            look: dict[str, Any] = {"color": mark.colour, "marker": mark.marker, "s": mark.size}
+            axes.scatter(*points.T, label=f"{mark.name} ({len(points)})", alpha=0.7, linewidths=0, **look)
+        if not known.any():
+            note(axes, "no trace was embedded yet")
+        plain(axes)
+        legend_above(axes)
+        axes.set_title(name, pad=24)
+    first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
+    if is_probability(replay.recipe):
+        first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
+        left.set(xlim=(-0.06, 1.06), ylim=_around(z[:, 1]))
+    else:
+        span = max(np.ptp(_around(z[:, i])) for i in (0, 1))
+        left.set(xlim=_around(z[:, 0], span), ylim=_around(z[:, 1], span))
+        for axes in (left, right):
+            axes.set_aspect("equal")
+    left.set(xlabel=first, ylabel=second)
+    right.set(xlabel=first)
+    if known.any() and replay.recipe.fraction is None:  # one that grows with the references has no radius of its own
+        _draw_balls(figure, z[known][-1], replay.recipe)
+    figure.suptitle(title)
+    return figure
 
 
-def _known(z: Floats) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(z).all(axis=1))
-
-
-def _scatter(axes: Axes, z: Floats, kinds: NDArray[Any], marks: Mapping[Any, Mark]) -> None:
-    for kind, mark in marks.items():
-        points = z[_known(z) & (kinds == kind)]
-        look: dict[str, Any] = {"color": mark.colour, "marker": mark.marker, "s": mark.size, "alpha": 0.7, "linewidths": 0}
-        axes.scatter(points[:, 0], points[:, 1], label=f"{mark.name} ({len(points)})", **look)
-    if not _known(z).any():
-        note(axes, "no trace was embedded yet")
-
-
-def _draw_balls(figure: Figure, z: Floats, recipe: Recipe) -> None:
+def _draw_balls(figure: Figure, centre: Floats, recipe: Recipe) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    if recipe.fraction is not None or not _known(z).any():
-        return  # a ball that grows until it holds a share of the references has no radius of its own
-    x, y = z[_known(z)][-1]
+    x, y = centre
     for axes in figure.axes:
         axes.add_patch(Circle((x, y), recipe.radius, fill=False, edgecolor=BLACK, linewidth=1.4))
         axes.plot([x], [y], "+", color=BLACK, markersize=9)
@@ -196,20 +202,6 @@ def _draw_balls(figure: Figure, z: Floats, recipe: Recipe) -> None:
     label += ", cut off above and below" if is_probability(recipe) else ""
     ring = Line2D([], [], color=BLACK, marker="o", markersize=11, fillstyle="none", linestyle="none", label=label)
     figure.legend(handles=[ring], loc="outside lower center", frameon=False, fontsize=SMALL)
-
-
-def _label_axes(left: Axes, right: Axes, z: Floats, recipe: Recipe) -> None:
-    if is_probability(recipe):
-        first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
-        left.set(xlim=(-0.06, 1.06), ylim=_around(z[:, 1]))
-    else:
-        first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
-        span = max(np.ptp(_around(z[:, 0])), np.ptp(_around(z[:, 1])))
-        left.set(xlim=_around(z[:, 0], span), ylim=_around(z[:, 1], span))
-        for axes in (left, right):
-            axes.set_aspect("equal")
-    left.set(xlabel=first, ylabel=second)
-    right.set(xlabel=first)
 
 
 def _around(values: Floats, span: float = 0.0) -> tuple[float, float]:
@@ -222,11 +214,6 @@ def _around(values: Floats, span: float = 0.0) -> tuple[float, float]:
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-WINDOW = 300  # cycles, the paper's
-FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
-COUNTS = ("accepted", "false_positive", "rejected", "false_negative")
-
-
 def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> dict[str, Floats]:
     """What the paper plots, in percent, (n,) each, over a sliding window and all replays, which must be equally long.
 
@@ -234,26 +221,22 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     precision, false_positive : of the accepted parts in the windows of all replays together.
     false_negative : of the rejected parts, likewise.  All three NaN where these are fewer than `fewest`.
     """
-    accept, reject = np.stack([r.accepted for r in replays]), np.stack([r.rejected for r in replays])
-    seen = sliding_sum(np.ones(accept.shape[1]), window)
-    certain = sliding_sum(accept | reject, window) / seen
-    false_positive = _pooled_share(np.stack([r.false_positive for r in replays]), accept, window, fewest)
-    false_negative = _pooled_share(np.stack([r.false_negative for r in replays]), reject, window, fewest)
+    certain = sliding_mean(np.stack([~r.verified for r in replays]), window)
+
+    def share(wrong: str, decided: str) -> Floats:
+        bad, of = (sliding_sum(sum(getattr(r, name).astype(int) for r in replays), window) for name in (wrong, decided))
+        return np.where(of >= fewest, bad / np.maximum(of, 1.0), np.nan)
+
+    false_positive = share("false_positive", "accepted")
     curves = {
         "certain": certain.mean(axis=0),
         "certain_low": np.quantile(certain, 0.1, axis=0),
         "certain_high": np.quantile(certain, 0.9, axis=0),
         "precision": 1.0 - false_positive,
         "false_positive": false_positive,
-        "false_negative": false_negative,
+        "false_negative": share("false_negative", "rejected"),
     }
     return {name: 100.0 * values for name, values in curves.items()}
-
-
-def _pooled_share(wrong: Any, decided: Any, window: int, fewest: int) -> Floats:
-    """(replays, n) bool each -> (n,): share of the decided parts that were wrong, in all replays' windows together."""
-    of = sliding_sum(decided.sum(axis=0), window)
-    return np.where(of >= fewest, sliding_sum(wrong.sum(axis=0), window) / np.maximum(of, 1.0), np.nan)
 
 
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: int = WINDOW) -> Figure:
@@ -263,19 +246,31 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
     """
     wide = max(2, min(len(by_recipe), 4))  # recipes side by side in the legends: a column each, and one for the bound
     figure, (top, bottom) = panels(2, (3.6 + 2.7 * wide, 7.4), heights=(4, 3))
-    length = max(len(r) for replays in by_recipe.values() for r in replays)
-    window = min(window, max(1, length // 3))
-    bounds = {r.recipe.policy.lower_bound for replays in by_recipe.values() for r in replays}
+    all_replays = [r for replays in by_recipe.values() for r in replays]
+    window = min(window, max(1, max(map(len, all_replays)) // 3))
+    bounds = sorted({r.recipe.policy.lower_bound for r in all_replays})
     for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
-        _draw_curves(top, bottom, replays, window, colour, f"{name}: " if len(by_recipe) > 1 else "")
-    _draw_tolerance(top, bottom, bounds)
+        lead = f"{name}: " if len(by_recipe) > 1 else ""
+        lines = _draw_certain(top, replays, window, colour, colour, lead)
+        x = np.arange(1, len(lines["certain"]) + 1)
+        # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
+        counts = [each.stretch() for each in replays]
+        for wrong, decided, kind, style in (
+            ("false_positive", "accepted", "bad", "-"),
+            ("false_negative", "rejected", "good", "--"),
+        ):
+            label = f"{lead}{sum(n[wrong] for n in counts)} {kind} of {sum(n[decided] for n in counts)} {decided}"
+            bottom.plot(x, lines[wrong], style, color=colour, label=label)
+    for bound in bounds:
+        top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
+        bottom.axhline(100 * (1 - bound), label=f"tolerance 100 - LB = {100 * (1 - bound):g} %", **LIMIT)
     top.set(ylim=(0, 102), ylabel="share [%]")
     # Above the tolerance at least half as much again: whether the errors keep to it is what the panel is there for.
-    bottom.set(ylim=(0, max(bottom.get_ylim()[1], 150 * (1 - min(bounds)))), ylabel="wrong [% of accepted, rejected]")
+    bottom.set(ylim=(0, max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))), ylabel="wrong [% of accepted, rejected]")
     bottom.set(xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)")
     figure.suptitle(title)
-    legend_above(top, columns=wide + 1)
-    legend_above(bottom, columns=wide + 1)
+    for axes in (top, bottom):
+        legend_above(axes, columns=wide + 1)
     return figure
 
 
@@ -291,24 +286,6 @@ def _draw_certain(
     return lines
 
 
-def _draw_curves(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str) -> None:
-    lines = _draw_certain(top, replays, window, colour, colour, lead)
-    x = np.arange(1, len(lines["certain"]) + 1)
-    # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
-    counted = [each.stretch() for each in replays]
-    n = {name: sum(each[name] for each in counted) for name in COUNTS}
-    bad, good = "{false_positive} bad of {accepted} accepted", "{false_negative} good of {rejected} rejected"
-    bottom.plot(x, lines["false_positive"], color=colour, label=lead + bad.format_map(n))
-    bottom.plot(x, lines["false_negative"], color=colour, linestyle="--", label=lead + good.format_map(n))
-
-
-def _draw_tolerance(top: Axes, bottom: Axes, lower_bounds: set[float]) -> None:
-    for bound in sorted(lower_bounds):
-        top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
-        tolerated = 100 * (1 - bound)
-        bottom.axhline(tolerated, label=f"tolerance 100 - LB = {tolerated:g} %", **LIMIT)
-
-
 def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     """A live run: verified share, errors so far and, with a clock, parts an hour."""
     window = min(window, max(1, len(log) // 3))
@@ -319,26 +296,21 @@ def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     axes[1].set(ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * max(log.false_positive.sum(), log.false_negative.sum())))
     legend_above(axes[1])
     if log.clock_s is not None:
-        _draw_rate(axes[2], log, log.clock_s, window)
+        x, took = np.arange(1, len(log) + 1), np.diff(log.clock_s, prepend=0.0)
+        rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
+        settled = x >= window  # a rate over few cycles is mostly luck
+        axes[2].plot(x[settled], rate[settled], color=GREEN, label="this run")
+        if log.verified.any():
+            # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
+            always = 3600 * sliding_mean(log.truth == 1.0, window) / float(np.median(took[log.verified]))
+            axes[2].plot(x[settled], always[settled], color=VERIFIED, linestyle=":", label="had every part been verified")
+        axes[2].set(ylabel=f"good parts/h, last {window}")
+        legend_above(axes[2])
     if not len(log):
         note(axes[0], "no cycle was finished")
     axes[-1].set(xlabel="cycle")
     figure.suptitle(title)
     return figure
-
-
-def _draw_rate(axes: Axes, log: Replay, clock_s: Floats, window: int) -> None:
-    x, took = np.arange(1, len(log) + 1), np.diff(clock_s, prepend=0.0)
-    rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
-    settled = x >= window  # a rate over few cycles is mostly luck
-    axes.plot(x[settled], rate[settled], color=GREEN, label="this run")
-    if log.verified.any():
-        # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
-        seconds = float(np.median(took[log.verified])) * sliding_sum(np.ones(len(x)), window)
-        always = 3600 * sliding_sum(log.truth == 1.0, window) / seconds
-        axes.plot(x[settled], always[settled], color=VERIFIED, linestyle=":", label="had every part been verified")
-    axes.set(ylabel=f"good parts/h, last {window}")
-    legend_above(axes)
 
 
 def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
@@ -348,62 +320,46 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
     that were false positives and false negatives. replays : of one contender and interval, all equally long.
     Source: the paper's figure "Results obtained with varying values of the parameters alpha and LB".
     """
-    alphas = sorted({r.recipe.policy.alpha for r in replays}, reverse=True)
-    bounds = sorted({r.recipe.policy.lower_bound for r in replays})
+    cells: dict[tuple[float, float], list[Replay]] = {}
+    for r in replays:
+        cells.setdefault((r.recipe.policy.alpha, r.recipe.policy.lower_bound), []).append(r)
+    alphas, bounds = sorted({alpha for alpha, _ in cells}, reverse=True), sorted({bound for _, bound in cells})
     figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas))
     heights = [3, 1.6] * len(alphas)
     axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
     window = min(window, max(1, len(replays[0]) // 3))
-    for i, alpha in enumerate(alphas):
-        for j, bound in enumerate(bounds):
-            cell = [r for r in replays if (r.recipe.policy.alpha, r.recipe.policy.lower_bound) == (alpha, bound)]
-            top, bottom = axes[2 * i, j], axes[2 * i + 1, j]
-            top.set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
-            if cell:
-                _draw_cell(top, bottom, cell, bound, window)
-    _label(figure, axes, window)
-    figure.suptitle(title)
-    return figure
-
-
-def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float, window: int) -> None:
-    _draw_certain(top, replays, window, GREEN, GOOD)
-    x = np.arange(1, len(replays[0]) + 1)
-    top.axhline(100 * bound, label="LB", **LIMIT)
-    for name, colour, style, label in (
-        ("false_positive", BAD, "-", "false positives, of all cycles"),
-        ("false_negative", GOOD, "-.", "false negatives, of all cycles"),
-    ):
-        bottom.plot(x, 100 * _share_of_cycles(replays, name, window), style, color=colour, linewidth=1.2, label=label)
-    bottom.axhline(100 * (1 - bound), label="100 - LB", **LIMIT)
-
-
-def _share_of_cycles(replays: Sequence[Replay], name: str, window: int) -> np.ndarray:
-    wrong = np.stack([getattr(r, name) for r in replays]).mean(axis=0)
-    return sliding_sum(wrong, window) / sliding_sum(np.ones(len(wrong)), window)
-
-
-def _label(figure: Figure, axes: np.ndarray, window: int) -> None:
+    for (i, alpha), (j, bound) in product(enumerate(alphas), enumerate(bounds)):
+        axes[2 * i, j].set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
+        if (alpha, bound) in cells:
+            _draw_cell(axes[2 * i, j], axes[2 * i + 1, j], cells[alpha, bound], bound, window)
     for each in axes.flat:
         plain(each)
     for i, row in enumerate(axes):
         row[0].set(ylabel="wrong [%]" if i % 2 else "share [%]", ylim=(0, None) if i % 2 else (0, 102))
     for each in axes[-1]:
         each.set_xlabel(f"cycle (end of a window of {window})")
-    drawn = next((pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines), None)
-    if drawn is not None:
-        handles = [line for each in drawn for line in each.lines]
-        figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+    drawn = next(pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines)
+    handles = [line for each in drawn for line in each.lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+    figure.suptitle(title)
+    return figure
 
 
-MARKERS = "osD^vP"
-APART = 0.08  # of the distance between two LBs: the alphas' whiskers side by side
-ROOM = 1.25  # above the highest mean
+def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float, window: int) -> None:
+    _draw_certain(top, replays, window, GREEN, GOOD)
+    top.axhline(100 * bound, label="LB", **LIMIT)
+    for name, colour, style in (("false_positive", BAD, "-"), ("false_negative", GOOD, "-.")):
+        wrong = np.stack([getattr(r, name) for r in replays]).mean(axis=0)
+        label = f"{name.replace('_', ' ')}s, of all cycles"
+        x, look = np.arange(1, len(wrong) + 1), {"color": colour, "linestyle": style}
+        bottom.plot(x, 100 * sliding_mean(wrong, window), linewidth=1.2, label=label, **look)
+    bottom.axhline(100 * (1 - bound), label="100 - LB", **LIMIT)
 
 
 def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
-    """Above: cost a part with its interval, and what verifying everything costs; the choice has a ring. Below: shares of
-    parts that were decided without a check. unit : of the costs.
+    """Above: cost a part with its interval, and what verifying everything costs; the choice has a ring.
+
+    Below: shares of parts that were decided without a check. unit : of the costs.
     """
     figure, (top, bottom) = panels(2, (9.0, 7.2), heights=(3, 2))
     bounds = sorted({row.policy.lower_bound for row in curve.rows})
@@ -411,37 +367,236 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     top.axhline(curve.baseline, label="verify everything", **LIMIT)
     for i, alpha in enumerate(alphas):
         rows = [row for row in curve.rows if row.policy.alpha == alpha]
-        x = np.array([bounds.index(row.policy.lower_bound) for row in rows]) + APART * (i - (len(alphas) - 1) / 2)
-        _draw(top, bottom, x, rows, RECIPES[i % len(RECIPES)], MARKERS[i % len(MARKERS)])
-        if curve.policy is not None and curve.policy.alpha == alpha:
-            at = next(j for j, row in enumerate(rows) if row.policy == curve.policy)
-            ring: dict[str, Any] = {"s": 260, "facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
-            top.scatter(x[at], rows[at].cost, label=f"the choice: {curve.verdict}", **ring)
+        # The alphas' whiskers side by side.
+        x = np.array([bounds.index(row.policy.lower_bound) for row in rows]) + 0.08 * (i - (len(alphas) - 1) / 2)
+        cost, lower, upper = np.array([(row.cost, row.lower, row.upper) for row in rows]).T
+        look: dict[str, Any] = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
+        look["label"] = f"alpha {alpha:g}"
+        # A replay's mean lies within what its errors' intervals allow, but for rounding.
+        ends = np.maximum([cost - lower, upper - cost], 0.0)
+        top.errorbar(x, cost, yerr=ends, capsize=3, elinewidth=1.0, **look)
+        bottom.plot(x, [100 * row.certain for row in rows], **look)
+        for at, row in zip(x, rows, strict=True):
+            if row.policy == curve.policy:
+                ring: dict[str, Any] = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+                top.scatter(at, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
     means = [row.cost for row in curve.rows]
-    top.set(ylim=(min(0.0, *means), ROOM * max(curve.baseline, *means)), ylabel=f"cost a part [{unit}]")
-    bottom.set(
-        ylim=(0, max(10.0, 110 * max(row.certain for row in curve.rows))), ylabel="decided without a check\n[% of parts]"
-    )
+    top.set(ylim=(min(0.0, *means), 1.25 * max(curve.baseline, *means)), ylabel=f"cost a part [{unit}]")
+    highest = max(10.0, 110 * max(row.certain for row in curve.rows))
+    bottom.set(ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
     bottom.set_xticks(range(len(bounds)), [f"{100 * bound:g}" for bound in bounds])
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
     for axes in (top, bottom):
         legend_above(axes, columns=len(alphas) + 2)
-    figure.suptitle(title or _title(curve, unit))
+    prices = {"check": curve.costs.check, "escape": curve.costs.escape, "false reject": curve.costs.false_reject}
+    what = ", ".join(f"{name} {price:g} {unit}" for name, price in prices.items())
+    how = f"{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the ends of their 95 % intervals"
+    figure.suptitle(title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
     return figure
 
 
-def _title(curve: CostCurve, unit: str) -> str:
-    costs = curve.costs
-    what = f"check {costs.check:g} {unit}, escape {costs.escape:g} {unit}, false reject {costs.false_reject:g} {unit}"
-    how = "bars: errors at the ends of their 95 % intervals"
-    return f"{curve.dataset}, {curve.recipe}: {what}\n{curve.reporting} shuffles of {curve.cycles} parts; {how}"
+def explained_picture(found: Explanation) -> Figure:
+    """Above, a panel a channel: the trace, its nearest references and the band. Below: their distances, and the bound."""
+    past, made, spec = found.decision, found.decision.decision, found.spec
+    widest = np.zeros(len(found.trace))
+    for each in () if found.envelope is None else found.envelope.excesses:
+        widest[each.channel] = max(widest[each.channel], each.widths)
+    channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())  # those that leave the band farthest
+    heights = [1.5 + 2.3 * len(channels), 2.6] if found.neighbours or found.bound else [1.5 + 2.3 * len(channels)]
+    figure = blank(10.0, sum(heights))
+    version = f"version {made.model_version}" if made.model_version else "no model yet"
+    words = f"{made.id}: {made.action.value}, {made.reason.value} ({version}); label: {past.label}"
+    figure.suptitle(words, fontweight="bold")
+    rows = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    above = rows[0].subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, channel in zip(above, channels, strict=True):
+        _draw_trace(axes, found, channel)
+        name = spec.columns[channel] if spec.columns else "trace" if spec.channels == 1 else f"channel {channel + 1}"
+        axes.set(ylabel=f"{name} [{spec.unit}]")
+    legend_above(above[0], columns=3)
+    above[-1].set(xlabel="time [s]")
+    if len(rows) > 1:
+        left, right = rows[1].subplots(1, 2, width_ratios=(1.15, 1.0))
+        _draw_distances(left, found)
+        _draw_bound(right, found.bound)
+    return figure
 
 
-def _draw(top: Axes, bottom: Axes, x: np.ndarray, rows: Sequence[PolicyCost], colour: str, marker: str) -> None:
-    cost = np.array([row.cost for row in rows])
-    ends = np.array([[row.cost - row.lower for row in rows], [row.upper - row.cost for row in rows]])
-    label = f"alpha {rows[0].policy.alpha:g}"
-    look: dict[str, Any] = {"color": colour, "marker": marker, "markersize": 6}
-    # A replay's mean lies within what its errors' intervals allow, but for rounding.
-    top.errorbar(x, cost, yerr=np.maximum(ends, 0.0), capsize=3, elinewidth=1.0, label=label, **look)
-    bottom.plot(x, [100 * row.certain for row in rows], label=label, **look)
+def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
+    plain(axes)
+    x, band = np.arange(found.trace.shape[1]) / found.spec.rate_hz, found.envelope
+    if band is not None:
+        label = f"95 % of {band.n:,} successes"
+        axes.fill_between(x, band.low[channel], band.high[channel], color=GREEN, alpha=0.22, linewidth=0, label=label)
+        axes.plot(x, band.median[channel], color=GREEN, linewidth=1.0, label="their median")
+    for success, name, colour, line, _ in KINDS:
+        near = [each.trace for each in found.neighbours if each.trace is not None and each.success is success]
+        for i, trace in enumerate(near):
+            label = f"neighbours that were {name} ({len(near)})" if i == 0 else "_"
+            axes.plot(x, trace[channel], line, color=colour, linewidth=0.7, alpha=0.55, label=label)
+    axes.plot(x, found.trace[channel], color=BLACK, linewidth=1.6, label="this trace")
+    outside = [each for each in band.excesses if each.channel == channel and each.widths >= CLEAR] if band else []
+    for i, each in enumerate(outside):
+        ends, label = np.array([each.from_s, each.to_s]) + [-0.5, 0.5] / np.float64(found.spec.rate_hz), "outside the band"
+        axes.axvspan(*ends, color=ORANGE, alpha=0.3, linewidth=0, label=label if i == 0 else "_", zorder=0)
+
+
+def _draw_distances(axes: Axes, found: Explanation) -> None:
+    """Nearest references by distance, a row a fold: those of one fold live in one space."""
+    plain(axes)
+    near = found.neighbours
+    if not near or found.radius is None:
+        note(axes, "no neighbours", GREY)
+        axes.set(xticks=[], yticks=[])
+        return
+    spaces = sorted({each.space for each in near})
+    for success, name, colour, _, marker in KINDS:
+        some = [(each.distance, spaces.index(each.space)) for each in near if each.success is success]
+        if some:
+            axes.scatter(*zip(*some, strict=True), s=34, color=colour, marker=marker, alpha=0.8, label=name)
+    end = max(each.distance for each in near)
+    if found.radius <= 3.0 * end:
+        axes.axvline(found.radius, label=f"ball, radius {found.radius:.3g}", **LIMIT)
+        end = max(end, found.radius)
+    else:
+        axes.plot([], [], " ", label=f"all inside the ball, radius {found.radius:.3g}")
+    axes.set(yticks=range(len(spaces)), yticklabels=[f"fold {space}" for space in spaces])
+    axes.set(ylim=(-0.7, len(spaces) - 0.3), xlim=(0.0, 1.08 * max(end, 1e-9)))
+    axes.set(xlabel=f"distance of the nearest references of version {found.neighbours_version} [scaled]")
+    legend_above(axes, columns=3)
+
+
+def _draw_bound(axes: Axes, bound: Bound | None) -> None:
+    """The interval of the success rate, and what it was held against."""
+    plain(axes)
+    axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel="success rate in the ball")
+    if bound is None:
+        note(axes, "no bound was asked for", GREY)
+        return
+    n = bound.n_success + bound.n_failure
+    if n:
+        axes.plot([bound.n_success / n], [0.0], "o", color=BLACK, label=f"{bound.n_success} of {n}")
+    axes.plot([bound.lower, bound.upper], [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label="bound")
+    for at, colour, name in ((bound.accept_at, GOOD, "accept from"), (bound.reject_at, BAD, "reject up to")):
+        if at is not None:
+            axes.axvline(at, color=colour, linestyle=":", linewidth=1.5, label=f"{name} {at:.3g}")
+    text, middle = f"{bound.lower:.3f} to {bound.upper:.3f}", 0.5 * (bound.lower + bound.upper)
+    side, x = ("left", bound.lower) if middle < 0.2 else ("right", bound.upper) if middle > 0.8 else ("center", middle)
+    axes.annotate(text, (x, 0.0), xytext=(0, 9), textcoords="offset points", ha=side, fontsize=SMALL)
+    legend_above(axes, columns=2)
+
+
+def status_picture(course: Course, title: str = "") -> Figure:
+    """Above, the verified and the novel share of each stretch; below, bad accepted parts so far and what is tolerated."""
+    figure, (top, bottom) = panels(2, (10.0, 6.4))
+    n, verified, novel, accepted, bad = (
+        np.array([getattr(each, name) for each in course.stretches], dtype=np.float64)
+        for name in ("n", "verified", "novel", "accepted", "bad")
+    )
+    ends = np.cumsum(n)
+    for share, colour, line, name in ((verified, VERIFIED, "-", "verified"), (novel, PINK, "--", "novel")):
+        if share is verified or share.any():
+            top.plot(ends - n / 2, 100 * share / np.maximum(n, 1), line, color=colour, label=name)
+    x, accepted, bad = (np.concatenate([[0.0], each]) for each in (ends, np.cumsum(accepted), np.cumsum(bad)))
+    total, tolerated = f"{bad[-1]:.0f} bad of {accepted[-1]:,.0f}" if len(n) else "none", course.tolerance * accepted
+    bottom.plot(x, bad, color=BAD, label=f"known bad ({total} accepted)")
+    bottom.plot(x, tolerated, ":", color=BLACK, label=f"tolerated, {100 * course.tolerance:g} % of the accepted")
+    whole_numbers(bottom)
+    bottom.set(ylim=(0, max(1.0, 1.1 * tolerated[-1], 1.1 * bad[-1])), ylabel="bad accepted parts so far")
+    every = f", {course.stretches[0].n} a point" if len(n) and n[0] > 1 else ""
+    bottom.set(xlabel=f"cycle{every}")
+    top.set(ylim=(0, 104), ylabel="share of the parts [%]")
+    if len(n):
+        bottom.set(xlim=(0, ends[-1] * 1.01))
+        _mark_events(top, bottom, course, ends)
+    else:
+        note(top, "no decision yet")
+    for axes in (top, bottom):
+        legend_above(axes, columns=4)
+    figure.suptitle(title)
+    return figure
+
+
+def _cycles(course: Course, ends: Floats, times: list[float]) -> Floats:
+    """At which cycle something happened, to within a stretch."""
+    return np.interp(times, [each.last for each in course.stretches], ends)
+
+
+def _mark_events(top: Axes, bottom: Axes, course: Course, ends: Floats) -> None:
+    for kept, marker, colour, name in ((True, "^", GREEN, "retrained"), (False, "x", BAD, "retrain dropped")):
+        at = _cycles(course, ends, [each.time for each in course.retrains if each.report.accepted is kept])
+        if len(at):
+            label, look = f"{name} ({len(at)})", {"marker": marker, "color": colour}
+            top.scatter(at, np.full(len(at), 2.5), s=26, label=label, zorder=3, clip_on=False, **look)
+    for axes in (top, bottom):
+        for i, (begin, end) in enumerate(_safe_modes(course, ends)):
+            axes.axvspan(begin, end, color=ORANGE, alpha=0.25, linewidth=0, label="safe mode" if i == 0 else None)
+        if course.last < ends[-1]:
+            label = f"the last {course.last:,}"
+            axes.axvspan(ends[-1] - course.last, ends[-1], color=SKY, alpha=0.15, linewidth=0, label=label, zorder=0)
+
+
+def _safe_modes(course: Course, ends: Floats) -> Iterator[tuple[float, float]]:
+    """From which cycle to which everything was verified; a safe mode that lasts ends with the newest cycle."""
+    began: float | None = None
+    for event, at in zip(course.modes, _cycles(course, ends, [each.time for each in course.modes]), strict=True):
+        if event.kind != SAFE_MODE_ENDED:
+            began = float(at) if began is None else began
+        elif began is not None:
+            yield began, float(at)
+            began = None
+    if began is not None:
+        yield began, float(ends[-1])
+
+
+def data_picture(data: Dataset, title: str = "") -> Figure:
+    """Above, a channel a panel: the median trace of good and bad parts, and where the middle 80 % lie.
+
+    Below: the share of good parts and each trace's mean, as recorded. Traces that are not finite are not drawn.
+    """
+    X = as_traces(data.X)
+    shown = np.isfinite(X).all(axis=(1, 2))
+    figure = blank(9.0, 7.6)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
+    names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
+    time_s, unit = np.arange(X.shape[2]) / data.rate_hz, f" [{data.unit}]" if X.shape[1] == 1 else ""
+    above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
+    tops = above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]
+    for i, axes in enumerate(tops):
+        plain(axes)
+        for label, name, colour, line, _ in KINDS:
+            some = X[shown & (data.y == label), i]  # (n, T)
+            if len(some):
+                low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
+                axes.fill_between(time_s, low, high, color=colour, alpha=0.18, linewidth=0)
+                axes.plot(time_s, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
+        axes.set(xlabel="time [s]", ylabel=f"{names[i]}{unit}")
+    if shown.any():
+        legend_above(tops[0])
+    share, level = below.subplots(2, 1, sharex=True)
+    _draw_share(share, data.y)
+    _draw_levels(level, np.flatnonzero(shown) + 1, levels(X[shown, :1])[:, 0], data.y[shown])
+    level.set(xlabel="recording, in the order in which they were made", ylabel=f"mean {names[0]}{unit}")
+    return figure
+
+
+def _draw_share(axes: Axes, y: NDArray[np.int8]) -> None:
+    plain(axes)
+    window = max(1, len(y) // 10)
+    x, good = np.arange(1, len(y) + 1), 100 * sliding_mean(y, window)
+    full = x >= window  # a share of the first few jumps
+    axes.plot(x[full], good[full], color=VERIFIED, label=f"good, of the last {window}")
+    axes.axhline(100 * y.mean(), label="good, of all", **LIMIT)
+    axes.set(ylim=(0, 104), ylabel="share [%]")
+    legend_above(axes)
+
+
+def _draw_levels(axes: Axes, x: NDArray[Any], level: Floats, y: NDArray[np.int8]) -> None:
+    plain(axes)
+    for label, name, colour, _, _ in KINDS:
+        axes.scatter(x[y == label], level[y == label], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
+    window = max(1, len(level) // 10)
+    if len(level) >= window:
+        middle = np.median(np.lib.stride_tricks.sliding_window_view(level, window), axis=1)
+        axes.plot(x[window - 1 :], middle, color=BLACK, linewidth=1.2, label=f"median of the last {window}")
+    legend_above(axes)

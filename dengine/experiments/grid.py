@@ -2,12 +2,9 @@
 
 >>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=30, keep="out/kept")
 
-joblib runs the replays, with the backend that the caller picked: `joblib.parallel_config(backend="dask")` sends the same
-replays to a cluster, and the same decisions come back.
-
-Finished replays are kept on disk, so that an interrupted grid goes on where it was. A file's name is a hash of all that its
-decisions depend on: traces and labels, every setting, the seed, dengine's own source, and the versions of the libraries
-that compute. Nothing is unpickled. A file that cannot be read is a replay that is not there.
+joblib runs the replays, with the backend that the caller picked: `joblib.parallel_config(backend="dask")` is a cluster.
+Finished replays are kept on disk under a hash of all that their decisions depend on: traces and labels, every setting, the
+seed, dengine's own source, and the libraries that compute. Nothing is unpickled; an unreadable file is no replay.
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import distributions
 from inspect import getsourcefile, isfunction
 from pathlib import Path
 from pickle import PicklingError
@@ -77,15 +74,22 @@ class Task:
 class KeptReplays:
     """A folder of finished replays of one data set; made if need be."""
 
-    def __init__(self, folder: str | os.PathLike[str], data: Dataset) -> None:
+    def __init__(self, folder: Folder, data: Dataset) -> None:
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._of_data = _digest_of(data)
+        digest = hashlib.sha256(f"{data.name} {data.X.shape} {data.rate_hz}".encode())
+        for array in (data.X, data.y, data.part):
+            digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+        self._of_data = digest.hexdigest()
         self._own: dict[Any, str] = {}  # read once: a file that changes while a grid is played is not what was imported
 
     def path(self, task: Task) -> Path:
-        """Where the replay of a task is kept."""
-        said = f"{self._of_data}\n{_digest_of_source()}\n{self._own_source(task.contender)}\n{task.description}"
+        """Where the replay of a task is kept: its name changes with the text of the files that a reducer stands in."""
+        own = task.contender.recipe.reducer
+        parts: list[Any] = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
+        self._own |= {part: _source_of(part) for part in parts if part not in self._own}
+        source = "".join(self._own[part] for part in parts)
+        said = f"{self._of_data}\n{_digest_of_source()}\n{source}\n{task.description}"
         return self.folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
 
     def get(self, task: Task) -> Replay | None:
@@ -93,62 +97,36 @@ class KeptReplays:
         path = self.path(task)
         try:
             with np.load(path, allow_pickle=False) as file:
-                return _replay_of({name: file[name] for name in file.files}, task.contender)
+                arrays = dict(file)
+            about = json.loads(str(arrays.pop("about")))
+            retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))
+            named = about | {"name": task.contender.name, "recipe": task.contender.recipe}
+            return Replay(**arrays, **named, retrains=retrains)
         except DAMAGED:
             return None
 
-    def _own_source(self, contender: Contender) -> str:
-        """The text of the files that a reducer and its parts stand in: what it does changes with them."""
-        own = contender.recipe.reducer
-        parts = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
-        self._own |= {part: _source_of(part) for part in parts if part not in self._own}
-        return "".join(self._own[part] for part in parts)
-
     def put(self, task: Task, replay: Replay) -> None:
         """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
+        values = {f.name: getattr(replay, f.name) for f in fields(replay)}
+        about = {name: values[name] for name in ABOUT} | {"retrains": [asdict(each) for each in replay.retrains]}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         partial = self.folder / f".{uuid4().hex}.partial"
         try:
             with partial.open("xb") as file:
-                np.savez_compressed(file, **_arrays_of(replay))
+                np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
             partial.replace(self.path(task))
         finally:
             partial.unlink(missing_ok=True)
 
 
-def _arrays_of(replay: Replay) -> dict[str, Any]:
-    values = {f.name: getattr(replay, f.name) for f in fields(replay)}
-    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-    about = {name: values[name] for name in ABOUT} | {"retrains": [asdict(each) for each in replay.retrains]}
-    return {**arrays, "about": np.array(json.dumps(about))}
-
-
-def _replay_of(arrays: dict[str, Any], contender: Contender) -> Replay:
-    about = json.loads(str(arrays.pop("about")))
-    retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))
-    named = about | {"name": contender.name, "recipe": contender.recipe}
-    return Replay(**arrays, **named, retrains=retrains)
-
-
-def _digest_of(data: Dataset) -> str:
-    digest = hashlib.sha256(f"{data.name} {data.X.shape} {data.rate_hz}".encode())
-    for array in (data.X, data.y, data.part):
-        digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
 @cache
 def _digest_of_source() -> str:
-    digest = hashlib.sha256(f"{sys.version_info[:2]} {[_version_of(name) for name in LIBRARIES]}".encode())
+    """Of dengine's own source, and of the versions of Python and of the libraries that compute."""
+    held = {each.metadata["Name"]: each.version for name in LIBRARIES for each in distributions(name=name)}
+    digest = hashlib.sha256(f"{sys.version_info[:2]} {held}".encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
-
-
-def _version_of(library: str) -> str:
-    try:
-        return version(library)
-    except PackageNotFoundError:
-        return ""
 
 
 def _source_of(part: Any) -> str:
@@ -179,21 +157,19 @@ def _digest_of_reducer(reducer: Any) -> str:
 
 
 def contenders(asked: Sequence[Any]) -> list[Contender]:
-    """Each as it was asked for, under a name of its own: equal names are followed by the settings in which they differ.
+    """Each as it was asked for; equal names are followed by the settings in which they differ, but those in `TOLD_APART`.
 
-    Recipes that differ in `TOLD_APART` alone keep one name. Transformers whose settings read alike, as two functions of one
-    name, are numbered. SettingError where two do not differ at all.
+    Transformers whose settings read alike, as two functions of one name, are numbered. SettingError where two are equal.
     """
     loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
     named = [_told_apart(one, [other for other in loaded if other.name == one.name and other is not one]) for one in loaded]
     held: dict[str, list[int]] = {}  # the transformers behind each name
     for one in named:
-        of_name = held.setdefault(one.name, [])
-        if not isinstance(one.recipe.reducer, str) and id(one.recipe.reducer) not in of_name:
-            of_name.append(id(one.recipe.reducer))
+        if not isinstance(one.recipe.reducer, str) and id(one.recipe.reducer) not in held.setdefault(one.name, []):
+            held[one.name].append(id(one.recipe.reducer))
     return [
         replace(one, name=f"{one.name} {1 + held[one.name].index(id(one.recipe.reducer))}")
-        if len(held[one.name]) > 1 and not isinstance(one.recipe.reducer, str)
+        if len(held.get(one.name, ())) > 1 and not isinstance(one.recipe.reducer, str)
         else one
         for one in named
     ]
@@ -232,9 +208,7 @@ class Played(NamedTuple):
 def iterate_replays(
     dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None, on_cycle: Any = None
 ) -> Iterator[Played]:
-    """Each task's replay as soon as it is done.
-
-    Played seed by seed, so that what an interrupted run has finished can be compared; they end in no certain order.
+    """Each task's replay as soon as it is done, played seed by seed: what an interrupted run has finished can be compared.
 
     n_jobs : replays at a time, as joblib counts; times are honest with 1 alone.
     keep : folder of finished replays: those that are there are not played again, the others are kept as they end.
@@ -299,12 +273,9 @@ def run_grid(
 ) -> pd.DataFrame:
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds.
 
-    recipes : a name, or a list of what `replay` takes, rivals too. The column `recipe` names each; two of one reducer keep
-        apart.
-    guarantees : "local", "pooled", or None for the recipe's own.
+    recipes : a name, or a list of what `replay` takes, rivals too.
+    guarantees : "local", "pooled", or None for the recipe's own.  keep : folder by which an interrupted grid goes on.
     confirms : whether accepted good parts are confirmed; False is the paper's feedback, stops alone.
-    keep : folder of finished replays, by which an interrupted grid goes on.
-
     Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
     """
     import pandas as pd
@@ -328,16 +299,15 @@ def grid_tasks(
     shuffle: bool = True,
 ) -> list[Task]:
     """Every combination as a task; None leaves a setting to the recipe."""
-    conditions = itertools.product(contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms)
-    return [
-        Task(_under(who, interval, alpha, bound, guarantee), seed, cycles, shuffle, confirm)
-        for (who, interval, alpha, bound, guarantee, confirm), seed in itertools.product(conditions, list(seeds))
-    ]
-
-
-def _under(who: Contender, interval: Any, alpha: Any, bound: Any, guarantee: Any) -> Contender:
-    asked = {"interval": interval, "alpha": alpha, "lower_bound": bound, "guarantee": guarantee}
-    return who.with_policy(**{name: value for name, value in asked.items() if value is not None})
+    seeds = list(seeds)
+    names = ("interval", "alpha", "lower_bound", "guarantee")
+    tasks = []
+    for who, *asked, confirm in itertools.product(
+        contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms
+    ):
+        changes = {name: value for name, value in zip(names, asked, strict=True) if value is not None}
+        tasks += [Task(who.with_policy(**changes), seed, cycles, shuffle, confirm) for seed in seeds]
+    return tasks
 
 
 def play_tasks(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-WHOLE = slice(None)
 COLUMNS = (  # of a run as a frame
     "action", "reason", "truth", "lower", "upper", "n_success", "n_failure", "stopped", "safe_mode", "version"
 )  # fmt: skip
@@ -57,7 +56,7 @@ class Contender:
 
     @classmethod
     def load(cls, asked: Any) -> Contender:
-        """From a contender, a rival's name (its chosen settings), or what `Recipe.load` takes; SettingError for else."""
+        """A contender itself, a rival's name (its chosen settings), or what `Recipe.load` takes; SettingError for else."""
         if isinstance(asked, Contender):
             return asked
         if isinstance(asked, str) and asked in RIVALS:
@@ -78,24 +77,22 @@ class Contender:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """One run of a cell, a replay or a live one; n cycles were finished, which may be none.
+    """One run of a cell, a replay or a live one, of n finished cycles, which may be none.
 
-    action : (n,) str, the engine's.  stopped : (n,) bool, the system stopped on an accepted part.
+    action, reason : (n,) str.  stopped : (n,) bool, the system stopped on an accepted part.
     truth : (n,) good or not: bool in a replay; in a live run float, NaN where the cell does not tell.
-    lower, upper, n_success, n_failure : (n,) the evidence.
+    lower, upper, n_success, n_failure : (n,) the evidence.  version : (n,) of the model; 0 before the first retrain.
     position : (n, d) scaled embedding, mean over the spaces; NaN where no model embedded the trace.
-    reason : (n,) str, as in `Reason`.  version : (n,) of the model that answered; 0 before the first retrain.
     safe_mode : (n,) bool, every part is verified after this cycle, whatever the model says.
     decide_seconds : (n,) wall time of each decision.
     clock_s : (n,) seconds of production when the cycle was done; None for a cell without a clock.
-    retrains : the reports of those that ended in this run.  recipe : of the engine.  name : of who played, in tables.
+    retrains : those that ended in this run.  recipe : of the engine.  name : of who played, in tables.
 
     Of a replay alone:
     index : (n,) position in the data set of the trace that each cycle played.  dataset : its name.
     seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
-    seconds : wall time of the whole replay.
-    encoder_steps : of label-free training between cycles.  encoder_seconds : assumed for them, so many a step whatever
-        they took, so that a seed repeats exactly.  slice_max_s : wall time of the longest slice of them.
+    seconds : wall time of the whole replay.  encoder_steps : of label-free training between cycles.
+    encoder_seconds : so many a step, whatever they took, so that a seed repeats exactly.  slice_max_s : their longest.
     """
 
     action: NDArray[np.str_]
@@ -157,25 +154,14 @@ class Replay:
         return np.asarray(self.reason == Reason.NOVEL)
 
     @property
-    def embedded(self) -> bool:
-        """Whether any trace was embedded; rivals embed none."""
-        return bool(np.isfinite(self.position).any())
-
-    @property
     def finished(self) -> Bools:
         """(n,) a good part was passed on, as far as the truth is known."""
         return np.asarray(~self.rejected & (self.truth == 1.0))
 
     @property
-    def first_certain(self) -> float:
-        """Number of the first cycle that was decided without a check, from 1; NaN where none was."""
-        certain = np.flatnonzero(~self.verified)
-        return float(certain[0] + 1) if len(certain) else float("nan")
-
-    @property
-    def retrain_seconds(self) -> Floats:
-        """Wall time of each retrain."""
-        return np.array([each.seconds for each in self.retrains], dtype=np.float64)
+    def embedded(self) -> bool:
+        """Whether any trace was embedded; rivals embed none."""
+        return bool(np.isfinite(self.position).any())
 
     def to_frame(self) -> pd.DataFrame:
         """A row a cycle, numbered from 1: what was decided, why, on what evidence, and what was true."""
@@ -191,39 +177,38 @@ class Replay:
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(a, b)) for a, b in pairwise(edges)]
 
-    def stretch(self, part: slice = WHOLE) -> dict[str, Any]:
+    def stretch(self, part: slice = slice(None)) -> dict[str, Any]:
         """Counts over some of the cycles; parts an hour where there is a clock."""
         begin, end, _ = part.indices(len(self))
         names = ("verified", "accepted", "rejected", "false_positive", "false_negative", "stopped", "novel", "safe_mode")
         counts = {name: int(getattr(self, name)[part].sum()) for name in names}
         counts["stops"] = counts.pop("stopped")
-        share = counts["verified"] / (end - begin) if end > begin else float("nan")
+        share, rate = float("nan"), None
+        if end > begin:
+            share = counts["verified"] / (end - begin)
+            clock_s = np.zeros(0) if self.clock_s is None else np.diff(self.clock_s, prepend=0.0)[begin:end]
+            rate = float(3600.0 * self.finished[part].sum() / clock_s.sum()) if clock_s.sum() > 0 else None
         about = {"first_cycle": begin + 1, "last_cycle": end, "verified_share": share}
-        return about | counts | {"parts_per_hour": self._parts_per_hour(begin, end)}
-
-    def _parts_per_hour(self, begin: int, end: int) -> float | None:
-        if self.clock_s is None or end <= begin:
-            return None
-        seconds = self.clock_s[end - 1] - (self.clock_s[begin - 1] if begin else 0.0)
-        return float(3600.0 * self.finished[begin:end].sum() / seconds) if seconds > 0 else None
+        return about | counts | {"parts_per_hour": rate}
 
     def summary(self) -> dict[str, Any]:
-        """One row of a table: counts over the whole stream; precision and NPV are NaN where nothing was decided."""
+        """One row of a table: counts over the whole stream; NaN where there is nothing to take a share or a time of."""
         counts, policy = self.stretch(), self.recipe.policy
         certain = counts["accepted"] + counts["rejected"]
         wrong = {name: counts[name] for name in ("false_positive", "false_negative")}
+        retrain_s = np.array([each.seconds for each in self.retrains])
+
+        def quantile(values: Floats, q: float) -> float:
+            return float(np.quantile(values, q)) if len(values) else float("nan")
+
         return {
             "recipe": self.name,
-            "interval": policy.interval,
-            "alpha": policy.alpha,
-            "lower_bound": policy.lower_bound,
-            "guarantee": policy.guarantee,
-            "stops": policy.stops,
+            **{name: getattr(policy, name) for name in ("interval", "alpha", "lower_bound", "guarantee", "stops")},
             "confirm": self.confirm,
             "seed": self.seed,
             "cycles": len(self),
             "certain": certain,
-            "first_certain": self.first_certain,
+            "first_certain": float(np.argmin(self.verified) + 1) if certain else float("nan"),  # counted from 1
             "accepted": counts["accepted"],
             "rejected": counts["rejected"],
             **wrong,
@@ -231,12 +216,12 @@ class Replay:
             "novel": counts["novel"],
             "safe_mode": counts["safe_mode"],
             "retrains": len(self.retrains),
-            "retrain_p50_s": _quantile(self.retrain_seconds, 0.5),
-            "retrain_max_s": _quantile(self.retrain_seconds, 1.0),
+            "retrain_p50_s": quantile(retrain_s, 0.5),
+            "retrain_max_s": quantile(retrain_s, 1.0),
             "encoder_s": self.encoder_seconds,
             "slice_max_s": self.slice_max_s,
-            "decide_p50_us": 1e6 * _quantile(self.decide_seconds, 0.5),
-            "decide_p99_us": 1e6 * _quantile(self.decide_seconds, 0.99),
+            "decide_p50_us": 1e6 * quantile(self.decide_seconds, 0.5),
+            "decide_p99_us": 1e6 * quantile(self.decide_seconds, 0.99),
             "saved_s": Costs().saved(certain),
             "net_s": Costs().saved(certain, **wrong),
             "seconds": self.seconds,
@@ -274,19 +259,23 @@ class RunRecorder:
         cycles = [cycle for cycle, _, _ in self._seen]
         decisions = [cycle.decision for cycle in cycles]
         has_clock = getattr(self.cell, "clock", None) is not None
+
+        def column(name: str, kind: Any, of: Sequence[Any] = decisions) -> NDArray[Any]:
+            return np.array([getattr(each, name) for each in of], dtype=kind)
+
         return Replay(
-            action=np.array([str(d.action) for d in decisions], dtype=np.str_),
+            action=column("action", np.str_),
             truth=np.array([truth for _, truth, _ in self._seen], dtype=np.float64),
-            lower=np.array([d.lower for d in decisions], dtype=np.float64),
-            upper=np.array([d.upper for d in decisions], dtype=np.float64),
-            n_success=np.array([d.n_success for d in decisions], dtype=np.int64),
-            n_failure=np.array([d.n_failure for d in decisions], dtype=np.int64),
+            lower=column("lower", np.float64),
+            upper=column("upper", np.float64),
+            n_success=column("n_success", np.int64),
+            n_failure=column("n_failure", np.int64),
             position=_positions(decisions),
-            decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
-            stopped=np.array([cycle.outcome == Outcome.STOPPED for cycle in cycles], dtype=np.bool_),
-            reason=np.array([str(d.reason) for d in decisions], dtype=np.str_),
-            version=np.array([d.model_version for d in decisions], dtype=np.int64),
-            safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
+            decide_seconds=column("decide_seconds", np.float64, cycles),
+            stopped=column("outcome", object, cycles) == Outcome.STOPPED,
+            reason=column("reason", np.str_),
+            version=column("model_version", np.int64),
+            safe_mode=column("safe_mode", object, cycles) != "",
             clock_s=np.array([clock for _, _, clock in self._seen], dtype=np.float64) if has_clock else None,
             retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
             recipe=self._recipe,
@@ -294,22 +283,19 @@ class RunRecorder:
         )
 
 
+def _positions(decisions: list[Decision]) -> Floats:
+    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
+    means = [np.mean(each.embedding, axis=0) if each.embedding else np.empty(0) for each in decisions]
+    width = next((len(mean) for mean in reversed(means) if len(mean)), 2)
+    unknown = np.full(width, np.nan)
+    return np.array([mean if len(mean) == width else unknown for mean in means]).reshape(len(means), width)
+
+
 def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> Replay:
     """Drive a cell and keep what figures and tables need; `RunRecorder` is for a run that may be broken off."""
     recorder = RunRecorder(cell)
     recorder.follow(engine, cycles, on_cycle)
     return recorder.log()
-
-
-def _positions(decisions: list[Decision]) -> NDArray[np.float64]:
-    """(n, d) of the newest embedding's width: a reducer may widen as it sees more traces."""
-    means = [np.mean(each.embedding, axis=0) if each.embedding else None for each in decisions]
-    known = [mean for mean in means if mean is not None]
-    positions = np.full((len(means), len(known[-1]) if known else 2), np.nan)
-    for i, mean in enumerate(means):
-        if mean is not None and len(mean) == positions.shape[1]:
-            positions[i] = mean
-    return positions
 
 
 def replay(
@@ -333,8 +319,11 @@ def replay(
     on_cycle : called with the number of cycles done, for a progress bar.
     """
     data, contender = load_dataset(dataset), Contender.load(recipe)
-    cell = ReplayCell(data, order_of(data, seed, cycles, shuffle), confirm)
-    return collect(contender.engine(seed), cell, data, seed, on_cycle, contender.name)
+    n = len(data) if cycles is None else cycles
+    if not 1 <= n <= len(data):
+        raise SettingError(f"Expected 1 to {len(data)} cycles from {data.name}, got {n}.")
+    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
+    return collect(contender.engine(seed), ReplayCell(data, order[:n], confirm), data, seed, on_cycle, contender.name)
 
 
 def collect(
@@ -362,16 +351,3 @@ def collect(
         encoder_seconds=spent.seconds,
         slice_max_s=spent.longest,
     )
-
-
-def order_of(data: Dataset, seed: int, cycles: int | None = None, shuffle: bool = True) -> NDArray[np.int64]:
-    """(cycles,) positions in the data set, in the order in which a replay plays them. SettingError for too many."""
-    n = len(data) if cycles is None else cycles
-    if not 1 <= n <= len(data):
-        raise SettingError(f"Expected 1 to {len(data)} cycles from {data.name}, got {n}.")
-    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
-    return order[:n]
-
-
-def _quantile(values: NDArray[np.float64], q: float) -> float:
-    return float(np.quantile(values, q)) if len(values) else float("nan")

@@ -27,7 +27,17 @@ if TYPE_CHECKING:
 
 CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops", "confirm"]
 COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode"]
-ERROR = ("error_lower", "error_upper")
+TIMES = {  # of a pooled row, and how the replays' are put together
+    "retrain_p50_s": "median",
+    "retrain_max_s": "max",
+    "encoder_s": "mean",
+    "slice_max_s": "max",
+    "decide_p50_us": "median",
+    "decide_p99_us": "max",
+    "first_certain": "mean",
+    "saved_s": "mean",
+    "net_s": "mean",
+}
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
 PROMISE = (
     "certain: cycles decided without a check, a mean a replay ± its standard deviation over the replays, and their "
@@ -60,7 +70,7 @@ def frame_of(replays: Sequence[Replay]) -> pd.DataFrame:
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
     """A row for each recipe, interval, alpha, LB, guarantee and feedback, in the frame's order.
 
-    replays : of the frame's rows; with them a row has the interval of the pooled error, as `rates.pooled_error` has it.
+    replays : of the frame's rows; with them a row has the interval of the pooled error, as `pooled_error` has it.
 
     precision, npv : over the sums of all replays, not the mean of their ratios, which would weigh a replay that accepted
         three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
@@ -70,41 +80,22 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
     encoder_s : seconds of label-free training that a replay assumed, the mean.
     """
     groups = frame.reset_index(drop=True).groupby(CONDITION, sort=False)
-    of = {key: [replays[i] for i in part.index] if replays else [] for key, part in groups}
-    return [_pooled(dict(zip(CONDITION, key, strict=True)), part) | _error_of(of[key]) for key, part in groups]
+    return [
+        _pooled(dict(zip(CONDITION, key, strict=True)), part, [replays[i] for i in part.index] if replays else [])
+        for key, part in groups
+    ]
 
 
-def _error_of(replays: Sequence[Replay]) -> dict[str, float]:
-    error = pooled_error(replays)
-    return {"error_lower": error.lower, "error_upper": error.upper} if error.decided else dict.fromkeys(ERROR, math.nan)
-
-
-def _pooled(condition: dict[str, Any], part: pd.DataFrame) -> dict[str, Any]:
-    total = {name: int(part[name].sum()) for name in COUNTS}
-    return (
-        condition
-        | {"replays": len(part), "cycles": int(part["cycles"].sum())}
-        | {name: float(part[name].mean()) for name in COUNTS}
-        | {f"total_{name}": n for name, n in total.items()}
-        | {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
-        | {
-            "precision": _share_right(total["false_positive"], total["accepted"]),
-            "npv": _share_right(total["false_negative"], total["rejected"]),
-            "retrain_p50_s": float(part["retrain_p50_s"].median()),
-            "retrain_max_s": float(part["retrain_max_s"].max()),
-            "encoder_s": float(part["encoder_s"].mean()),
-            "slice_max_s": float(part["slice_max_s"].max()),
-            "decide_p50_us": float(part["decide_p50_us"].median()),
-            "decide_p99_us": float(part["decide_p99_us"].max()),
-            "first_certain": float(part["first_certain"].mean()),
-            "saved_s": float(part["saved_s"].mean()),
-            "net_s": float(part["net_s"].mean()),
-        }
-    )
-
-
-def _share_right(wrong: int, n: int) -> float:
-    return 1.0 - wrong / n if n else math.nan
+def _pooled(condition: dict[str, Any], part: pd.DataFrame, replays: Sequence[Replay]) -> dict[str, Any]:
+    total, error = {name: int(part[name].sum()) for name in COUNTS}, pooled_error(replays)
+    row = condition | {"replays": len(part), "cycles": int(part["cycles"].sum())}
+    row |= {name: float(part[name].mean()) for name in COUNTS} | {f"total_{name}": n for name, n in total.items()}
+    row |= {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
+    for name, wrong, decided in (("precision", "false_positive", "accepted"), ("npv", "false_negative", "rejected")):
+        row[name] = 1.0 - total[wrong] / total[decided] if total[decided] else math.nan
+    row |= {name: float(part[name].agg(how)) for name, how in TIMES.items()}
+    ends = (error.lower, error.upper) if error.decided else (math.nan, math.nan)
+    return row | dict(zip(("error_lower", "error_upper"), ends, strict=True))
 
 
 def promise_kept(row: Mapping[str, Any]) -> bool | None:
@@ -127,40 +118,34 @@ def promise_line(row: Mapping[str, Any], telling: Sequence[str] = ()) -> str:
     who = f"{row['recipe']} ({', '.join([row['guarantee'], *(said[name] for name in telling)])})"
     if not row["total_accepted"]:
         return f"{who}: no part was accepted."
-    verdict = {True: "kept", False: "broken", None: f"fewer than {ENOUGH} accepted parts, too few to say"}[
-        promise_kept(row)
-    ]
-    good, bound = percent(row["precision"]), 100 * row["lower_bound"]
+    few = f"fewer than {ENOUGH} accepted parts, too few to say"
+    verdict = {True: "kept", False: "broken", None: few}[promise_kept(row)]
     bad = f"; bad: {100 * row['error_lower']:.1f} to {percent(row['error_upper'])} at 95 %"
-    bad = "" if math.isnan(row["error_lower"]) else bad
-    return f"{who}: {good} of {row['total_accepted']} accepted parts were good{bad}, LB {bound:g} %: {verdict}."
-
-
-def guarantee_line(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What the rows' guarantees say, and what is known of stops; one that a user wrote is not explained."""
-    asked = dict.fromkeys(str(row["guarantee"]) for row in rows)
-    known = dict.fromkeys("confirmed" if row["confirm"] else str(row["stops"]) for row in rows)
-    return " ".join([*(SHOWN[name] for name in asked if name in SHOWN), *(KNOWN[name] for name in known)])
+    good = f"{percent(row['precision'])} of {row['total_accepted']} accepted parts were good"
+    good += "" if math.isnan(row["error_lower"]) else bad
+    return f"{who}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}."
 
 
 def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> Table:
-    """The pooled rows for a screen; the caption says which promise they show."""
+    """The pooled rows for a screen; the caption says which promise they show, and what is known of stops."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
+    known = ["confirmed" if row["confirm"] else str(row["stops"]) for row in rows]
+    asked = dict.fromkeys(str(row["guarantee"]) for row in rows)  # one that a user wrote is not explained
+    meant = " ".join([*(SHOWN[name] for name in asked if name in SHOWN), *(KNOWN[name] for name in dict.fromkeys(known))])
+    said = PROMISE.format(check=VERIFY_SECONDS, stop=STOP_SECONDS, again=CYCLE_SECONDS, guarantees=meant)
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
-    said = PROMISE.format(check=VERIFY_SECONDS, stop=STOP_SECONDS, again=CYCLE_SECONDS, guarantees=guarantee_line(rows))
     look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
     table = Table(title=f"\n{title}\n", caption=f"\n{said}\n", **look)
     # The one that gives way: 80 columns are enough for every number.
     table.add_column("recipe\nguarantee", overflow="fold")
-    for name in _CELLS_OF:
+    for name in CELLS:
         table.add_column(name, justify="right", no_wrap=True)
-    intervals = {row["interval"] for row in rows}
-    for row in rows:
-        known = "confirmed" if row["confirm"] else row["stops"]
-        name = f"{row['recipe']}\n{row['guarantee']}, {known}" + (f"\n{row['interval']}" if len(intervals) > 1 else "")
-        table.add_row(name, *(show(row) for show in _CELLS_OF.values()))
+    several = len({row["interval"] for row in rows}) > 1
+    for row, stops in zip(rows, known, strict=True):
+        name = f"{row['recipe']}\n{row['guarantee']}, {stops}" + (f"\n{row['interval']}" if several else "")
+        table.add_row(name, *(show(row) for show in CELLS.values()))
     return table
 
 
@@ -173,7 +158,7 @@ def _with_sd(row: Mapping[str, Any], name: str) -> str:
     return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"
 
 
-_CELLS_OF: dict[str, Any] = {
+CELLS: dict[str, Any] = {
     "alpha\nLB": lambda r: f"{r['alpha']:g}\n{100 * r['lower_bound']:g} %",
     "certain\nshare": lambda r: f"{_with_sd(r, 'certain')}\n{percent(r['total_certain'] / r['cycles'])}",
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",

@@ -12,8 +12,7 @@ import pytest
 from dengine import DataEngine, Dataset
 from dengine.cli.output import WIDE
 from dengine.datasets import Fault
-from dengine.experiments.figures import save
-from dengine.experiments.pictures import data_picture
+from dengine.experiments.figures import data_picture, save
 from dengine.experiments.survey import Spread, survey
 from tests.support.command_line import dengine, document, well
 

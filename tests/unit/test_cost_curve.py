@@ -60,6 +60,7 @@ def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
     lax, strict = found.rows
     assert (found.choosing, found.reporting) == (2, 2)
     assert (lax.chosen_by, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
+    assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT  # of equal ones
     assert lax.sd == pytest.approx(math.sqrt(0.125))
     assert (strict.chosen_by, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
     assert found.policy == LAX  # cheaper where it was chosen, though not where it is reported
@@ -90,12 +91,7 @@ def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, 
     assert (found.verdict, found.policy) == ("does not pay", None)
     assert found.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
     assert not found.to_frame()["chosen"].any()
-
-
-def test_where_nothing_was_ever_certain_it_asks_for_more_recordings() -> None:
-    found = curve(lax=[(100, 0)] * 4)
-    assert found.policy is None
-    assert "everything was verified. Record more." in found.sentence
+    assert "everything was verified. Record more." in curve(lax=[(100, 0)] * 4).sentence
 
 
 def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear() -> None:
@@ -104,10 +100,6 @@ def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear(
     assert dear.cheapest.cost == cheap.cheapest.cost == 4.95
     assert (dear.verdict, cheap.verdict) == ("does not pay", "may pay")
     assert "is expected to cost 5.01 and cost 4.95 in other shuffles" in dear.sentence
-
-
-def test_of_equal_policies_the_strictest_is_taken() -> None:
-    assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT
 
 
 def test_a_shuffle_that_not_every_policy_has_played_is_left_out() -> None:
@@ -132,11 +124,10 @@ def test_the_curve_is_that_of_replays(found: CostCurve, make_data: Callable[...,
     assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
 
 
-def test_a_policy_comes_from_costs_and_with_it_whatever_the_recipe_says(make_data: Callable[..., Dataset]) -> None:
+def test_what_a_recipe_says_beside_alpha_and_lb_stays(make_data: Callable[..., Dataset]) -> None:
     how = HOW | {"recipe": Recipe.load("pca").with_policy(stops="all")}
     policy = policy_from_costs(make_data(160), check=5, escape=20, false_reject=10, **how)
     assert (policy.alpha, policy.stops) == (0.5, "all")
-    assert policy.lower_bound in HOW["lower_bounds"]
 
 
 def test_where_nothing_pays_there_is_no_policy_from_costs(make_data: Callable[..., Dataset]) -> None:
@@ -188,19 +179,5 @@ def test_the_verb_shows_a_table_and_writes_the_curve(folder: Path) -> None:
     assert [row["alpha"] for row in told["rows"]] == [0.5, 0.1]
     assert told["sentence"] in shown
     assert len(list((folder / "kept").iterdir())) == 4  # played once
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        ("--escape 20", 2, "--false-reject"),
-        ("--escape 20 --false-reject 10 --alpha 0.1", 2, "name those to be tried, --alphas"),
-        ("--escape -1 --false-reject 10", 2, "-1"),
-        ("--escape 20 --false-reject 10 --repeats 1", 2, "1 is not in the range"),
-        ("--escape 20 --false-reject 10 --check 0", 1, "Expected a check that costs something"),
-    ],
-)
-def test_a_wrong_call_says_what_was_expected(folder: Path, words: str, code: int, said: str) -> None:
-    done = costs(words)
-    assert done.exit_code == code
-    assert said in " ".join(done.output.split())
+    done = costs("--escape 20 --false-reject 10 --alpha 0.1")
+    assert (done.exit_code, "name those to be tried, --alphas" in " ".join(done.output.split())) == (2, True)

@@ -17,7 +17,7 @@ from dengine import ConvReducer, Policy, Recipe, RetrainReport
 from dengine.cells.simulation.conditions import first_change
 from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
 from dengine.experiments.replay import Replay, RunRecorder
-from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line, write_csv
+from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line
 
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
 
@@ -79,18 +79,6 @@ def test_the_promise_is_kept_up_to_the_tolerance(bad: int, kept: bool) -> None:
     assert promise_kept(row) is kept
 
 
-def test_names_keep_recipes_of_one_reducer_apart() -> None:
-    rows = pool(frame_of([replace(MANY_RIGHT, name="mine"), replace(ONE_WRONG, name="yours")]))
-    assert [row["recipe"] for row in rows] == ["mine", "yours"]
-
-
-def test_the_table_says_which_promise_it_shows() -> None:
-    table = pooled_table(pool(frame_of([MANY_RIGHT])))
-    assert "pooled precision is only measured" in str(table.caption)
-    assert "of accepted parts only stops are known" in str(table.caption)
-    assert list(table.columns[0].cells) == ["pca\nlocal, some"]
-
-
 def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
     pooled = replay_of(["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all"))
     rows = pool(frame_of([MANY_RIGHT, pooled]))
@@ -100,13 +88,6 @@ def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
     for said in ("is only measured", "keeps all accepted parts together", "no stop follows"):
         assert said in str(table.caption)
     assert promise_line(rows[1]).startswith("pca (pooled): 100.0 % of 300")
-
-
-def test_the_csv_has_a_row_a_replay(tmp_path) -> None:
-    path = write_csv(frame_of([MANY_RIGHT, ONE_WRONG]), tmp_path / "deep" / "replays.csv")
-    header, *rows = path.read_text().splitlines()
-    assert header.startswith("recipe,interval,alpha,lower_bound,guarantee,stops,confirm,seed")
-    assert len(rows) == 2
 
 
 @pytest.mark.parametrize("window", [1, 3, 10, 50])
@@ -124,12 +105,9 @@ def test_window_curves_are_shares_of_the_cycles_and_of_what_was_decided_in_the_w
     np.testing.assert_allclose(lines["false_negative"], [np.nan, np.nan, np.nan, 100])
 
 
-def test_the_errors_of_all_replays_are_pooled_before_they_are_divided() -> None:
+def test_shares_are_of_all_replays_together_and_those_of_too_few_parts_are_left_out() -> None:
     lines = window_curves([MANY_RIGHT, ONE_WRONG], window=300)
     assert lines["false_positive"][-1] == pytest.approx(100 * 11 / 301)  # the mean of the two shares would be 51.7
-
-
-def test_a_share_of_too_few_parts_is_left_out() -> None:
     some = replay_of(["accept"] * 4 + ["verify"] * 4, [0] + [1] * 7)
     assert np.isfinite(window_curves([some], window=4, fewest=3)["precision"]).tolist() == [0, 0, 1, 1, 1, 0, 0, 0]
 
@@ -250,14 +228,9 @@ PICTURES: dict[str, Callable[[], Figure]] = {
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_every_figure_is_written_as_a_png_without_pyplot(name: str, tmp_path: Path) -> None:
-    path = save(PICTURES[name](), tmp_path / "deep" / "figure.png", dpi=40)
-    assert path.read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize("name", PICTURES)
-def test_no_legend_lies_on_the_data(name: str) -> None:
+def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_its_data(name: str, tmp_path: Path) -> None:
     figure = PICTURES[name]()
+    assert save(figure, tmp_path / "deep" / "figure.png", dpi=40).read_bytes().startswith(b"\x89PNG")
     figure.draw_without_rendering()
     legends = [each.get_legend() for each in figure.axes if each.get_legend()] + figure.legends
     assert legends
@@ -265,13 +238,6 @@ def test_no_legend_lies_on_the_data(name: str) -> None:
         box = legend.get_window_extent()
         assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(figure.axes)
         assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
-
-
-def test_novel_parts_and_cycles_of_safe_mode_are_counted_in_their_stretch() -> None:
-    novel, safe = np.arange(100) % 10 == 0, np.arange(100) >= 70
-    log = replace(log_of(None), reason=np.where(novel, "novel", "uncertain"), safe_mode=safe)
-    assert (log.stretch()["novel"], log.stretch()["safe_mode"]) == (10, 30)
-    assert [part["safe_mode"] for part in log.stretches(4)] == [0, 0, 5, 25]
 
 
 @pytest.mark.parametrize(("scenario", "cycle"), [("nominal", None), ("wear", 2), ("variant", 401), ("bias_jump", 401)])

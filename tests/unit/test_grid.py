@@ -20,9 +20,10 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
 from dengine.cli import main
 from dengine.errors import SettingError
-from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays, run_replays
+from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays
 from dengine.experiments.replay import Contender
 from dengine.experiments.rivals import RIVALS
+from dengine.recipe import RECIPES
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
 TIMES = ("decide_seconds", "retrains", "seconds")
@@ -90,20 +91,18 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
     assert KeptReplays(tmp_path / "kept", data).path(task) != before
 
 
-@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 not a zip", b"\x93NUMPY"])
-def test_a_damaged_file_is_a_replay_that_is_not_there(data: Dataset, tmp_path: Path, damage: bytes) -> None:
-    task, kept = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data)
-    kept.path(task).write_bytes(damage)
-    assert kept.get(task) is None
-    (played,) = iterate_replays(data, [task], keep=tmp_path)
-    assert not played.kept
-    same(kept.get(task), played.replay)
-
-
 def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
     task, kept, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), KeptReplays(tmp_path, data), np.random.default_rng(0)
     played = replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
+    file = kept.path(task).read_bytes()
+    for damage in (b"", b"PK\x03\x04 not a zip", b"\x93NUMPY"):
+        kept.path(task).write_bytes(damage)
+        assert kept.get(task) is None
+    (again,) = iterate_replays(data, [task], keep=tmp_path)
+    assert not again.kept
+    same(kept.get(task), again.replay)
+    kept.path(task).write_bytes(file)
     whole = np.frombuffer(kept.path(task).read_bytes(), dtype=np.uint8)
     found = []
     for size in [1, 1, 3, 50] * 75:
@@ -197,25 +196,11 @@ def test_a_grid_is_the_same_on_a_dask_cluster(
 # --------------------------------------------------------------------------------------------------------- tasks
 
 
-def test_guarantees_and_feedbacks_are_conditions_of_their_own(data: Dataset) -> None:
-    known = RECIPE.with_policy(stops="all")
-    frame = run_grid(
-        data,
-        [known],
-        (0.1,),
-        (0.9,),
-        repeats=1,
-        cycles=60,
-        n_jobs=1,
-        guarantees=("local", "pooled"),
-        confirms=(False, True),
-    )
-    assert list(zip(frame["guarantee"], frame["confirm"], strict=True)) == [
+def test_guarantees_and_feedbacks_are_conditions_and_none_leaves_a_setting_to_the_recipe() -> None:
+    tasks = grid_tasks([RECIPE], guarantees=("local", "pooled"), confirms=(False, True))
+    assert [(each.contender.recipe.policy.guarantee, each.confirm) for each in tasks] == [
         ("local", False), ("local", True), ("pooled", False), ("pooled", True)
     ]  # fmt: skip
-
-
-def test_none_leaves_a_setting_to_the_recipe() -> None:
     (task,) = grid_tasks([RECIPE], (None,), (None,), (None,), [7])
     assert (task.contender.recipe, task.seed) == (RECIPE, 7)
 
@@ -224,11 +209,6 @@ def test_replays_end_seed_by_seed_so_that_a_part_can_be_compared(data: Dataset) 
     tasks = grid_tasks([RECIPE, "always"], (0.1,), (0.9,), ("wilson",), range(2), cycles=40)
     seeds = [tasks[played.position].seed for played in iterate_replays(data, tasks)]
     assert seeds == [0, 0, 1, 1]
-
-
-def test_the_list_of_replays_is_in_the_order_in_which_they_were_asked_for(data: Dataset) -> None:
-    replays = run_replays(data, [RECIPE, "always"], (3, 2), cycles=40, n_jobs=2)
-    assert [(each.name, each.seed) for each in replays] == [("pca", 3), ("pca", 2), ("always", 3), ("always", 2)]
 
 
 # ---------------------------------------------------------------------------------------------------- contenders
@@ -240,15 +220,15 @@ def names(asked: list) -> list[str]:
     return [one.name for one in contenders(asked)]
 
 
-def test_two_recipes_of_one_reducer_are_named_by_the_settings_in_which_they_differ() -> None:
+def test_two_recipes_are_named_by_the_settings_in_which_they_differ_and_have_no_columns_for() -> None:
     assert names([PLAIN, replace(PLAIN, radius=0.3)]) == ["pca radius=0.5", "pca radius=0.3"]
     other = replace(PLAIN, radius=0.3, params={"n_components": 1})
     assert names([PLAIN, other, "conv"]) == ["pca radius=0.5", "pca radius=0.3 n_components=1", "conv"]
-
-
-def test_transformers_of_one_class_are_told_apart_by_their_own_settings() -> None:
-    assert names([PCA(1), PCA(2)]) != names([PCA(2), PCA(2, whiten=True)])
-    assert len(set(names([PCA(1), PCA(2)]))) == 2
+    assert names([PLAIN, PLAIN.with_policy(guarantee="pooled", stops="all")]) == ["pca", "pca"]
+    with pytest.raises(SettingError, match="pca twice"):
+        contenders([PLAIN, replace(PLAIN)])
+    assert names("conv") == ["conv"]
+    assert set(RIVALS) & set(RECIPES) == set()
 
 
 def test_transformers_are_named_by_their_settings_and_numbered_where_these_read_alike() -> None:
@@ -258,40 +238,6 @@ def test_transformers_are_named_by_their_settings_and_numbered_where_these_read_
     assert len(set(names([PCA(2), PCA(2)]))) == 2
     one = Recipe(absolute)
     assert names([one, one.with_policy(stops="all")]) == ["Pipeline", "Pipeline"]
-
-
-def test_recipes_that_differ_in_what_tables_have_columns_for_keep_one_name() -> None:
-    pooled = PLAIN.with_policy(guarantee="pooled", stops="all")
-    assert names([PLAIN, pooled]) == ["pca", "pca"]
-
-
-def test_one_name_is_a_list_of_one() -> None:
-    assert names("conv") == ["conv"]
-
-
-def test_the_same_recipe_twice_is_refused() -> None:
-    with pytest.raises(SettingError, match="pca twice"):
-        contenders([PLAIN, replace(PLAIN)])
-
-
-def test_a_rivals_name_is_a_contender_under_the_policy_that_is_set() -> None:
-    never = Contender.load("never").with_policy(alpha=0.2, lower_bound=0.8)
-    assert (never.name, never.rival) == ("never", "never")
-    engine = never.engine(seed=3)
-    assert engine.recipe.policy == Policy(0.2, 0.8)
-    assert engine.seed == 3
-
-
-@pytest.mark.parametrize("unknown", ["nearest", "no_such_file.toml", 3])
-def test_what_is_neither_recipe_nor_rival_is_refused(unknown: object) -> None:
-    with pytest.raises(SettingError, match="recipe"):
-        Contender.load(unknown)
-
-
-def test_no_rival_has_the_name_of_a_recipe() -> None:
-    from dengine.recipe import RECIPES
-
-    assert set(RIVALS) & set(RECIPES) == set()
 
 
 def test_the_description_changes_with_every_setting_that_decides(data: Dataset, tmp_path: Path) -> None:
@@ -311,10 +257,7 @@ def test_the_description_changes_with_every_setting_that_decides(data: Dataset, 
     said = [Task(each, 0).description for each in [one, *others]]
     assert len(set(said)) == len(said)
     assert Task(replace(one, name="another"), 0).description == said[0]
-    alike = [Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))) for _ in range(2)]
-    assert Task(alike[0], 0).description == Task(alike[1], 0).description
-
-
-def test_a_function_without_a_name_cannot_be_told_apart() -> None:
     with pytest.raises(SettingError, match="define it in a module"):
         _ = Task(Contender.load(FunctionTransformer(lambda x: x)), 0).description
+    alike = [Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))) for _ in range(2)]
+    assert Task(alike[0], 0).description == Task(alike[1], 0).description

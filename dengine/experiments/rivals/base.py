@@ -48,17 +48,14 @@ class Rival(ABC):
     seed : of all that it draws; the same seed and the same labels give the same decisions.
 
     A subclass gives `_learn` and `_judge`, and `_take` where it learns between two trainings. Where a training cannot be
-    done, on labels of one class or on too few, every part is verified until the next one. The engine asks
-    `predict_interval`, `count` and `decide` in turn about one trace: the first does the work, the others remember it.
+    done, on labels of one class or on too few, every part is verified until the next one.
 
-    title : for a table.  source : the paper, or the library.  needs : the library beyond what dengine needs.
+    title : for a table.  needs : the library beyond what dengine needs.
     bound : what bound its decisions keep; "" where it has none, and its threshold is swept.
-    tries : four sets of parameters, as many as ours, to choose among on other seeds than those reported.
-    chosen : which of them.
+    tries : four sets of parameters, as many as ours, to choose among on other seeds than those reported.  chosen : which.
     """
 
     title: ClassVar[str]
-    source: ClassVar[str]
     bound: ClassVar[str] = ""
     needs: ClassVar[str] = ""
     tries: ClassVar[tuple[Mapping[str, Any], ...]] = ({},) * 4
@@ -68,7 +65,7 @@ class Rival(ABC):
         self.policy = Policy(alpha, lower_bound)
         self.seed = seed
         self.ready = False
-        self._last: tuple[bytes, Judgement] | None = None
+        self._last: tuple[bytes, Judgement] | None = None  # the engine asks three things in turn about one trace
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Train anew on labelled traces X (n, C, T), y (n,) of 1 = success and 0 = failure."""
@@ -119,9 +116,7 @@ class Rival(ABC):
 
 
 class ThresholdRival(Rival):
-    """A rival with one number for each trace, its success probability as it believes: accept from one threshold on, reject
-    up to another. Without a threshold on a side, nothing is decided on that side.
-    """
+    """A rival that accepts from one success probability on, and rejects up to another; without them it decides nothing."""
 
     def __init__(self, alpha: float, lower_bound: float, seed: int = 0) -> None:
         super().__init__(alpha, lower_bound, seed)
@@ -129,7 +124,7 @@ class ThresholdRival(Rival):
 
     @abstractmethod
     def _probability(self, X: Traces) -> Floats:
-        """(n,) success probabilities of traces (n, C, T), after a training."""
+        """(n,) success probabilities, as the method believes, of traces (n, C, T), after a training."""
 
     def _judge(self, X: Traces) -> Judgement:
         p = self._probability(X)
@@ -168,7 +163,6 @@ def whole(name: str, value: Any, least: int = 1) -> int:
 class Components:
     """The first principal components of traces, scaled.
 
-    n_components : how many.
     whiten : each to unit variance; otherwise all by the first one's deviation, so that they keep their proportions.
     """
 
@@ -199,19 +193,15 @@ def segment_means(X: Traces, segments: int) -> Floats:
     """(n, C, T) -> (n, C * segments): means of stretches of about equal length, at most T of them."""
     n, channels, samples = X.shape
     starts = np.unique(np.linspace(0, samples, min(segments, samples), endpoint=False).astype(int))
-    lengths = np.diff(np.append(starts, samples))
     sums = np.add.reduceat(X.astype(np.float64), starts, axis=2)
-    return np.asarray((sums / lengths).reshape(n, channels * len(starts)))
+    return np.asarray((sums / np.diff(np.append(starts, samples))).reshape(n, channels * len(starts)))
 
 
 class References:
-    """Labelled points (n, d) to which one more can be added at little cost."""
+    """Labelled points (n, d) to which one more can be added at little cost: the room doubles when it is used up."""
 
     def __init__(self, points: Floats, good: Labels) -> None:
         self._points, self._good, self._size = points.copy(), good.copy(), len(good)
-
-    def __len__(self) -> int:
-        return self._size
 
     @property
     def points(self) -> Floats:
@@ -224,9 +214,16 @@ class References:
         return self._good[: self._size]
 
     def add(self, point: Floats, good: bool) -> None:
-        """One more point (1, d); the room doubles when it is used up."""
+        """One more point (1, d)."""
         if self._size == len(self._good):
             self._points = np.concatenate([self._points, np.empty_like(self._points)])
             self._good = np.concatenate([self._good, np.empty_like(self._good)])
         self._points[self._size], self._good[self._size] = point[0], good
         self._size += 1
+
+
+def squared_distances(Z: Floats, points: Floats) -> Floats:
+    """(n, d) and (m, d) -> (n, m)."""
+    from scipy.spatial.distance import cdist
+
+    return np.asarray(cdist(Z, points, "sqeuclidean"))

@@ -3,38 +3,34 @@
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...errors import SettingError
 from ...records import Action
-from .base import Floats, Judgement, Labels, References, Rival, ThresholdRival, Traces, actions_of, segment_means, whole
+from .base import (
+    Floats,
+    Judgement,
+    Labels,
+    References,
+    Rival,
+    ThresholdRival,
+    Traces,
+    actions_of,
+    segment_means,
+    squared_distances,
+    whole,
+)
 
 
 class AlwaysVerify(Rival):
-    """Every part is verified: no error, and nothing saved."""
+    """Every part is verified, the cell as it is: no error, and nothing saved."""
 
     title = "always verify"
-    source = "the cell as it is"
     bound = "no error: every part is verified"
-
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        return True
-
-    def _judge(self, X: Traces) -> Judgement:
-        return Judgement.same(len(X), Action.VERIFY)
-
-
-class NeverVerify(Rival):
-    """Every part is accepted, whatever it looks like: all is saved, and every bad part stops the system.
-
-    An engine has no model before its first retrain, so the first `retrain_every` parts are verified all the same.
-    """
-
-    title = "never verify"
-    source = "the cell without its check"
+    action: ClassVar[Action] = Action.VERIFY
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Nothing to learn: labels of one class are as good as any."""
@@ -45,21 +41,29 @@ class NeverVerify(Rival):
         return True
 
     def _judge(self, X: Traces) -> Judgement:
-        return Judgement.same(len(X), Action.ACCEPT)
+        return Judgement.same(len(X), self.action)
+
+
+class NeverVerify(AlwaysVerify):
+    """Every part is accepted, whatever it looks like: all is saved, and every bad part stops the system.
+
+    An engine has no model before its first retrain, so the first `retrain_every` parts are verified all the same.
+    """
+
+    title = "never verify"
+    bound = ""
+    action = Action.ACCEPT
 
 
 class AgreeingNeighbours(Rival):
     """Accept where all k nearest labelled traces are successes, reject where all are failures, verify otherwise.
 
-    k : how many have to agree. The distance is Euclidean between the force traces as they are, all channels in a row.
-
-    The share of agreeing neighbours bounds nothing: alpha and LB have no effect, and k takes the place of a threshold.
-    Every label counts from the next part on. `predict_interval` gives the share of successes twice; it is no bound.
+    Distances are Euclidean between the traces as they are, all channels in a row. alpha and LB have no effect: k takes the
+    place of a threshold. Every label counts from the next part on. `predict_interval` gives the share of successes twice.
     Source: Duan et al. (2025), as the paper's section "Related Work" describes it.
     """
 
     title = "k-NN, all k agree"
-    source = "Duan et al. (2025), the authors' predecessor"
     tries = ({"k": 5}, {"k": 10}, {"k": 20}, {"k": 40})
 
     def __init__(self, alpha: float, lower_bound: float, seed: int = 0, *, k: int = 10) -> None:
@@ -74,9 +78,7 @@ class AgreeingNeighbours(Rival):
         self._references.add(_rows(X), good)
 
     def _judge(self, X: Traces) -> Judgement:
-        from scipy.spatial.distance import cdist
-
-        distances = cdist(_rows(X), self._references.points, "sqeuclidean")  # (n, references)
+        distances = squared_distances(_rows(X), self._references.points)  # (n, references)
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
         share = n_success / self.k
@@ -92,30 +94,21 @@ class StreamForest(ThresholdRival):
     """Adaptive random forest on segment means; accept from a threshold on its vote, reject from the same on the other side.
 
     threshold : of the votes' share, in (0.5, 1]. It stands for no bound: alpha and LB have no effect.
-    segments : stretches of each channel whose means are the features.
-    n_models : trees, as in river.
+    segments : stretches of each channel whose means are the features.  n_models : trees, as in river.
 
-    It learns each label once, as it comes, and a training adds only what it has not learned yet: a stream learner looks at
-    nothing twice, and forgets by its own drift detectors, not by the engine's window. A label that was corrected is learned
-    in addition. `predict_interval` gives the votes' share twice; it is no bound.
+    It learns each label once, as it comes, and forgets by its own drift detectors, not by the engine's window. A label that
+    was corrected is learned in addition. `predict_interval` gives the votes' share twice.
     Source: Gomes et al. (2017), "Adaptive random forests for evolving data stream classification", Machine Learning 106.
     """
 
     title = "adaptive random forest"
-    source = "Gomes et al. (2017), river"
     tries = ({"threshold": 0.8}, {"threshold": 0.9}, {"threshold": 0.95}, {"threshold": 0.99})
     needs = "river"
 
     def __init__(
-        self,
-        alpha: float,
-        lower_bound: float,
-        seed: int = 0,
-        *,
-        threshold: float = 0.95,
-        segments: int = 20,
-        n_models: int = 10,
-    ) -> None:
+        self, alpha: float, lower_bound: float, seed: int = 0, *,
+        threshold: float = 0.95, segments: int = 20, n_models: int = 10,
+    ) -> None:  # fmt: skip
         from river.forest import ARFClassifier
 
         super().__init__(alpha, lower_bound, seed)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
+from abc import abstractmethod
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,17 @@ from .base import (
     Traces,
     positive,
     segment_means,
+    squared_distances,
     whole,
 )
 
 BANDWIDTHS = (0.03, 0.05, 0.08, 0.12, 0.2, 0.3, 0.5, 0.8)  # to choose among, in deviations of a component
 MOST_CHOOSING = 1000  # traces that the bandwidth is chosen on: the work grows with their square
 DIMENSIONS = 2
+MOST_TRAINED = 500  # traces to train a Gaussian process on: the work grows with their cube
+SHORTEST = 9  # samples: the length of MiniRocket's kernels
+SEGMENTS = 50
+PROCEDURES = ("bonferroni_holm", "fixed_sequence")
 
 
 class WilsonKernelDensity(Rival):
@@ -37,20 +43,16 @@ class WilsonKernelDensity(Rival):
         leave-one-out likelihood of the labels.
 
     With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is the kernel regression m = sum w_i y_i / sum w_i, and
-    the number of trials is n = sum K_H(z - z_i) |H| / R(K), K the normal density and R(K) = (4 pi)^(-d/2) its squared
-    integral: n = 2^(d/2) sum w_i, here 2 sum w_i. That is the sample size which the asymptotic variance of kernel
-    regression, m (1 - m) R(K) / (N h^d f), stands for, and where traces lie densely it equals Kish's (sum w)^2 / sum w^2.
-    It is no count: a lone label at the very place of the query counts as two, and a kernel wider than the data counts
-    every label twice. So the method has a bound in form, but only where the kernel is narrow and many labels lie within.
+    the number of trials n = sum K_H(z - z_i) |H| / R(K), K the normal density, R(K) = (4 pi)^(-d/2): n = 2^(d/2) sum w_i,
+    here 2 sum w_i. It is no count: a lone label at the place of the query counts as two, and a kernel wider than the data
+    counts every label twice. So the bound holds only where the kernel is narrow and many labels lie within.
 
     Source: Iversen, Duan and Hagelskjær (2026), "Estimation of Confidence Bounds in Binary Classification using Wilson
-    Score Kernel Density Estimation", arXiv:2602.20947; n, and H in proportion to the root of the covariance, as in the
-    authors' public implementation, github.com/SDU-Robotics/wilson-score-kde. Our reading: two principal components as
-    features, and the likelihood of Wilson's centre, (n m + z^2 / 2) / (n + z^2), which no lone wrong neighbour sends to 0.
+    Score Kernel Density Estimation", arXiv:2602.20947; n and H as in github.com/SDU-Robotics/wilson-score-kde. Our reading:
+    two principal components, and the likelihood of Wilson's centre, which no lone wrong neighbour sends to 0.
     """
 
     title = "Wilson-score kernel density"
-    source = "Iversen, Duan and Hagelskjær (2026), arXiv:2602.20947"
     bound = "Wilson interval of kernel-weighted counts, at one look"
     tries = ({"bandwidth": None}, {"bandwidth": 0.1}, {"bandwidth": 0.2}, {"bandwidth": 0.4})
 
@@ -78,13 +80,6 @@ class WilsonKernelDensity(Rival):
         return Judgement(self.policy.actions(lower, upper), lower, upper, *whole_numbers)
 
 
-def squared_distances(Z: Floats, points: Floats) -> Floats:
-    """(n, d) and (m, d) -> (n, m)."""
-    from scipy.spatial.distance import cdist
-
-    return np.asarray(cdist(Z, points, "sqeuclidean"))
-
-
 def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Floats, Floats]:
     """(n_success, n_failure), each (n,), no whole numbers: from squared distances (n, m) in two dimensions, labels (m,)."""
     weights = np.exp(-0.5 * distances / bandwidth**2) * 2.0 ** (DIMENSIONS / 2)
@@ -93,18 +88,15 @@ def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Fl
 
 def chosen_bandwidth(Z: Floats, good: Labels, alpha: float) -> float:
     """The bandwidth among `BANDWIDTHS` under which labels (n,) at Z (n, 2) are most likely, each left out in turn."""
-    distances = squared_distances(Z, Z)
+    distances, z = squared_distances(Z, Z), normal_quantile(alpha)
     np.fill_diagonal(distances, np.inf)
-    z = normal_quantile(alpha)
-    return max(BANDWIDTHS, key=lambda h: _log_likelihood(*kernel_counts(distances, good, h), good, z))
 
+    def log_likelihood(bandwidth: float) -> float:
+        n_success, n_failure = kernel_counts(distances, good, bandwidth)
+        rate = (n_success + z * z / 2.0) / (n_success + n_failure + z * z)
+        return float(np.log(np.where(good, rate, 1.0 - rate)).sum())
 
-def _log_likelihood(n_success: Floats, n_failure: Floats, good: Labels, z: float) -> float:
-    rate = (n_success + z * z / 2.0) / (n_success + n_failure + z * z)
-    return float(np.log(np.where(good, rate, 1.0 - rate)).sum())
-
-
-MOST_TRAINED = 500  # traces to train on: the work of a training grows with their cube
+    return max(BANDWIDTHS, key=log_likelihood)
 
 
 class GaussianProcess(Rival):
@@ -115,15 +107,13 @@ class GaussianProcess(Rival):
         likelihood drives it up where classes part well; then the interval stays wide even amid hundreds of successes.
 
     The latent function f at a trace has mean m and variance v under Laplace's approximation; the interval of the success
-    probability is sigmoid(m -+ z sqrt(v)), z the 1 - alpha/2 normal quantile as with Wilson. It is a credible interval: it
-    holds under the prior, a scaled squared exponential of one length scale, both chosen by the marginal likelihood.
-    Trained on the newest 500 labels only, because of its cost; nothing is learned between two trainings.
+    probability is sigmoid(m -+ z sqrt(v)), z the 1 - alpha/2 normal quantile. It is a credible interval: it holds under the
+    prior, a scaled squared exponential of one length scale. Trained on the newest 500 labels only, because of its cost.
     Source: Rasmussen and Williams (2006), "Gaussian Processes for Machine Learning", Algorithms 3.1 and 3.2.
     Raises SettingError for a scikit-learn before 1.7, which does not tell the latent mean and variance.
     """
 
     title = "Gaussian process"
-    source = "Rasmussen and Williams (2006), scikit-learn"
     bound = "credible interval under the prior, at one look"
     tries = (
         {"n_components": 2, "amplitude": 2.0},
@@ -207,6 +197,46 @@ def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: 
     return found
 
 
+class HeldOutRival(ThresholdRival):
+    """A classifier, and a threshold on each side that labels vouch for on which it was not trained.
+
+    holdout : share of the labels that choose the thresholds and train nothing; drawn anew at each training.
+
+    For each training and each side by itself: with probability 1 - alpha over the held-out labels at most 1 - LB of what is
+    decided on that side is wrong, for parts like those that were held out. In the loop these were verified or stopped:
+    of good parts beyond the threshold that are not confirmed only the bad ones return, which errs on the safe side for
+    accepting; of rejected parts nothing returns. Nothing is learned between two trainings, and `predict_interval` gives the
+    classifier's probability twice.
+    """
+
+    shortest: ClassVar[int] = 1  # samples
+
+    def __init__(self, alpha: float, lower_bound: float, seed: int, holdout: float, classifier: Any) -> None:
+        super().__init__(alpha, lower_bound, seed)
+        self.holdout, self._classifier = positive("holdout", holdout, below=1.0), classifier
+
+    def _learn(self, X: Traces, good: Labels) -> bool:
+        train, rest = held_out(len(X), self.holdout, self.seed)
+        if X.shape[-1] < self.shortest or len(np.unique(good[train])) < 2 or not len(rest):
+            return False
+        self._classifier.fit(self._features(X[train]), good[train])
+        p = self._probability(X[rest])
+        self.accept_at = self._threshold(p, good[rest])
+        self.reject_at = 1.0 - self._threshold(1.0 - p, ~good[rest])
+        return True
+
+    def _probability(self, X: Traces) -> Floats:
+        return np.asarray(self._classifier.predict_proba(self._features(X))[:, 1], dtype=np.float64)
+
+    @abstractmethod
+    def _features(self, X: Traces) -> NDArray[Any]:
+        """Traces (n, C, T) as the classifier takes them."""
+
+    @abstractmethod
+    def _threshold(self, p: Floats, right: Labels) -> float:
+        """From which p (m,) on a side is decided, with `right` (m,); infinity where nothing can be vouched for."""
+
+
 def held_out(n: int, share: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Positions of n traces to train on, and to hold out: a share of them, at random and blind to labels."""
     order = np.random.default_rng(seed).permutation(n)
@@ -214,144 +244,82 @@ def held_out(n: int, share: float, seed: int) -> tuple[NDArray[np.int64], NDArra
     return np.sort(order[size:]), np.sort(order[:size])
 
 
-SHORTEST = 9  # samples: the length of MiniRocket's kernels
-
-
-class RocketSelective(ThresholdRival):
-    """MiniRocket (aeon), logistic regression (scikit-learn), and SGR's threshold on each side.
+class RocketSelective(HeldOutRival):
+    """MiniRocket (aeon), logistic regression (scikit-learn), and SGR's threshold on each side, with delta = alpha.
 
     n_kernels : of MiniRocket, 84 at least; aeon's default.
     C : inverse strength of the regression's penalty, as in scikit-learn; features are standardised.
-    holdout : share of the labels that choose the thresholds, and train nothing; drawn anew at each training.
-
-    Traces that are held out and called successes give the threshold to accept from, with risk 1 - LB and delta = alpha;
-    those called failures give the one to reject from. So for each training and each side: with probability 1 - alpha over
-    the held-out labels, at most 1 - LB of what is decided on that side is wrong; with 1 - 2 alpha on both sides. That
-    is so for one training, and for parts like those that were held out. In the loop there are many trainings, and held-out
-    parts are those that were verified or stopped: where good parts beyond the threshold are not confirmed, only the bad
-    ones among them return as labels. For accepting that errs on the safe side; of rejected parts nothing returns at all.
-
-    Nothing is learned between two trainings. `predict_interval` gives the regression's probability twice; it is no bound.
     Sources: Dempster, Schmidt and Webb (2021), "MiniRocket", KDD; Geifman and El-Yaniv (2017), NIPS 30, Algorithm 1.
     """
 
     title = "MiniRocket, logistic, SGR"
-    source = "Dempster et al. (2021), aeon; Geifman and El-Yaniv (2017)"
     bound = "SGR risk bound, each side and each training by itself"
     tries = tuple({"C": C, "holdout": holdout} for holdout in (0.5, 0.3) for C in (0.001, 0.01))
     chosen = 1
     needs = "aeon"
+    shortest = SHORTEST
 
     def __init__(
-        self,
-        alpha: float,
-        lower_bound: float,
-        seed: int = 0,
-        *,
-        n_kernels: int = 10_000,
-        C: float = 0.001,
-        holdout: float = 0.5,
-    ) -> None:
-        super().__init__(alpha, lower_bound, seed)
-        self._classifier = _pipeline(whole("n_kernels", n_kernels, 84), positive("C", C), seed)
-        self.holdout = positive("holdout", holdout, below=1.0)
+        self, alpha: float, lower_bound: float, seed: int = 0, *,
+        n_kernels: int = 10_000, C: float = 0.001, holdout: float = 0.5,
+    ) -> None:  # fmt: skip
+        from aeon.transformations.collection.convolution_based import MiniRocket
+        from sklearn.linear_model import LogisticRegression
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        train, rest = held_out(len(X), self.holdout, self.seed)
-        if X.shape[-1] < SHORTEST or len(np.unique(good[train])) < 2:
-            return False
-        self._classifier.fit(X[train], good[train])
-        p = self._probability(X[rest]) if len(rest) else np.empty(0)
-        self._set_thresholds(p, good[rest])
-        return True
+        features = MiniRocket(n_kernels=whole("n_kernels", n_kernels, 84), random_state=seed)
+        regression = LogisticRegression(C=positive("C", C), max_iter=1000)
+        super().__init__(alpha, lower_bound, seed, holdout, make_pipeline(features, StandardScaler(), regression))
+        features.fit_transform(np.eye(2 * SHORTEST, dtype=np.float32)[:, None, :])  # compiled here
 
-    def _set_thresholds(self, p: Floats, good: Labels) -> None:
-        risk, delta = 1.0 - self.policy.lower_bound, self.policy.alpha
+    def _features(self, X: Traces) -> Traces:
+        return X
+
+    def _threshold(self, p: Floats, right: Labels) -> float:
         called = p > 0.5
-        self.accept_at = guaranteed_threshold(p[called], ~good[called], risk, delta)
-        self.reject_at = 1.0 - guaranteed_threshold(1.0 - p[~called], good[~called], risk, delta)
-
-    def _probability(self, X: Traces) -> Floats:
-        return np.asarray(self._classifier.predict_proba(X)[:, 1], dtype=np.float64)
+        return guaranteed_threshold(p[called], ~right[called], 1.0 - self.policy.lower_bound, self.policy.alpha)
 
 
-def _pipeline(n_kernels: int, C: float, seed: int) -> Any:
-    """The classifier, untrained, its features compiled."""
-    from aeon.transformations.collection.convolution_based import MiniRocket
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    features = MiniRocket(n_kernels=n_kernels, random_state=seed)
-    features.fit_transform(np.eye(2 * SHORTEST, dtype=np.float32)[:, None, :])
-    return make_pipeline(features, StandardScaler(), LogisticRegression(C=C, max_iter=1000))
-
-
-SEGMENTS = 50
-PROCEDURES = ("bonferroni_holm", "fixed_sequence")
-
-
-class ControlledRisk(ThresholdRival):
+class ControlledRisk(HeldOutRival):
     """Logistic regression on segment means, and the thresholds whose precision MAPIE certifies.
 
     thresholds : how many probabilities are tested on each side, from 0.95 down to 0.5.
     fwer : how MAPIE pays for testing many: "bonferroni_holm", its default, shares alpha among them; "fixed_sequence" tests
         them in turn at the whole alpha, from the highest on, until one fails.
-    holdout : share of the labels that the tests are made on, and that train nothing; drawn anew at each training.
 
     Of the thresholds at which `BinaryClassificationController` certifies a precision of LB with confidence 1 - alpha, the
-    one with the highest recall accepts; the same with failures as the positive class rejects (its precision is the NPV).
-    As with SGR (`RocketSelective`) that holds for one training, for each side by itself, and for parts like those
-    that were held out, which in the loop are the verified and the stopped ones.
-
-    Nothing is learned between two trainings. `predict_interval` gives the regression's probability twice; it is no bound.
+    one with the highest recall decides; to reject, failures are the positive class.
     Source: Angelopoulos, Bates, Candès, Jordan and Lei (2021), "Learn then test", arXiv:2110.01052, in MAPIE
     (Hoeffding-Bentkus p-values).
     """
 
     title = "logistic, MAPIE risk control"
-    source = "Angelopoulos et al. (2021), MAPIE"
     bound = "learn-then-test, each side and each training by itself"
     tries = tuple({"thresholds": n, "fwer": fwer} for fwer in PROCEDURES for n in (5, 20))
     chosen = 3
     needs = "mapie"
 
     def __init__(
-        self,
-        alpha: float,
-        lower_bound: float,
-        seed: int = 0,
-        *,
-        thresholds: int = 10,
-        fwer: str = "bonferroni_holm",
-        holdout: float = 0.5,
-    ) -> None:
+        self, alpha: float, lower_bound: float, seed: int = 0, *,
+        thresholds: int = 10, fwer: str = "bonferroni_holm", holdout: float = 0.5,
+    ) -> None:  # fmt: skip
         from mapie.risk_control import BinaryClassificationController
         from sklearn.linear_model import LogisticRegression
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
-        super().__init__(alpha, lower_bound, seed)
-        self._controller: Any = BinaryClassificationController
-        self._classifier: Any = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
-        self.thresholds = whole("thresholds", thresholds)
+        classifier: Any = make_pipeline(StandardScaler(), LogisticRegression(max_iter=1000))
+        super().__init__(alpha, lower_bound, seed, holdout, classifier)
         if fwer not in PROCEDURES:
             raise SettingError(f"Expected fwer {' or '.join(PROCEDURES)}, got {fwer!r}.")
-        self.fwer = fwer
-        self.holdout = positive("holdout", holdout, below=1.0)
+        self.thresholds, self.fwer = whole("thresholds", thresholds), fwer
+        self._controller: Any = BinaryClassificationController
 
-    def _learn(self, X: Traces, good: Labels) -> bool:
-        train, rest = held_out(len(X), self.holdout, self.seed)
-        if len(np.unique(good[train])) < 2 or len(rest) == 0:
-            return False
-        self._classifier.fit(segment_means(X[train], SEGMENTS), good[train])
-        p = self._probability(X[rest])
-        self.accept_at = self._certified(p, good[rest])
-        self.reject_at = 1.0 - self._certified(1.0 - p, ~good[rest])
-        return True
+    def _features(self, X: Traces) -> Floats:
+        return segment_means(X, SEGMENTS)
 
-    def _certified(self, p: Floats, positive_class: Labels) -> float:
-        """The certified threshold of the highest recall; infinity where there is none. p, positive_class : (m,)."""
+    def _threshold(self, p: Floats, right: Labels) -> float:
         controller = self._controller(
             predict_function=_both_classes,
             risk="precision",
@@ -362,12 +330,9 @@ class ControlledRisk(ThresholdRival):
         )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # that there is no threshold, which the result says
-            controller.calibrate(p, positive_class.astype(int))
+            controller.calibrate(p, right.astype(int))
         best: Any = controller.best_predict_param
         return np.inf if best is None else float(best)
-
-    def _probability(self, X: Traces) -> Floats:
-        return np.asarray(self._classifier.predict_proba(segment_means(X, SEGMENTS))[:, 1], dtype=np.float64)
 
 
 def _both_classes(p: Floats) -> Floats:
