@@ -24,7 +24,7 @@ from ..files import UNREADABLE, must_fit
 from .cutting import Insertion, cut_stream, usual_step
 from .dataset import Asked, Dataset, Fault, UnreadableError
 from .folders import natural
-from .labels import Listed, collect, label_of, listed
+from .labels import Labels, collect, label_of, listed
 from .lengths import Collected, as_dataset
 from .triggers import Trigger, as_trigger
 
@@ -183,7 +183,13 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]
-    labels, faults = _labels(messages, cuts, names, asked)
+    labels: Labels
+    if asked.labels is not None:
+        labels, faults = listed(asked.labels, asked.part, names)
+    elif asked.label is not None:
+        labels, faults = Told(asked.label, messages, cuts, names), []
+    else:
+        raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
     found = Collected(name, channels, faults)
     found.faults.extend(Fault(source, 0, cut.fault) for source, cut in zip(names, cuts, strict=True) if cut.fault)
     traces = [None if cut.fault else cut.trace for cut in cuts]
@@ -191,12 +197,16 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     return as_dataset(found, asked)
 
 
-@dataclass(frozen=True)
 class Told:
-    """Labels from a topic: of each insertion's name the value that was told next, if it was before another one began."""
+    """Labels from a topic: of each insertion the value that was told next, if it was before another one began."""
 
-    topic: str
-    words: dict[str, Any]
+    def __init__(self, topic: str, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> None:
+        self.topic, self.words = topic, dict[str, Any]()
+        begins = [messages.logged[cut.first] for cut in cuts]
+        for logged, word in messages.others[topic]:
+            place = int(np.searchsorted(begins, logged, side="right")) - 1
+            if place >= 0:
+                self.words.setdefault(names[place], word)
 
     def label(self, name: str) -> tuple[int, str | None]:
         if name not in self.words:
@@ -205,21 +215,3 @@ class Told:
 
     def advice(self) -> str:
         return f"give the topic that tells them, {self.topic} does not, or a file of labels"
-
-
-def _labels(
-    messages: Messages, cuts: Sequence[Insertion], names: Sequence[str], asked: Asked
-) -> tuple[Told | Listed, list[Fault]]:
-    if asked.labels is not None:
-        return listed(asked.labels, asked.part, names)
-    if asked.label is None:
-        raise DataError(
-            "Expected the labels' topic (label='/height_check/ok'), or a file of them by number (labels='labels.csv')."
-        )
-    begins = [messages.logged[cut.first] for cut in cuts]
-    words: dict[str, Any] = {}
-    for logged, word in messages.others[asked.label]:
-        place = int(np.searchsorted(begins, logged, side="right")) - 1
-        if place >= 0:
-            words.setdefault(names[place], word)
-    return Told(asked.label, words), []

@@ -41,7 +41,6 @@ class UnreadableError(DataError):
         self.what, self.line = what, line
 
     def fault(self, source: str) -> Fault:
-        """Of the recording with this name."""
         return Fault(source, self.line, self.what)
 
 
@@ -89,12 +88,10 @@ class Dataset:
 
         X = self.X if self.X.ndim == 3 else self.X[:, None]
         channels = self.channels or ("x",) if X.shape[1] == 1 else self.channels or [f"x{c}" for c in range(X.shape[1])]
-        samples = pd.DataFrame(
-            X.reshape(len(X), -1), columns=[f"{name}_{i}" for name in channels for i in range(X.shape[2])]
-        )
+        names = [f"{name}_{i}" for name in channels for i in range(X.shape[2])]
         known = {"label": self.y, "part": self.part, "cause": self.cause}
         about = pd.DataFrame({name: values for name, values in known.items() if values is not None})
-        return pd.concat([about, samples], axis=1)
+        return pd.concat([about, pd.DataFrame(X.reshape(len(X), -1), columns=names)], axis=1)
 
     def cut(self, samples: int) -> Dataset:
         """The first `samples` samples of every trace: an earlier, harder moment to decide at."""

@@ -36,9 +36,7 @@ def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
     try:
         table = read_table(path)
         if 2 * sum(is_number(word) and not word.isdecimal() for word in table.header) > len(table.header) > 2:
-            raise DataError(
-                f"Expected a header in {path}, its first line is of numbers; name the columns FZ_0, FZ_1, ..., label."
-            )
+            raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
         if not table.rows:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         frame = table.frame().set_axis(table.header, axis=1)

@@ -126,16 +126,12 @@ def test_the_environment_gives_the_password_and_a_used_store_is_shown_without_it
     with DataEngine("pca", retrain_every=60, store=url) as engine:
         for x, y in zip(data.X, data.y, strict=True):
             engine.report(engine.decide(x).id, y)
-        spec = engine.trace
-    journal, table = tmp_path / "journal.csv", tmp_path / "data.npz"
-    journal.write_text("1," + ",".join(map(str, range(spec.samples))) + "\n")
-    np.savez(table, X=data.X[:40] + 1, y=data.y[:40])
+    np.savez(table := tmp_path / "data.npz", X=data.X[:40] + 1, y=data.y[:40])
     shown = ""
     for words in (
         ["status", url],
         ["train", "--data", str(table), "--store", url, "--retrains", "1"],
         ["export", url, "--out", str(tmp_path / "model.ts")],
-        ["import-labels", str(journal), "--store", url],
     ):
         for form in ([], ["--json"]):
             done = CliRunner().invoke(main, words + form)

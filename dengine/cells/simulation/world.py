@@ -48,9 +48,7 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     try:
         import mujoco
     except ImportError as error:
-        raise DengineError(
-            "Expected MuJoCo for the simulated cell, found none; install it with: pip install dengine[sim]"
-        ) from error
+        raise DengineError("Expected MuJoCo for the simulated cell, found none: pip install dengine[sim]") from error
     steps = round(1 / RATE_HZ / time_step_s)
     if not math.isclose(steps * time_step_s, 1 / RATE_HZ):
         raise SettingError(f"Expected a time step that divides 2 ms, got {time_step_s} s; take 0.0005 or half of it.")
@@ -72,10 +70,9 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
 
 def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> NDArray[np.float64]:
     """Run the push under its controller; the reading is zeroed before the motion, with the part in hand."""
-    settled = np.zeros(6)
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
-    settled += data.sensordata
+    settled = np.array(data.sensordata)
     travel_m = (conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm) / 1000
     period_s, delay_samples = 1 / RATE_HZ, conditions.delay_s * RATE_HZ
     target_m, wrench = 0.0, np.empty((SAMPLES, 6))
@@ -150,11 +147,15 @@ def _part(c: Conditions) -> str:
 
 
 def _fixture(c: Conditions) -> str:
-    """Four walls with a 45 degree chamfer, a floor, and what may lie on it."""
-    half, chamfer, depth = (WIDTH_MM + c.clearance_mm) / 2000, c.chamfer_mm / 1000, DEPTH_MM / 1000
-    walls = "\n".join(_wall(side, half, chamfer, depth) for side in range(4))
-    floor = f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>'
-    return f"{walls}\n{floor}\n{_debris(c, depth)}"
+    """Four walls with a 45 degree chamfer, a floor, and a chip that may lie on it, more or less soft."""
+    half, depth = (WIDTH_MM + c.clearance_mm) / 2000, DEPTH_MM / 1000
+    chamfer, chip = c.chamfer_mm / 1000, c.debris_mm / 2000
+    parts = [_wall(side, half, chamfer, depth) for side in range(4)]
+    parts.append(f'<geom type="box" size="0.03 0.03 0.005" pos="0 0 {-depth - 0.005}"/>')
+    if c.debris_mm > 0:
+        position, soft = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + chip}", f"{c.debris_softness_s} 1"
+        parts.append(f'<geom type="box" size="0.003 0.003 {chip}" pos="{position}" solref="{soft}" priority="1"/>')
+    return "\n".join(parts)
 
 
 def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
@@ -172,12 +173,3 @@ def _wall(side: int, half: float, chamfer: float, depth: float) -> str:
       <geom type="box" size="{wall / 2} {reach} {chamfer / 2}" pos="{reach - wall / 2} 0 {-chamfer / 2}"/>
       <geom type="box" size="{face} {half + chamfer} {thick}" pos="{slope_x} 0 {slope_z}" euler="0 {-math.pi / 4} 0"/>
     </body>"""
-
-
-def _debris(c: Conditions, depth: float) -> str:
-    """A chip on the floor: a small box, more or less soft."""
-    if c.debris_mm <= 0:
-        return ""
-    half, soft = c.debris_mm / 2000, f"{c.debris_softness_s} 1"
-    position = f"{c.debris_x_mm / 1000} {c.debris_y_mm / 1000} {-depth + half}"
-    return f'<geom type="box" size="0.003 0.003 {half}" pos="{position}" solref="{soft}" priority="1"/>'

@@ -16,6 +16,7 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any, Protocol
 
 import numpy as np
@@ -51,11 +52,6 @@ class Connection:
         self.started = False
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_WR)
-
-
-def named(payload: bytes) -> list[str]:
-    """The fields of a set-up; ur_rtde ends its list with a comma, which real controllers let pass."""
-    return payload.decode().rstrip(",").split(",")
 
 
 CHECK, REST = 5, 2  # control cycles of a height check, and of standstill before an insertion is answered
@@ -112,9 +108,9 @@ class RobotProgram:
             return Answer.FAILED
         good = bool(self.data.y[self.played[-1]])
         if verb == Verb.VERIFY:
-            yield from self._wait(CHECK)
+            yield from repeat(None, CHECK)
             return Answer.GOOD if good else Answer.BAD
-        yield from self._wait(1)
+        yield from repeat(None, 1)
         if verb == Verb.REJECT:
             return Answer.DONE
         return (Answer.CONFIRMED if self.confirm else Answer.UNKNOWN) if good else Answer.STOPPED
@@ -124,7 +120,7 @@ class RobotProgram:
             return Answer.FAILED  # the bin is empty
         part = len(self.played)
         self.played.append(part)
-        yield from self._wait(self.approach)
+        yield from repeat(None, self.approach)
         self.outputs[PHASE] = number
         for sample in range(self._traces.shape[2]):
             self.place = part, sample
@@ -132,12 +128,8 @@ class RobotProgram:
             yield
         self.place = None
         self.outputs.update({PHASE: 0, **dict.fromkeys(self._columns, 0.0)})
-        yield from self._wait(REST)
+        yield from repeat(None, REST)
         return Answer.DONE
-
-    def _wait(self, cycles: int) -> Iterator[None]:
-        for _ in range(cycles):
-            yield
 
 
 CYCLE_S = 0.002
@@ -145,7 +137,6 @@ IDLE_S = 0.0002  # of a cycle at no set speed, while nobody listens
 STATE = {"robot_mode": 7.0, "safety_mode": 1.0, "speed_scaling": 1.0, RUNTIME: float(Runtime.PLAYING)}
 FOREIGN = (OSError, CellError, struct.error, ValueError, KeyError)  # of a client that is gone, or speaks otherwise
 PATIENCE = struct.pack("ll", 5, 0)  # seconds, a timeval: a client that does not read is hung up on
-VERSION_HERE = struct.pack(">4I", 5, 11, 0, 0)  # of the controller's software
 GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
 TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
 
@@ -285,27 +276,31 @@ class FakeController:
             elif package.kind is Kind.TEXT:
                 self.said.append(package.payload[1 : 1 + package.payload[0]].decode())
             else:
-                answer = getattr(self, f"_on_{package.kind.name.lower()}")(connection, package.payload)
+                answer = self._reply(connection, package.kind, package.payload)
                 connection.socket.sendall(Package(package.kind, answer).bytes)
                 connection.started = package.kind is Kind.START and answer == b"\1"
 
-    def _on_version(self, connection: Connection, payload: bytes) -> bytes:
-        return bytes([struct.unpack(">H", payload)[0] == VERSION and Kind.VERSION not in self.refuses])
+    def _reply(self, connection: Connection, kind: Kind, payload: bytes) -> bytes:
+        if kind is Kind.OUTPUTS:
+            return self._set_outputs(connection, payload)
+        if kind is Kind.INPUTS:
+            return self._set_inputs(connection, payload)
+        if kind is Kind.CONTROLLER:
+            return struct.pack(">4I", 5, 11, 0, 0)  # of its software
+        agrees = {Kind.VERSION: payload == struct.pack(">H", VERSION), Kind.START: connection.output is not None}
+        return bytes([agrees.get(kind, True) and kind not in self.refuses])
 
-    def _on_controller(self, connection: Connection, payload: bytes) -> bytes:
-        return VERSION_HERE
-
-    def _on_outputs(self, connection: Connection, payload: bytes) -> bytes:
+    def _set_outputs(self, connection: Connection, payload: bytes) -> bytes:
         (rate,) = struct.unpack_from(">d", payload)
-        names = named(payload[8:])
+        names = payload[8:].decode().rstrip(",").split(",")  # ur_rtde ends its list with a comma
         types = [NOT_FOUND if name in self.unknown else type_of(name) for name in names]
         if NOT_FOUND not in types:
             connection.output = Recipe(1, tuple(names), tuple(types))
         connection.every = max(int(1 / (CYCLE_S * rate)), 1) if rate > 0 else 1
         return bytes([1]) + ",".join(types).encode()
 
-    def _on_inputs(self, connection: Connection, payload: bytes) -> bytes:
-        names = named(payload)
+    def _set_inputs(self, connection: Connection, payload: bytes) -> bytes:
+        names = payload.decode().rstrip(",").split(",")
         others = [recipe for each in self._connections if each is not connection for recipe in each.inputs.values()]
         taken = self.held.union(*(recipe.names for recipe in others))
         types = [IN_USE if name in taken else type_of(name) for name in names]
@@ -313,12 +308,6 @@ class FakeController:
         if number:
             connection.inputs[number] = Recipe(number, tuple(names), tuple(types))
         return bytes([number]) + ",".join(types).encode()
-
-    def _on_start(self, connection: Connection, payload: bytes) -> bytes:
-        return bytes([connection.output is not None and Kind.START not in self.refuses])
-
-    def _on_pause(self, connection: Connection, payload: bytes) -> bytes:
-        return b"\1"
 
     # The control cycle.
 

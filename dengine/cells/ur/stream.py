@@ -80,7 +80,7 @@ class RtdeClient:
         return found
 
     def send(self, values: Sequence[float]) -> None:
-        """Write the input fields, all of them in one package."""
+        """Write the input fields, in one package."""
         if self.inputs is None:
             raise CellError("Expected input fields to write, this connection was set up without.")
         try:
@@ -89,7 +89,6 @@ class RtdeClient:
             raise CellError(f"Expected {self.where} to take its inputs, the connection is lost: {error}.") from error
 
     def close(self) -> None:
-        """Hang up."""
         with suppress(OSError):  # it may have hung up first
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -119,9 +118,8 @@ class RtdeClient:
             raise CellError(f"Expected packages from {self.where}, it hung up{self._why()}.")
         for package in self._packages.feed(piece):
             if package.kind is Kind.TEXT:
-                self.said = (
-                    package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace") if package.payload else ""
-                )
+                length, words = int.from_bytes(package.payload[:1]), package.payload[1:]
+                self.said = words[:length].decode("utf-8", "replace")
             elif package.kind is not Kind.PAUSE:
                 self._waiting.append(package)
 
@@ -223,7 +221,6 @@ class RtdeStream:
         self._counts = dict.fromkeys(StreamReport.__dataclass_fields__, 0)
 
     def open(self) -> RtdeStream:
-        """Connect and begin to read."""
         for left in reversed(range(int(RELEASE_S / RETRY_S[0]) + 1)):
             try:
                 self._client = self._connect()
@@ -260,7 +257,6 @@ class RtdeStream:
             return self._first + len(self._rows)
 
     def report(self) -> StreamReport:
-        """Counts since it was opened."""
         with self._news:
             return StreamReport(**self._counts)
 
@@ -272,9 +268,7 @@ class RtdeStream:
         with self._news:
             self._news.wait_for(lambda: self._first + len(self._rows) > position or self._closing.is_set(), timeout)
             if (lost := self._first - position) > 0:
-                raise CellError(
-                    f"Expected to be asked within {KEPT_S:g} s, {lost} packages were given up; arm() begins anew."
-                )
+                raise CellError(f"Expected to be asked within {KEPT_S:g} s, {lost} packages are lost; arm() begins anew.")
             return self._rows[position - self._first :], self._first + len(self._rows)
 
     def write(self, values: Sequence[float] | None) -> None:
@@ -327,7 +321,6 @@ class RtdeStream:
             self._news.notify_all()
 
     def _again(self, why: str) -> None:
-        """Connect again."""
         wait, longest = RETRY_S
         with self._news:
             lost, self._client, self.trouble = self._client, None, why
