@@ -79,33 +79,29 @@ def full(outcome: Outcome, place: Place) -> None:
 
 @contextlib.contextmanager
 def _full() -> Iterator[None]:
-    def keep_small(connection: Any, *_: object) -> None:
-        connection.execute("PRAGMA max_page_count = 1")
+    most = 1
 
-    def let_grow(connection: Any, *_: object) -> None:
-        connection.execute("PRAGMA max_page_count = 1073741823")
+    def bound(connection: Any, *_: object) -> None:
+        if isinstance(connection, sqlite3.Connection):
+            connection.execute(f"PRAGMA max_page_count = {most}")
 
-    with _listening(sa.pool.Pool, "checkout", keep_small):
-        yield
-    sa.event.listen(sa.pool.Pool, "checkout", let_grow)
+    sa.event.listen(sa.pool.Pool, "checkout", bound)  # it stays, so that every connection may grow again
+    yield
+    most = 1073741823
 
 
 @contextlib.contextmanager
-def _listening(where: Any, name: str, react: Callable[..., None]) -> Iterator[None]:
-    sa.event.listen(where, name, react)
-    try:
-        yield
-    finally:
-        sa.event.remove(where, name, react)
-
-
-def _statements(react: Callable[[str, Any], None]) -> Any:
+def _statements(react: Callable[[str, Any], None]) -> Iterator[None]:
     """Do this before each statement of any store in this process."""
 
     def before(connection: Any, cursor: Any, statement: str, parameters: Any, *_: object) -> None:
         react(statement, parameters)
 
-    return _listening(sa.Engine, "before_cursor_execute", before)
+    sa.event.listen(sa.Engine, "before_cursor_execute", before)
+    try:
+        yield
+    finally:
+        sa.event.remove(sa.Engine, "before_cursor_execute", before)
 
 
 def slow(outcome: Outcome, place: Place) -> None:
