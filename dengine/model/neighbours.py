@@ -79,7 +79,7 @@ class ModelPrediction(EngineModel):
         return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
-    def user_model(self) -> ModelPrediction:  # type: ignore[override]  # itself: an attribute would be a circle
+    def user_model(self) -> ModelPrediction:  # itself: an attribute would be a circle
         return self
 
     @property
