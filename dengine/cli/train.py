@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -12,9 +14,6 @@ from .options import DataChoice, RecipeChoice, short_name
 from .output import Asked, EndAskedError, end_interrupted, imported_line, interruptible, progress, show, write_json
 
 if TYPE_CHECKING:
-    from ..datasets import Dataset
-    from ..datasets.importing import ImportReport
-    from ..recipe import Recipe
     from ..records import RetrainReport
 
 WITHIN = "At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one."
@@ -35,84 +34,59 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    from ..datasets.importing import form_in
-    from ..experiments.tables import retrain_line
-
-    before = form_in(store, source.data)  # of what the store has, where no other form was asked for
-    dataset = replace(source, how=before | source.how).load(quiet=as_json)
-    recipe = choice.if_asked()
-    with interruptible() as asked:
-        imported = _import(dataset, store, recipe, seed, as_json, asked)
-        trained = _train(store, retrains, as_json, asked)
-    if as_json:
-        about = {"verb": "train", "store": store, "interrupted": trained.interrupted, "faults": dataset.faults}
-        write_json(about | {"import": imported, "retrains": trained.reports})
-    else:
-        last = trained.reports[-1].version
-        answers = f"Version {last} of {trained.reducer} answers. {retrain_line(trained.reports)}"
-        kind = "a used store" if imported.resumed else "a new store"
-        lines = (
-            answers if last else "No version answers yet: every part is verified.",
-            f"{store} holds {trained.labels} labels.",
-        )
-        show(imported_line(imported, f"{store}, {kind}"), *lines)
-    if trained.interrupted:
-        end_interrupted(f"Interrupted after {len(trained.reports)} of at most {retrains} retrains; they are in {store}.")
-    if not trained.reports[-1].accepted:
-        raise click.ClickException(f"The last retrain was {trained.reports[-1].reason}.")
-
-
-@dataclass(frozen=True)
-class Trained:
-    """What came of the retrains, and the labels that the store holds now."""
-
-    reports: list[RetrainReport]
-    reducer: str
-    labels: int
-    interrupted: bool
-
-
-def _import(
-    dataset: Dataset, store: str, recipe: Recipe | None, seed: int | None, quiet: bool, asked: Asked
-) -> ImportReport:
-    from ..datasets.importing import import_labelled
-
-    done = 0
-
-    def count(n: int) -> None:
-        nonlocal done
-        done += n
-        advance(n)
-        if asked() and done < len(dataset):
-            raise EndAskedError
-
-    try:
-        with progress(f"importing {dataset.name}", len(dataset), quiet) as advance:
-            return import_labelled(store, dataset, recipe, seed, count)
-    except EndAskedError:
-        end_interrupted(
-            f"Interrupted: {done} of {len(dataset)} traces are in {store}; the same command goes on from there."
-        )
-
-
-def _train(store: str, retrains: int, quiet: bool, asked: Asked) -> Trained:
-    from ..datasets.importing import train_until_done
+    from ..datasets.importing import form_in, import_labelled, train_until_done
     from ..engine.engine import DataEngine
+    from ..experiments.tables import retrain_line
     from ..store.base import UNHURRIED
 
+    before = form_in(store, source.data)  # of what the store has, where no other form was asked for
+    data = replace(source, how=before | source.how).load(quiet=as_json)
     reports: list[RetrainReport] = []
+    recipe, interrupted = choice.if_asked(), False
 
-    def count(report: RetrainReport) -> None:
+    def trained(report: RetrainReport) -> None:
         reports.append(report)
-        advance(1)
-        if asked() and len(reports) < retrains:
-            raise EndAskedError
+        count(1)
 
-    interrupted = False
-    with DataEngine.open(store, wait=UNHURRIED) as engine:
+    with interruptible() as asked:
         try:
-            with progress("training", retrains, quiet) as advance:
-                train_until_done(engine, retrains, count)
-        except EndAskedError:
-            interrupted = True
-        return Trained(reports, short_name(engine.recipe.name), engine.store.status()["labels"], interrupted)
+            with _steps(f"importing {data.name}", len(data), as_json, asked) as count:
+                imported = import_labelled(store, data, recipe, seed, count)
+        except EndAskedError as end:
+            there = f"{end.args[0]} of {len(data)} traces are in {store}"
+            end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
+        with DataEngine.open(store, wait=UNHURRIED) as engine:
+            try:
+                with _steps("training", retrains, as_json, asked) as count:
+                    train_until_done(engine, retrains, trained)
+            except EndAskedError:
+                interrupted = True
+            name, labels = short_name(engine.recipe.name), engine.store.status()["labels"]
+    if as_json:
+        about = {"verb": "train", "store": store, "interrupted": interrupted, "faults": data.faults}
+        write_json(about | {"import": imported, "retrains": reports})
+    else:
+        version, kind = reports[-1].version, "a used store" if imported.resumed else "a new store"
+        answers = f"Version {version} of {name} answers. {retrain_line(reports)}"
+        answers = answers if version else "No version answers yet: every part is verified."
+        show(imported_line(imported, f"{store}, {kind}"), answers, f"{store} holds {labels} labels.")
+    if interrupted:
+        end_interrupted(f"Interrupted after {len(reports)} of at most {retrains} retrains; they are in {store}.")
+    if not reports[-1].accepted:
+        raise click.ClickException(f"The last retrain was {reports[-1].reason}.")
+
+
+@contextmanager
+def _steps(title: str, total: int, quiet: bool, asked: Asked) -> Iterator[Callable[[int], None]]:
+    """A bar whose every step ends the work with EndAskedError(steps done) where Ctrl-C asked for it before the last."""
+    done = 0
+    with progress(title, total, quiet) as advance:
+
+        def count(n: int) -> None:
+            nonlocal done
+            done += n
+            advance(n)
+            if asked() and done < total:
+                raise EndAskedError(done)
+
+        yield count

@@ -9,7 +9,7 @@ A picture for people, not a test: one sample in twenty of an ordinary success li
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -48,9 +48,9 @@ class Envelope:
     """
 
     n: int
-    low: NDArray[np.float32]
-    median: NDArray[np.float32]
-    high: NDArray[np.float32]
+    low: NDArray[np.float32] = field(metadata={"apart": True})
+    median: NDArray[np.float32] = field(metadata={"apart": True})
+    high: NDArray[np.float32] = field(metadata={"apart": True})
     outside: float
     usual: float
     not_finite: int

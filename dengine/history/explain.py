@@ -3,18 +3,14 @@
     for sentence in explain("0123456789ab-412", Records(store)).said: ...
 
 What was recorded (counts, bound, action, reason) is shown as it is. Neighbours, the novelty score and the levels of a
-guarantee are found again, by the version that answered where the store keeps it, and `Explanation.notes` says by which.
-
-The version that answered a decision, as it stood then: references, novelty gate and rule, out of arrays alone.
-
-A store keeps the references of each version with their places, each trace's place with its decision, and each label
-with its time. So what was near a trace is found again without its reducer, whatever that was.
+guarantee are found again, without a reducer, by the version that answered where the store keeps it: `Explanation.notes`
+says by which. A store keeps each version's references, each trace's place, and the time of each label.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -181,7 +177,7 @@ class Neighbour:
     distance: float
     space: int
     inside: bool
-    trace: NDArray[np.float32] | None
+    trace: NDArray[np.float32] | None = field(metadata={"apart": True})
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +194,7 @@ class Explanation:
     """
 
     decision: StoredDecision
-    trace: NDArray[np.float32]
+    trace: NDArray[np.float32] = field(metadata={"apart": True})
     spec: TraceSpec
     said: tuple[str, ...]
     notes: tuple[str, ...]
@@ -211,17 +207,10 @@ class Explanation:
 
     def record(self) -> dict[str, Any]:
         """All but the arrays, as plain values for a machine."""
-        own = [f.name for f in fields(self) if f.name not in ("trace", "neighbours", "envelope")]
-        said = {name: plain(getattr(self, name)) for name in own}
-        said["neighbours"] = [_without(each, "trace") for each in self.neighbours]
-        band = self.envelope
-        if band is not None:
-            said["envelope"] = _without(band, "low", "median", "high") | {"largest": band.largest and asdict(band.largest)}
-        return {"envelope": None} | said
-
-
-def _without(thing: Any, *names: str) -> dict[str, Any]:
-    return {name: value for name, value in asdict(thing).items() if name not in names}
+        said: dict[str, Any] = plain(self)
+        if self.envelope is not None:
+            said["envelope"]["largest"] = plain(self.envelope.largest)
+        return said
 
 
 @dataclass(frozen=True)
@@ -245,67 +234,45 @@ def explain(decision_id: str, records: Records, neighbours: int = NEIGHBOURS) ->
     store, known = records.store, records.store.settings()
     if "recipe" not in known:
         raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
-    past, stored = store.past_decision(decision_id), store.get_decision(decision_id)
-    if past is None or stored is None:
-        raise unknown(decision_id, store.cell_id)
-    recipe, spec = Recipe.from_toml(known["recipe"]), trace_in(known) or _spec_of(stored)
-    answering = as_it_stood(store, past.decision.model_version, recipe, past) if past.decision.model_version else None
-    around = _around(past, stored, answering, records, recipe)
+    past = store.get_decision(decision_id)
+    if past is None:
+        raise ReportError(
+            f"Expected the id of a decision of cell {store.cell_id!r}, got {decision_id!r}, which its store does not hold; "
+            "`dengine history STORE` lists the ids, newest last."
+        )
+    made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
+    spec = trace_in(known) or TraceSpec(samples=trace.shape[1], channels=trace.shape[0])
+    answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
+    around = _around(past, answering, records, recipe)
+    mode = safe_mode_event(store, past.time)
+    (coin,) = toss(content_hash(trace[None]), audit_salt(int(known.get("seed", "0")))).tolist()
+    novelty = None
+    if answering is not None and answering.gate is not None and not past.quarantined:
+        with torch.inference_mode():
+            novelty = Novelty(*answering.gate.scores(torch.from_numpy(trace)).tolist())
     found = Circumstances(
         recipe=recipe,
         spec=spec,
         model=known.get("model"),
         rule=None if answering is None else answering.rule,
-        novelty=_novelty(answering, stored),
-        coin=_coin(stored, int(known.get("seed", "0"))),
-        safe_mode=_safe_mode(store, past),
+        novelty=novelty,
+        coin=coin / 2**COIN_BITS,
+        safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
     )
-    bound = bound_of(past, found)
+    bound = bound_of(made, found)
     return Explanation(
         decision=past,
-        trace=stored.trace,
+        trace=trace,
         spec=spec,
-        said=tuple(verdict(past, stored.trace, bound, found)),
+        said=tuple(verdict(past, bound, found)),
         notes=tuple(_notes(past, answering, around, bound)),
         bound=bound,
-        novelty=found.novelty,
+        novelty=novelty,
         neighbours=() if around is None else tuple(_nearest(store, around, neighbours)),
         neighbours_version=None if around is None else around.answering.version,
         radius=None if around is None else around.ball.radius,
-        envelope=_envelope(store, past, stored, answering, spec),
+        envelope=_envelope(store, past, answering, spec),
     )
-
-
-def unknown(decision_id: str, cell_id: str) -> ReportError:
-    """What is said of an id that the store does not hold."""
-    return ReportError(
-        f"Expected the id of a decision of cell {cell_id!r}, got {decision_id!r}, which its store does not hold; "
-        "`dengine history STORE` lists the ids, newest last."
-    )
-
-
-def _spec_of(stored: StoredDecision) -> TraceSpec:
-    return TraceSpec(samples=stored.trace.shape[1], channels=stored.trace.shape[0])
-
-
-def _novelty(answering: Answering | None, stored: StoredDecision) -> Novelty | None:
-    if answering is None or answering.gate is None or stored.quarantined:
-        return None
-    with torch.inference_mode():
-        level, texture = answering.gate.scores(torch.from_numpy(stored.trace)).tolist()
-    return Novelty(level, texture)
-
-
-def _coin(stored: StoredDecision, seed: int) -> float:
-    """Where the audits' coin fell for a trace, in [0, 1)."""
-    (fell,) = toss(content_hash(stored.trace[None]), audit_salt(seed)).tolist()
-    return float(fell) / float(2**COIN_BITS)
-
-
-def _safe_mode(store: Store, past: StoredDecision) -> str:
-    """Why everything was verified when a decision was made; "" where it was not."""
-    mode = safe_mode_event(store, past.time)
-    return mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else ""
 
 
 @dataclass(frozen=True)
@@ -317,32 +284,26 @@ class _Around:
     own: bool
 
 
-def _around(
-    past: StoredDecision, stored: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe
-) -> _Around | None:
-    if stored.quarantined or past.decision.reason is Reason.MODEL_ERROR:
+def _around(past: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe) -> _Around | None:
+    if past.quarantined or past.decision.reason is Reason.MODEL_ERROR:
         return None
-    if answering is not None and stored.decision.embedding is not None:
-        return _Around(answering, _ball(answering, stored.decision.embedding, past, recipe), own=True)
+    if answering is not None and past.decision.embedding is not None:
+        return _Around(answering, _ball(answering, past.decision.embedding, past, recipe), own=True)
     model = records.present()
-    now = None if model is None else as_it_stood(records.store, records.version, recipe, None)
-    embedding = None if model is None or now is None else _embedding(model, stored)
-    if now is None or embedding is None:
+    if model is None or model.untold or (now := as_it_stood(records.store, records.version, recipe, None)) is None:
         return None
-    return _Around(now, _ball(now, embedding, past, recipe), own=False)
-
-
-def _embedding(model: EngineModel, stored: StoredDecision) -> Embedding | None:
-    return None if model.untold else model.predict_one(stored.trace, stored.content_hash).embedding
+    embedding = model.predict_one(past.trace, past.content_hash).embedding
+    return None if embedding is None else _Around(now, _ball(now, embedding, past, recipe), own=False)
 
 
 def _ball(answering: Answering, z: Embedding, past: StoredDecision, recipe: Recipe) -> Ball:
     """The ball that decided: the wide one, or the narrow one that rejections may be judged by."""
+    made = past.decision
     wide = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.fraction or 0.0)
-    if past.decision.predicted is not Action.REJECT or not recipe.reject_fraction:
+    if made.predicted is not Action.REJECT or not recipe.reject_fraction:
         return wide
     narrow = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.reject_fraction)
-    return narrow if (narrow.n_success, narrow.n_failure) == (past.decision.n_success, past.decision.n_failure) else wide
+    return narrow if (narrow.n_success, narrow.n_failure) == (made.n_success, made.n_failure) else wide
 
 
 def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
@@ -353,7 +314,7 @@ def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
             break
         label = behind[slot]
         stored = None if label is None else store.get_decision(label.decision_id)
-        neighbour = Neighbour(
+        one = Neighbour(
             decision_id=None if label is None else label.decision_id,
             part=None if stored is None else stored.decision.part,
             success=bool(index.labels[slot]),
@@ -363,20 +324,16 @@ def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
             inside=bool(ball.distances[slot] <= ball.radius),
             trace=None if stored is None else stored.trace,
         )
-        found.append(neighbour)
+        found.append(one)
     return found
 
 
-def _envelope(
-    store: Store, past: StoredDecision, stored: StoredDecision, answering: Answering | None, spec: TraceSpec
-) -> Envelope | None:
+def _envelope(store: Store, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
     """The band of the successes that were known then; where those were too few, of those known now."""
-    known_then = None if answering is None else answering.last_seq
-    for upto in (known_then, None):
+    for upto in (None if answering is None else answering.last_seq, None):
         labelled = store.labelled(SUCCESSES) if upto is None else store.labelled_upto(upto, SUCCESSES)
         others = (labelled.labels == 1) & (labelled.hashes != past.content_hash)
-        band = envelope_of(labelled.traces[others], stored.trace, spec.rate_hz)
-        if band is not None:
+        if (band := envelope_of(labelled.traces[others], past.trace, spec.rate_hz)) is not None:
             return band
     return None
 

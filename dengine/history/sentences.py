@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from ..decision.policy import RULES, Policy
 from ..decision.rule import NOBODY, DecisionRule
 from ..recipe import Recipe
-from ..records import Action, Reason, TraceSpec
+from ..records import Action, Decision, Reason, TraceSpec
 from ..store.records import StoredDecision
 
 MOST = 20_000  # more labels in a ball than that are not thought of
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
-KINDS = {"accept": ("success", "successes", "failure"), "reject": ("failure", "failures", "success")}
 DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
 
 
@@ -79,10 +78,9 @@ class Circumstances:
     safe_mode: str = ""
 
 
-def bound_of(past: StoredDecision, found: Circumstances) -> Bound | None:
+def bound_of(made: Decision, found: Circumstances) -> Bound | None:
     """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
-    made = past.decision
-    if made.reason not in BOUNDED or _was_lost(past):
+    if made.reason not in BOUNDED or _was_lost(made):
         return None
     policy = found.recipe.policy
     accept_at, reject_at, level = _thresholds(found)
@@ -94,23 +92,19 @@ def bound_of(past: StoredDecision, found: Circumstances) -> Bound | None:
         n_failure=made.n_failure,
         lower=made.lower,
         upper=made.upper,
-        ball=_ball(past, found),
+        ball=_ball(made, found),
         accept_at=accept_at,
         reject_at=reject_at,
         level=level,
-        successes_needed=None if accept_at is None else _needed(policy, past, accept_at, 1),
-        failures_needed=None if reject_at is None else _needed(policy, past, reject_at, 0),
+        successes_needed=None if accept_at is None else _needed(policy, made, accept_at, 1),
+        failures_needed=None if reject_at is None else _needed(policy, made, reject_at, 0),
         repeats=found.model is not None or bool(np.allclose((lower, upper), (made.lower, made.upper), atol=1e-6)),
     )
 
 
-def _was_lost(past: StoredDecision) -> bool:
+def _was_lost(made: Decision) -> bool:
     """Whether the row was made from a stop whose decision was lost: an accept on no evidence."""
-    return (
-        past.decision.reason is Reason.CERTAIN
-        and past.decision.action is Action.ACCEPT
-        and (past.decision.lower, past.decision.upper) == (0.0, 1.0)
-    )
+    return (made.reason, made.action, made.lower, made.upper) == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
 
 
 def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
@@ -125,48 +119,47 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
         return None, None, "the levels that held then are not kept"
     accept_at, reject_at = (float(level) for level in rule.evidence.open)
     held = "the lowest level that held then" if policy.guarantee == "pooled" else "what held in safe mode"
-    return (
-        accept_at if accept_at < NOBODY else None,
-        1.0 - reject_at if reject_at < NOBODY else None,
-        held,
-    )
+    return accept_at if accept_at < NOBODY else None, 1.0 - reject_at if reject_at < NOBODY else None, held
 
 
-def _ball(past: StoredDecision, found: Circumstances) -> str:
+def _ball(made: Decision, found: Circumstances) -> str:
     recipe = found.recipe
     if found.model is not None and found.rule is None:
         return "as the model counts them"
     if recipe.fraction is None:
         return f"within the radius {recipe.radius:g}"
-    narrow = recipe.reject_fraction if past.decision.predicted is Action.REJECT else None
+    narrow = recipe.reject_fraction if made.predicted is Action.REJECT else None
     return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
 
 
-def _needed(policy: Policy, past: StoredDecision, threshold: float, success: int) -> int | None:
+def _needed(policy: Policy, made: Decision, threshold: float, success: int) -> int | None:
     more = np.arange(MOST + 1)
-    lower, upper = policy.bound(past.decision.n_success + success * more, past.decision.n_failure + (1 - success) * more)
+    lower, upper = policy.bound(made.n_success + success * more, made.n_failure + (1 - success) * more)
     enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
     return int(enough[0]) if len(enough) else None
 
 
-def verdict(past: StoredDecision, trace: NDArray[np.float32], bound: Bound | None, found: Circumstances) -> Iterator[str]:
-    """The sentences: what was done and why, then how the bound came out."""
-    yield _why(past, trace, found)
+def verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) -> Iterator[str]:
+    """The sentences: what was done and why, how the bound came out, and what became of the part."""
+    made = past.decision
+    yield _why(made, past.trace, found)
     if bound is not None:
-        yield from _bound_sentences(past, bound, found)
-    if found.novelty is not None and past.decision.reason is not Reason.NOVEL:
+        yield from _bound_sentences(made, bound, found)
+    if found.novelty is not None and made.reason is not Reason.NOVEL:
         yield f"It is not novel: {_scores(found.novelty)}."
-    yield _outcome(past)
+    source = "" if past.source is None else f" ({past.source.value})"
+    known = past.success is not None
+    yield f"The part turned out {past.label}{source}." if known else "Nothing was reported of the part."
 
 
-def _why(past: StoredDecision, trace: NDArray[np.float32], found: Circumstances) -> str:
-    did = DID[past.decision.action].capitalize()
-    if _was_lost(past):
+def _why(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    did = DID[made.action].capitalize()
+    if _was_lost(made):
         return f"{did}: the row was made from a stop whose decision was lost; on what evidence is not known."
     said = {
-        "would": DID[past.decision.predicted],
+        "would": DID[made.predicted],
         "coin": found.coin,
-        "rate": past.decision.propensity,
+        "rate": made.propensity,
         "n": int((~np.isfinite(trace)).sum()),
         "size": trace.size,
         "first": float(trace.flat[0]),
@@ -175,7 +168,7 @@ def _why(past: StoredDecision, trace: NDArray[np.float32], found: Circumstances)
         "score": "" if found.novelty is None else f": {_scores(found.novelty)}",
         "mode": found.safe_mode or "its reason is not kept",
     }
-    return did + WHY[past.decision.reason].format(**said)
+    return did + WHY[made.reason].format(**said)
 
 
 WHY = {
@@ -213,49 +206,35 @@ def _saturation(trace: NDArray[np.float32], spec: TraceSpec) -> str:
 
 
 def _scores(novelty: Novelty) -> str:
-    both = (("level", novelty.level), ("texture", novelty.texture))
-    return ", ".join(f"in {name} {value:.2f} times the limit" for name, value in both)
+    return f"in level {novelty.level:.2f} times the limit, in texture {novelty.texture:.2f} times the limit"
 
 
-def _bound_sentences(past: StoredDecision, bound: Bound, found: Circumstances) -> Iterator[str]:
-    n = bound.n_success + bound.n_failure
+def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iterator[str]:
+    n, reach = bound.n_success + bound.n_failure, f"{bound.lower:.3f} to {bound.upper:.3f}"
     if found.model is not None and found.rule is None:
-        yield f"{found.model} gives {bound.n_success} successes, {bound.n_failure} failures, bound {_range(bound)}."
+        yield f"{found.model} gives {bound.n_success} successes, {bound.n_failure} failures, bound {reach}."
         return
     counted = f"{bound.n_success} of {n} labels {bound.ball} are successes" if n else f"No label {bound.ball}"
     name = bound.interval.replace("_", "-").capitalize()
-    yield f"{counted}; {name} at alpha {bound.alpha:g} bounds the success rate by {_range(bound)}."
+    yield f"{counted}; {name} at alpha {bound.alpha:g} bounds the success rate by {reach}."
     if bound.accept_at is None and bound.reject_at is None:
-        yield f"Nothing could pass, whatever the bound: {_no_level(bound, found)}."
+        why = found.safe_mode or (bound.level if found.rule is None else "no level of evidence held yet")
+        yield f"Nothing could pass, whatever the bound: {why}."
         return
-    if past.decision.predicted is not Action.REJECT:
-        yield _side("accept", "lower", bound.lower, "at least", bound.accept_at, bound.successes_needed, bound.level)
-    if past.decision.predicted is not Action.ACCEPT:
-        yield _side("reject", "upper", bound.upper, "at most", bound.reject_at, bound.failures_needed, bound.level)
+    if made.predicted is not Action.REJECT:
+        yield _side("accept", f"lower must be at least {{:.4g}} ({bound.level}); it is {bound.lower:.3f}", bound)
+    if made.predicted is not Action.ACCEPT:
+        yield _side("reject", f"upper must be at most {{:.4g}} ({bound.level}); it is {bound.upper:.3f}", bound)
 
 
-def _no_level(bound: Bound, found: Circumstances) -> str:
-    return found.safe_mode or (bound.level if found.rule is None else "no level of evidence held yet")
-
-
-def _side(action: str, end: str, value: float, than: str, threshold: float | None, needed: int | None, level: str) -> str:
+def _side(action: str, must: str, bound: Bound) -> str:
+    """What one action would have needed."""
+    ways = {
+        "accept": (bound.accept_at, bound.successes_needed, "success", "successes", "failure"),
+        "reject": (bound.reject_at, bound.failures_needed, "failure", "failures", "success"),
+    }
+    threshold, needed, one, many, other = ways[action]
     if threshold is None:
         return f"To {action}: no level held, so nothing could be {action}ed."
-    one, many, other = KINDS[action]
-    lead = f"To {action}, {end} must be {than} {threshold:.4g} ({level}); it is {value:.3f}"
-    if needed == 0:
-        return f"{lead}, enough."
-    if needed is None:
-        return f"{lead}: no number of labels would do."
-    return f"{lead}: {needed} more {one if needed == 1 else many} and no {other} would do."
-
-
-def _range(bound: Bound) -> str:
-    return f"{bound.lower:.3f} to {bound.upper:.3f}"
-
-
-def _outcome(past: StoredDecision) -> str:
-    if past.success is None:
-        return "Nothing was reported of the part."
-    source = "" if past.source is None else f" ({past.source.value})"
-    return f"The part turned out {'good' if past.success else 'bad'}{source}."
+    more = "no number of labels" if needed is None else f"{needed} more {one if needed == 1 else many} and no {other}"
+    return f"To {action}, {must.format(threshold)}" + (", enough." if needed == 0 else f": {more} would do.")

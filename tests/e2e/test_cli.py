@@ -217,30 +217,15 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained
         assert engine.decide(file["X"][0]).predicted != "verify"
 
 
-def test_bad_traces_are_kept_and_never_trained_on() -> None:
+def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_their_own() -> None:
     X, y = easy(160, 0)
-    X[0, 3], X[1] = np.nan, 7.0
+    X[0, 3], X[1], X[2:8] = np.nan, 7.0, X[2]
     store = MemoryStore()
-    report = import_labelled(store, (X, y), "pca")
-    assert (report.imported, report.quarantined) == (158, 2)
-    assert len(store.labelled().labels) == 158
-    assert store.status()["reasons"] == store.status()["reasons"] | {"not_finite": 1, "constant": 1}
-
-
-def test_equal_traces_in_one_file_are_events_of_their_own() -> None:
-    X, y = np.tile(np.linspace(0, 1, 20), (6, 1)), np.array([1, 1, 0, 1, 1, 1])
-    store = MemoryStore()
-    assert import_labelled(store, (X, y), "pca").imported == 6
-    assert import_labelled(store, (X, y)).known == 6
-
-
-def test_an_interrupted_import_goes_on_where_it_stopped() -> None:
-    X, y = easy(160, 0)
-    store = MemoryStore()
-    import_labelled(store, (X[:70], y[:70]), "pca")
+    first = import_labelled(store, (X[:70], y[:70]), "pca")
     report = import_labelled(store, (X, y))
-    assert (report.imported, report.known) == (90, 70)
-    np.testing.assert_array_equal(store.labelled().labels, y)
+    assert (first.imported, first.quarantined, report.imported, report.known) == (68, 2, 90, 70)
+    np.testing.assert_array_equal(store.labelled().labels, y[2:])  # bad ones are kept, and never trained on
+    assert store.status()["reasons"] == store.status()["reasons"] | {"not_finite": 1, "constant": 1}
 
 
 @pytest.mark.parametrize(

@@ -109,20 +109,6 @@ def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Da
     assert "- and 3 more" in said
 
 
-def test_train_counts_a_folder_once_after_files_were_added(folder: Path, tmp_path: Path) -> None:
-    names, some = sorted(folder.iterdir(), key=lambda path: path.stat().st_size), tmp_path / "some"
-    some.mkdir()
-    words, found = ("train", "--data", some, "--store", tmp_path / "a.db"), []
-    for files, asked in ((names[50:], ("--reducer", "pca")), (names[:50], ())):  # when the others come, the median falls
-        for path in files:
-            (some / path.name).write_bytes(path.read_bytes())
-        found.append(document(*words, *asked)["import"])
-    assert (found[0]["imported"], found[1]["known"], found[1]["imported"]) == (30, 30, 47)
-    wrong = dengine(*words, "--samples", 900)
-    assert wrong.exit_code == 1
-    assert "samples=" in wrong.output
-
-
 # ------------------------------------------------------------------------------------------------------- the survey
 
 
