@@ -134,27 +134,18 @@ def _buffers(stored: ModelVersion, prefix: str) -> dict[str, torch.Tensor]:
 
 @dataclass(frozen=True)
 class Ball:
-    """What lies around a trace.
+    """What lies around a trace, in the space of a version: `own` if that is the one that answered.
 
     distances : (n,) to each reference, in the order of `index.points`; infinite to those of its own part.
     radius : of the ball.  n_success, n_failure : its votes.
     """
 
+    answering: Answering
+    own: bool
     distances: NDArray[np.float64]
     radius: float
     n_success: int
     n_failure: int
-
-
-def ball_around(index: RadiusIndex, z: Embedding, part: int, radius: float, fraction: float) -> Ball:
-    """What lies around a trace (K, d) of a part with this hash; radius, fraction : as the rule is asked, 0 for None."""
-    ring = index.ring
-    squared = ring.squared_distances(torch.tensor(z, dtype=torch.float32), part)
-    n_success, n_failure = ring.count_near(squared, radius, fraction)
-    distances = np.sqrt(squared.double().numpy())
-    if fraction > 0.0 and len(distances):
-        radius = float(np.sort(distances)[min(len(distances), math_ceil(fraction * len(distances))) - 1])
-    return Ball(distances, radius, n_success, n_failure)
 
 
 NEIGHBOURS = 10  # nearest references that are shown
@@ -270,45 +261,45 @@ def explain(decision_id: str, records: Records, neighbours: int = NEIGHBOURS) ->
         novelty=novelty,
         neighbours=() if around is None else tuple(_nearest(store, around, neighbours)),
         neighbours_version=None if around is None else around.answering.version,
-        radius=None if around is None else around.ball.radius,
+        radius=None if around is None else around.radius,
         envelope=_envelope(store, past, answering, spec),
     )
 
 
-@dataclass(frozen=True)
-class _Around:
-    """The ball around a trace, in the space of a version: `own` if that is the one that answered."""
-
-    answering: Answering
-    ball: Ball
-    own: bool
-
-
-def _around(past: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe) -> _Around | None:
+def _around(past: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe) -> Ball | None:
+    """The ball that decided, or the one of the version that answers now; None where nothing embeds the trace."""
+    z, own = past.decision.embedding, True
     if past.quarantined or past.decision.reason is Reason.MODEL_ERROR:
         return None
-    if answering is not None and past.decision.embedding is not None:
-        return _Around(answering, _ball(answering, past.decision.embedding, past, recipe), own=True)
-    model = records.present()
-    if model is None or model.untold or (now := as_it_stood(records.store, records.version, recipe, None)) is None:
-        return None
-    embedding = model.predict_one(past.trace, past.content_hash).embedding
-    return None if embedding is None else _Around(now, _ball(now, embedding, past, recipe), own=False)
+    if answering is None or z is None:
+        model, own = records.present(), False
+        answering = None if model is None else as_it_stood(records.store, records.version, recipe, None)
+        if model is None or model.untold or answering is None:
+            return None
+        z = model.predict_one(past.trace, past.content_hash).embedding
+        if z is None:
+            return None
+    made, fractions = past.decision, [recipe.fraction or 0.0]
+    if made.predicted is Action.REJECT and recipe.reject_fraction:
+        fractions.insert(0, recipe.reject_fraction)  # rejections may be judged by a narrow ball
+    balls = [_ball(answering, own, z, past.content_hash, recipe.radius, fraction) for fraction in fractions]
+    recorded = (made.n_success, made.n_failure)
+    return next((ball for ball in balls if (ball.n_success, ball.n_failure) == recorded), balls[-1])
 
 
-def _ball(answering: Answering, z: Embedding, past: StoredDecision, recipe: Recipe) -> Ball:
-    """The ball that decided: the wide one, or the narrow one that rejections may be judged by."""
-    made = past.decision
-    wide = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.fraction or 0.0)
-    if made.predicted is not Action.REJECT or not recipe.reject_fraction:
-        return wide
-    narrow = ball_around(answering.index, z, past.content_hash, recipe.radius, recipe.reject_fraction)
-    return narrow if (narrow.n_success, narrow.n_failure) == (made.n_success, made.n_failure) else wide
+def _ball(answering: Answering, own: bool, z: Embedding, part: int, radius: float, fraction: float) -> Ball:
+    """What lies around a trace (K, d) of a part with this hash; radius, fraction : as the rule is asked, 0 for None."""
+    ring = answering.index.ring
+    squared = ring.squared_distances(torch.tensor(z, dtype=torch.float32), part)
+    n_success, n_failure = ring.count_near(squared, radius, fraction)
+    distances = np.sqrt(squared.double().numpy())
+    if fraction > 0.0 and len(distances):
+        radius = float(np.sort(distances)[min(len(distances), math_ceil(fraction * len(distances))) - 1])
+    return Ball(answering, own, distances, radius, n_success, n_failure)
 
 
-def _nearest(store: Store, around: _Around, most: int) -> list[Neighbour]:
-    index, ball = around.answering.index, around.ball
-    behind, found = around.answering.labels_of_references(), []
+def _nearest(store: Store, ball: Ball, most: int) -> list[Neighbour]:
+    index, behind, found = ball.answering.index, ball.answering.labels_of_references(), []
     for slot in np.argsort(ball.distances, kind="stable")[:most]:
         if not np.isfinite(ball.distances[slot]):
             break
@@ -338,15 +329,14 @@ def _envelope(store: Store, past: StoredDecision, answering: Answering | None, s
     return None
 
 
-def _notes(past: StoredDecision, answering: Answering | None, around: _Around | None, bound: Bound | None) -> list[str]:
+def _notes(past: StoredDecision, answering: Answering | None, around: Ball | None, bound: Bound | None) -> list[str]:
     version, found = past.decision.model_version, []
     if past.quarantined:
         found.append("The trace is quarantined: it was not embedded, is never trained on, and has no neighbours.")
     elif around is None:
         found.append("Nothing that embeds this trace is kept, so no neighbours are shown.")
     elif around.own:
-        ball, recorded = around.ball, (past.decision.n_success, past.decision.n_failure)
-        again = (ball.n_success, ball.n_failure)
+        recorded, again = (past.decision.n_success, past.decision.n_failure), (around.n_success, around.n_failure)
         found.append(f"Neighbours: the references of version {version}, which answered, as they stood then.")
         if past.decision.reason is not Reason.NOVEL and again != recorded:
             found.append(

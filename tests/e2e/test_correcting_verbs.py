@@ -63,7 +63,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
     assert (failed.exit_code, len(labels(store))) == (1, 60)
     assert "'nobody'" in failed.stderr
     line = said("forget", store, names[0], names[1], "--reason", "wrong part")
-    assert line.startswith(f"The labels of {names[0]}, {names[1]} are forgotten. Event 1,")
+    assert line.startswith(f"The labels of {names[0]}, {names[1]} are forgotten: wrong part. Event 1,")
     assert sorted(labels(store)) == list(range(3, 61))
     assert "0 labels corrected, 2 more forgotten" in said("status", store)
     with DataEngine.open(store) as engine:
