@@ -40,7 +40,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     from ..store.base import UNHURRIED
 
     before = form_in(store, source.data)  # of what the store has, where no other form was asked for
-    data = replace(source, how=before | source.how).load(quiet=as_json)
+    data = replace(source, how={**before, **source.how}).load(quiet=as_json)
     reports: list[RetrainReport] = []
     recipe, interrupted = choice.if_asked(), False
 
