@@ -64,7 +64,7 @@ def _from_arrays(found: Mapping[str, Any], have: Sequence[str], path: Path, name
         X = X.astype(np.float32) * found["scale"].astype(np.float32)
     rate, unit = float(found.get("rate_hz", 500.0)), str(found.get("unit", "N"))
     channels = tuple(map(str, np.atleast_1d(found["channels"]))) if "channels" in found else ()
-    beside = {"part": found.get(asked.part), "cause": found.get("cause"), "channels": channels}
+    beside: dict[str, Any] = {"part": found.get(asked.part), "cause": found.get("cause"), "channels": channels}
     return refit(make_dataset(X, _labels(found["y"]), name=name, rate_hz=rate, unit=unit, **beside), asked)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     rate = asked.rate_hz or (float(np.nanmedian(rates)) if timed else 500.0)
     # A recording without a part's number is of a part of its own.
     parts = [each.source if each.part is None else each.part for each in found.read]
-    about = {
+    about: dict[str, Any] = {
         "part": np.array(parts) if any(each.part is not None for each in found.read) else None,
         "faults": tuple(found.faults),
         "channels": found.channels,

@@ -116,7 +116,7 @@ def _read_store(path: Path, asked: Asked) -> Dataset:
         store.close()
     if spec is None or not len(held.labels):
         raise DataError(f"Expected a store with labelled traces, {path} has none; record some first, as in shadow mode.")
-    about = {"rate_hz": spec.rate_hz, "unit": spec.unit, "channels": tuple(spec.columns), "fit": spec.fit}
+    about: dict[str, Any] = {"rate_hz": spec.rate_hz, "unit": spec.unit, "channels": tuple(spec.columns), "fit": spec.fit}
     X = held.traces[:, 0] if spec.channels == 1 else held.traces
     again = len(np.unique(held.hashes)) < len(held.hashes)
     part = held.hashes.astype(np.str_) if again else None  # as they count: a part that came again has one vote

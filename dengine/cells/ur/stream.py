@@ -223,13 +223,13 @@ class RtdeStream:
     def open(self) -> RtdeStream:
         for left in reversed(range(int(RELEASE_S / RETRY_S[0]) + 1)):
             try:
-                self._client = self._connect()
+                client = self._connect()
                 break
             except HeldError:  # an owner that has just gone is given time to be noticed as gone
                 if not left:
                     raise
                 self._closing.wait(RETRY_S[0])
-        self.columns = self._client.outputs.columns
+        self._client, self.columns = client, client.outputs.columns
         self._thread.start()
         return self
 
