@@ -198,6 +198,7 @@ def collect(read: Iterable[tuple[str, NDArray[np.float32] | None, float | None]]
             f"Expected a label for each recording, {unlabelled} of {total} have none, {found.faults[-1].source} for one; "
             f"{labels.advice()}."
         )
-    for line, file, *_ in labels.rows if isinstance(labels, Listed) else ():
-        if line not in labels.used:
-            found.faults.append(Fault(labels.source, line, f"Expected the name of a recording, found no file {file}"))
+    if isinstance(labels, Listed):
+        lost = [(line, file) for line, file, *_ in labels.rows if line not in labels.used]
+        said = "Expected the name of a recording, found no file"
+        found.faults.extend(Fault(labels.source, line, f"{said} {file}") for line, file in lost)
