@@ -238,7 +238,7 @@ LINE = (
     "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
     "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at."
 )
-IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float}
+IN_LINE: Json = {"waiting": int, "late": int, "busy": int, "deadline": float}
 TRACE = {"trace": list[list[float | None]]}
 ANSWERS: dict[str, type[Struct]] = {
     "Answer": _answer("Answer", f"A decision, as it is recorded.\n{LATE}", Decision, late=bool, seconds=float),
@@ -248,7 +248,8 @@ ANSWERS: dict[str, type[Struct]] = {
     "Health": Health,
     "Problem": Problem,
 }
-ANSWERS["Decisions"] = _answer("Decisions", "Newest first.", decisions=list[ANSWERS["Decision"]])  # type: ignore[misc]  # made above
+Known = ANSWERS["Decision"]
+ANSWERS["Decisions"] = _answer("Decisions", "Newest first.", decisions=list[Known])  # type: ignore[valid-type]  # made above
 
 
 def answer(name: str, *records: object, **more: Any) -> Struct:

@@ -103,8 +103,7 @@ class Connection(asyncio.Protocol):
         """The client sends no more: what it asked is answered, half a head is refused."""
         self._ended = True
         if self._begun and not self.asked:  # a head that is whole is told of by then, or within this turn of the loop
-            half = HTTPStatus.BAD_REQUEST, "Expected the whole of the request."
-            asyncio.get_running_loop().call_soon(lambda: self.asked or self._end(*half))
+            asyncio.get_running_loop().call_soon(self._refuse_half)
         return self._begun or self.asked
 
     def write(self, data: bytes) -> None:
@@ -124,6 +123,10 @@ class Connection(asyncio.Protocol):
         self.asked = False
         if self._ended:
             self._transport.close()
+
+    def _refuse_half(self) -> None:
+        if not self.asked:
+            self._end(HTTPStatus.BAD_REQUEST, "Expected the whole of the request.")
 
     def _end(self, status: HTTPStatus, detail: str) -> None:
         """Answer outside of HTTP's course, and close."""

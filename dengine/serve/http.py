@@ -80,9 +80,7 @@ class HttpApi:
         ]
 
     async def decide(self, request: Request) -> Response:
-        """Decide on a trace. With a request id, whoever died before the answer asks again and has the same. The query is of
-        a raw body; JSON and MessagePack hold it all.
-        """
+        """Decide on a trace; asked again under its request id, it answers the same. The query is of a raw body alone."""
         given = await self.service.decide(*await read_trace(request))
         return answered(answer("Answer", given.decision, given))
 
@@ -106,9 +104,7 @@ class HttpApi:
         return answered(answer("Decision", known.decision, known, trace=known.trace if shown.trace else UNSET))
 
     async def decisions(self, request: Request) -> Response:
-        """The newest decisions, newest first; with open=true those that wait for a label: what a controller that died goes
-        on with.
-        """
+        """The newest decisions, newest first; with open=true those that wait for a label."""
         asked = read_query(request, ListQuery)
         found = await self.service.look(lambda store: _newest(store, asked.limit, asked.open))
         return answered({"decisions": [answer("Decision", each.decision, each, trace=UNSET) for each in found]})
@@ -119,10 +115,7 @@ class HttpApi:
         return Response(body, media_type=kind)
 
     async def healthz(self, request: Request) -> Response:
-        """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503).
-
-        It asks for no token.
-        """
+        """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503). It asks for no token."""
         engine, alive = self.service.engine, self.service.silent < HUNG
         state = "down" if not alive else "degraded" if engine.store_fault else "ok"
         return answered(Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)

@@ -127,9 +127,7 @@ class RobotCalls:
         request : as `begin` gave it; left out, the newest one's.
         """
         if self._recorder is None:
-            raise SettingError(
-                "Expected a recorder, this server was started without one; send the trace, or start it with one."
-            )
+            raise SettingError("Expected a recorder, got none; start the server with --robot, or send the trace.")
         async with self._recording:
             id_ = self._armed if request == "" else as_id(request)
             if id_ is not None and (known := await self._known(id_)) is not None:
@@ -156,9 +154,7 @@ class RobotCalls:
         return _answered(answer.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
-        """What became of a part, True for good. Returns whether it is kept: it is not where nothing under this id was
-        recorded, where the server is busy, or where its store is away.
-        """
+        """What became of a part, True for good. False: nothing was recorded under this id, or it cannot be kept now."""
         if decision_id == "":  # as `decide_recorded` gave it
             return False
         try:
@@ -173,19 +169,17 @@ class RobotCalls:
     async def status(self) -> Answered:
         """How the cell is doing, in a dozen plain numbers and texts; no decision waits for it.
 
-        decisions, accepted, rejected : since its birth.  bad : accepted parts that are known to have been bad.
-        verified_share : of the newest decisions; 1 where there is none.  version : of the model, 0: none.
-        safe_mode : why everything is verified, or "".  shadow : everything is verified, the model is only asked.
-        waiting : requests in line.  late, busy : deadlines exceeded, requests refused.  alarm : what to look at, or "".
+        verified_share : of the newest decisions; 1 where there is none.  late, busy : deadlines exceeded, requests refused.
+        bad : accepted parts that are known to have been bad.  safe_mode, alarm : why, or "".  waiting : requests in line.
         """
         service, found = self._service, await self._service.status()
-        share = found.newest.verified_share
+        share, ever = found.newest.verified_share, found.ever
         return {
-            "decisions": found.ever.decisions,
+            "decisions": ever.decisions,
             "verified_share": 1.0 if share is None else share,
-            "accepted": found.ever.accepted,
-            "rejected": found.ever.rejected,
-            "bad": found.ever.stops,
+            "accepted": ever.accepted,
+            "rejected": ever.rejected,
+            "bad": ever.stops,
             **{name: getattr(found, name) for name in ("version", "safe_mode", "shadow", "alarm")},
             **{name: getattr(service, name) for name in ("waiting", "late", "busy")},
         }

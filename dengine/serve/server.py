@@ -133,9 +133,9 @@ def serve(
             if serving.opcua is not None:
                 from .opcua import opcua_server
 
-                files = {"cert": serving.opcua_cert or serving.cert, "key": serving.opcua_key or serving.key}
-                how = {"port": serving.opcua, "host": serving.host, "token": access.token or None}
-                beside.append(partial(opcua_server, **how, **files))
+                cert, key = serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
+                how = partial(opcua_server, port=serving.opcua, host=serving.host, token=access.token or None)
+                beside.append(partial(how, cert=cert, key=key))
             app = create_app(service, access, serving.interfaces, beside, recorder)
             config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
             port = listening.getsockname()[1]
@@ -195,9 +195,7 @@ class CellServer(uvicorn.Server):
 
 @contextmanager
 def quick_switches() -> Iterator[None]:
-    """Have the engine's thread and the one that answers give each other Python's lock without delay, and Python's collector
-    leave alone what is there now, the imported libraries: to look at all of it takes long.
-    """
+    """Have threads give each other Python's lock without delay, and Python's collector leave alone what is there now."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH)
     gc.collect()

@@ -2,11 +2,8 @@
 
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     answer = await service.decide(trace, "order-7")
-    told = await service.report(answer.decision.id, True)
-    service.close()
 
-HTTP, XML-RPC, OPC UA and the page turn their words into these calls. What only reads does so by a second connection to the
-store (`read`, `look`), so that no decision waits for it.
+What only reads does so by a second connection to the store (`read`, `look`), so that no decision waits for it.
 """
 
 from __future__ import annotations
@@ -61,10 +58,7 @@ class Job(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What is answered to a trace.
-
-    decision : as it is recorded.  seconds : from the request to the answer.
-    """
+    """What is answered to a trace.  decision : as it is recorded.  seconds : from the request to the answer."""
 
     decision: Decision
     seconds: float
@@ -77,10 +71,9 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What became of a report.
+    """What became of a report.  seconds : from the request to the answer.
 
     repeated : the same label was reported before, and nothing changed.  retrain : what it set off in line, if anything.
-    seconds : from the request to the answer.
     """
 
     decision_id: str

@@ -33,26 +33,20 @@ def there_and_back(what: Any) -> Any:
     return got[0]
 
 
-def test_tensors_arrive_as_they_are_and_share_what_they_shared() -> None:
+def test_arrays_and_tensors_arrive_as_they_are_writable_and_share_what_they_shared() -> None:
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], x > 7.0, torch.empty(0), torch.tensor(1.5, dtype=torch.float64), torch.nn.Linear(3, 4)
     whole, part, mask, nothing, number, layer = there_and_back(sent)
     for got, was in zip((whole, part, mask, nothing, number, layer.weight), (*sent[:5], sent[5].weight), strict=True):
-        assert got.dtype == was.dtype
-        assert got.stride() == was.stride()
+        assert (got.dtype, got.stride()) == (was.dtype, was.stride())
         assert torch.equal(got, was)
     assert layer.weight.requires_grad
     whole.zero_()
     assert not part.any()
-
-
-@pytest.mark.parametrize("n", [1, 100_000])
-def test_arrays_arrive_as_they_are_and_can_be_written_to(n: int) -> None:
-    x = np.random.default_rng(0).normal(size=(3, n)).astype(np.float32)
-    for array in (x, x[:, ::2], x.T):
-        (got,) = there_and_back([array])
-        assert np.array_equal(got, array)
-        got[0] = 7.0
+    for array in (x[:, :1].numpy(), x.numpy()[:, ::2], x.numpy().T):
+        (copy,) = there_and_back([array])
+        assert np.array_equal(copy, array)
+        copy[0] = 7.0
 
 
 def test_a_call_is_answered_and_its_error_is_raised() -> None:

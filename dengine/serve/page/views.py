@@ -200,12 +200,12 @@ def how_view(looking: Looking, last: int = 500) -> HowView:
     """Read how it is doing.  last : parts that are looked at apart."""
     store, recipe, engine = looking.store, looking.recipe, looking.service.engine
     doing, tally = status(store, last), store.tally(PACE)
-    timed = tally.first is not None and tally.last is not None and tally.last > tally.first
+    seconds = 0.0 if tally.first is None or tally.last is None else tally.last - tally.first
     return HowView(
         doing=doing,
         watch=looking.kept("watch", (engine.version, engine.new_labels, recipe), lambda: watch(store, recipe)),
         course=course(store, recipe, last) if doing.ever.decisions else None,
-        pace=3600.0 * (tally.count() - 1) / (tally.last - tally.first) if timed else None,
+        pace=3600.0 * (tally.count() - 1) / seconds if seconds > 0 else None,
         events=store.events(12)[::-1],
     )
 
