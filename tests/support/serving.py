@@ -19,7 +19,7 @@ def served(app: Any, port: int = 0, **options: Any) -> Iterator[int]:
 
     from dengine.serve.server import bound
 
-    server = uvicorn.Server(uvicorn.Config(app, **{"log_level": "error", "timeout_graceful_shutdown": 1} | options))
+    server = uvicorn.Server(uvicorn.Config(app, **{"log_config": None, "timeout_graceful_shutdown": 1} | options))
     with bound("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
