@@ -15,8 +15,8 @@ FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file i
 MODULES = {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}  # a family's is named NAME.__init__
 
 
+PACKAGE_LINES, REST_LINES = 29_000, 26_500
 KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
-UNTIL_DONE = pytest.mark.xfail(strict=False, reason="the halving is under way")
 
 
 def lines(*folders: str) -> int:
@@ -29,9 +29,9 @@ def test_at_most_ten_modules_stand_at_the_top() -> None:
     assert len(top) <= 10, f"{len(top)} modules stand at the top; put one into a family: {', '.join(top)}"
 
 
-@UNTIL_DONE
+# The budgets are 24,000 and 20,000; the halving is under way, and until then the house may not grow again.
 @pytest.mark.parametrize(
-    ("folders", "most"), [(("dengine",), 24_000), (("tests", "training"), 20_000)], ids=["package", "rest"]
+    ("folders", "most"), [(("dengine",), PACKAGE_LINES), (("tests", "training"), REST_LINES)], ids=["package", "rest"]
 )
 def test_what_comes_in_pushes_something_out(folders: tuple[str, ...], most: int) -> None:
     found = lines(*folders)
@@ -65,7 +65,6 @@ def bases(module: str) -> Iterable[tuple[str, str]]:
             yield f"{module}.{node.name}", origin(known.get(name, name))
 
 
-@UNTIL_DONE
 def test_no_base_of_ours_has_a_single_subclass() -> None:
     pairs = [pair for module in MODULES for pair in bases(module)]
     aside = {name for name, base in pairs if base in ("Protocol", "typing.Protocol", "Exception") or name.endswith("Error")}
@@ -86,7 +85,6 @@ def test_no_module_is_imported_by_a_string() -> None:
     assert not strings, f"import them, or move what needs them; a string only hides a layer: {', '.join(sorted(strings))}"
 
 
-@UNTIL_DONE
 def test_tests_go_through_public_faces() -> None:
     private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
     files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
@@ -105,7 +103,6 @@ print(*sorted({name.partition(".")[0] for name in sys.modules}))
 HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "sqlalchemy", "torchmetrics", "umap"}
 
 
-@UNTIL_DONE
 def test_an_engine_with_pca_in_memory_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", LOOK], cwd=REPO, capture_output=True, text=True, check=True)
     assert HEAVY & set(done.stdout.split()) == set(), "import it in the function that uses it"
