@@ -122,7 +122,7 @@ def cell_options(*names: str, product: bool = False) -> Callable[[Command], Comm
     def with_options(command: Command) -> Command:
         @wraps(command)
         def named(store: str | None, cell_id: str | None, product: str | None = None, **others: Any) -> Any:
-            from ..store.peers import address
+            from ..store.records import address
 
             if store is None and (cell_id or product):
                 raise click.UsageError("A cell and its product are known to a store: name it, --store FILE|URL.")

@@ -132,11 +132,10 @@ def _mode_line(change: Mapping[str, Any]) -> str:
 
 def _simulated(store: Store, seed: int, scenario: str, cycles: int, **others: Any) -> tuple[Cell, str]:
     from ..cells.simulation.cell import SimulatedCell
-    from ..store.base import is_shared
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]
-    if is_shared(store):  # peers have one seed, and parts of their own all the same
+    if store.product is not None:  # peers have one seed, and parts of their own all the same
         seed += crc32(store.cell_id.encode())
     return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
 
@@ -146,11 +145,10 @@ def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> t
 
     from ..cells.replay import ReplayCell
     from ..folds import content_hash
-    from ..store.base import is_shared
 
     dataset = source.load()
     # By content: of a part that comes twice the store's own hash would name both.
-    played = store.own_labelled() if is_shared(store) else store.labelled()
+    played = store.own_labelled()
     hashes = content_hash(played.traces)
     for id_ in store.unreported_accepts()[-1:]:
         newest = store.get_decision(id_)

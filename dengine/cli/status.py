@@ -107,7 +107,8 @@ def _read(store: str, last: int, out: Path | None) -> Status:
 def _several(store: str) -> list[CellSummary]:
     """The cells of a database that holds others than the one that is meant where none is named; else none."""
     from ..store.base import must_be_there
-    from ..store.peers import CellAddress, list_cells
+    from ..store.peers import list_cells
+    from ..store.records import CellAddress
 
     if isinstance(store, CellAddress):
         return []

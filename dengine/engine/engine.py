@@ -45,8 +45,8 @@ from ..records import (
     as_success,
     source_of,
 )
-from ..store.base import Store, is_shared, opening
-from ..store.outbox import CLOSE, Keeper, OwnedStore
+from ..store.base import Store, opening
+from ..store.outbox import CLOSE, Keeper
 from ..store.records import StoredDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
@@ -133,7 +133,7 @@ class DataEngine:
             self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
                 self.store.save_settings(self._settings.now.to_store())
-                if is_shared(opened):
+                if opened.product is not None:
                     self._versions.resume()  # on what the others of its product learned
 
     def _start(
@@ -156,7 +156,7 @@ class DataEngine:
         self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
         self._settings = SettingsInForce(settings, self._keeper)
         self._versions = ModelVersions(template, retrainer, self._keeper, clock, settings.evidence)
-        if is_shared(store):
+        if store.product is not None:
             self._versions.count = Fleet(store, self._versions)
         self._feedback = Feedback(self._keeper, self._versions, self._settings, on_safe_mode)
         self._maker = DecisionMaker(self._settings)
@@ -272,7 +272,7 @@ class DataEngine:
         id_ = as_id(decision_id)
         if (known := self._known(id_)) is None:
             number = as_part(part)
-            if self.trace is None or not isinstance(self.store, OwnedStore):
+            if self.trace is None or self.store.wait is None:
                 return unasked(id_, number, self.version, Reason.LATE)
             reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
@@ -305,7 +305,7 @@ class DataEngine:
     def _peers_trace(self) -> TraceSpec | None:
         """What the product's other cells agreed on; where the store is away, the cell's own first trace stands."""
         try:
-            return self._keeper.ask(lambda: peers_trace(self.store)) if is_shared(self.store) else None
+            return self._keeper.ask(lambda: peers_trace(self.store)) if self.store.product is not None else None
         except StoreError:
             log.exception("the product's contract of traces cannot be had")
             return None

@@ -22,9 +22,8 @@ from ..errors import StoreError
 from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import TraceSpec, trace_in
-from ..store.base import SharedStore, Store, is_shared
-from ..store.peers import without_rule
-from ..store.records import ModelVersion
+from ..store.base import Store
+from ..store.records import ModelVersion, without_rule
 from .resume import TrainedOn, join_since, known_to, restored
 from .settings import EngineSettings
 from .versions import ModelVersions
@@ -43,14 +42,12 @@ def agreed(settings: EngineSettings, store: Store) -> EngineSettings:
 
 def peers_trace(store: Store) -> TraceSpec | None:
     """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
-    if not is_shared(store):
-        return None
-    return next(filter(None, map(trace_in, store.sisters_settings().values())), None)
+    return next(filter(None, map(trace_in, store.peers_settings().values())), None)
 
 
 def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
     """What a new engine is asked for, as `DataEngine` takes it; what was left open, as a peer has it if there is one."""
-    known = next(iter(store.sisters_settings().values()), {}) if is_shared(store) else {}
+    known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)
     if filled.get("seed") is None:
         filled["seed"] = int(known.get("seed", 0))
@@ -77,7 +74,7 @@ class Fleet:
 
     shared = True
 
-    def __init__(self, store: SharedStore, versions: ModelVersions) -> None:
+    def __init__(self, store: Store, versions: ModelVersions) -> None:
         self.store, self.versions = store, versions
         self._ahead: dict[int, _Own] = {}  # own labels by number; of peers' before them nothing is known yet
         self._since: list[tuple[int, bool]] = []  # labels since the newest retrain began: number, and whether it is own

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from ..model.base import EngineModel, Told
 from ..store.base import Store
-from ..store.peers import without_rule
-from ..store.records import Correction, Evidence, ModelVersion
+from ..store.records import Correction, Evidence, ModelVersion, without_rule
 from .settings import EvidenceWindow
 from .trainer import Window
 

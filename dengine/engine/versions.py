@@ -22,8 +22,7 @@ from ..records import Reason, RetrainReport
 from ..reducers.base import State
 from ..store.base import Store
 from ..store.outbox import Asked, Keeper
-from ..store.peers import without_rule
-from ..store.records import Change, StoredDecision
+from ..store.records import Change, StoredDecision, without_rule
 from .resume import TrainedOn, change, join_since, refit, resume, tell_all
 from .settings import EvidenceWindow
 from .trainer import HUNG, Retrainer, Trained, Window

@@ -29,7 +29,6 @@ from ..folds import own_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, TraceSpec, source_of, trace_in
 from ..store.base import NewLabel, Store, opening
-from ..store.outbox import OwnedStore
 from ..traces import TraceGate, as_trace
 
 FORM = 3
@@ -201,8 +200,7 @@ def import_journal(
     while an engine runs on the cell.
     """
     with opening(store, must_exist=True) as opened:
-        if isinstance(opened, OwnedStore):
-            opened.own()  # an engine that runs would never learn of these labels
+        opened.own()  # an engine that runs would never learn of these labels
         known = opened.settings()
         spec = trace_in(known)
         if spec is None or "recipe" not in known:

@@ -27,7 +27,7 @@ from ..model.base import EngineModel
 from ..recipe import Recipe
 from ..records import Action, Reason, Source, TraceSpec, plain, trace_in
 from ..store.base import Store
-from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision
+from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
 from ..store.views import PastLabel
 from .envelope import Envelope, envelope_of
 from .sentences import Bound, Circumstances, Novelty, bound_of, verdict
@@ -61,8 +61,11 @@ class Answering:
 
 def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision | None) -> Answering | None:
     """A version as it stood when a decision was made, or as it stands now; None where the store does not keep it."""
-    stored = store.kept_version(version)
-    if stored is None or "points" not in stored.state:  # a rival keeps nothing
+    try:
+        stored = store.load_version(version)
+    except VersionError:
+        return None
+    if "points" not in stored.state:  # a rival keeps nothing
         return None
     retrains = [each.last_seq for each in store.past_retrains() if each.report.accepted and each.report.version > version]
     upto = min(retrains[0] if retrains else stored.last_seq + STRIDE, stored.last_seq + STRIDE)
@@ -322,7 +325,7 @@ def _nearest(store: Store, ball: Ball, most: int) -> list[Neighbour]:
 def _envelope(store: Store, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
     """The band of the successes that were known then; where those were too few, of those known now."""
     for upto in (None if answering is None else answering.last_seq, None):
-        labelled = store.labelled(SUCCESSES) if upto is None else store.labelled_upto(upto, SUCCESSES)
+        labelled = store.labelled(SUCCESSES, last=upto)
         others = (labelled.labels == 1) & (labelled.hashes != past.content_hash)
         if (band := envelope_of(labelled.traces[others], past.trace, spec.rate_hz)) is not None:
             return band

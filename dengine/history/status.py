@@ -21,7 +21,7 @@ from ..decision.policy import Policy
 from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec, trace_in
-from ..store.base import Store, is_shared
+from ..store.base import Store
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Evidence, Key, Outcomes, StoredDecision
 from ..store.views import LABELS, HistoryFilter, PastRetrain, Stretch, Tally
 
@@ -215,7 +215,9 @@ def safe_mode_event(store: Store, until: float = float("inf")) -> Event | None:
 
 def _newest_evidence(store: Store, labels: int) -> Evidence:
     """What became of the decisions with the newest labels, RECENT at most."""
-    known = store.evidence_since(0 if is_shared(store) else labels - RECENT)  # numbered from 1, or over a whole product
+    known = store.evidence_since(
+        labels - RECENT if store.product is None else 0
+    )  # numbered from 1, or over a whole product
     return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
 
 

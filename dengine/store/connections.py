@@ -1,30 +1,37 @@
-"""A database that one cell writes to: the queue of decisions, the thread that writes it, and rows set aside.
+"""A database that one cell writes to: engine, transactions, lease on the cell, and the queue of decisions with its writer.
 
-Connections to SQLite and PostgreSQL: how they are made, and what to do about their errors.
-
-Connections and transactions of one cell: their errors in words, the file watched, the lease, and no use in a fork.
+A deleted file, a fork, a lost answer and a row that the database refuses are each met here.
 """
 
 from __future__ import annotations
 
 import atexit
+import hashlib
 import logging
 import os
 import sqlite3
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, shortened
+from .journal import owned_by, owner
 from .ledger import LedgerEntry, chain_writes
 from .queries import Scope, join_product
 from .records import Event, StoredDecision, as_text, duplicate_id, to_row
 from .schema import DECISION, EVENT, TRACE, chunks, decision_row, prepare_tables, trace_row
+
+log = logging.getLogger("dengine")
+LINGER = 0.05  # seconds that a decision waits for company before it is committed
+RETRY = 1.0  # seconds before the writer tries again after a failure
+QUEUE_BYTES = 64 << 20  # of traces that may wait in memory
+
+T = TypeVar("T")
 
 # Of a server that answers no more, libpq says so after some seconds, not hours.
 PATIENCE = {
@@ -134,32 +141,38 @@ def advice(error: BaseException) -> str:
 OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)  # the database itself is well
 
 
-class SqlConnections:
-    """An open database, prepared for a cell.
+class Database:
+    """An open database, prepared for a cell, and the decisions on their way to it.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     clock : the time in seconds that entries of the ledger are stamped with.
-    scope : the cell and its product.
-    name : the URL without its password, for errors.
-    failures : how many writes failed so far.
+    scope : the cell and its product.  name : the URL without its password.  failures : how many writes failed so far.
     """
 
     def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
         self.cell_id = cell_id
         self.failures = 0
         self._clock = clock
-        self._engine = make_engine(url)
-        chain_writes(self._engine)
-        self.name = self._engine.url.render_as_string(hide_password=True)
+        self._queue: dict[str, StoredDecision] = {}
+        self._queue_bytes = 0
+        self._clash: StoreError | None = None
         self._doubtful = False  # the last write failed, and may have been committed all the same
-        self._closed = False
+        self._closed = self._left = False  # left: let go without writing
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
-        self._lease: Callable[[sa.Connection], None] | None = None  # taken again on each new connection that writes
+        self._leasing = False  # a lease is taken on each new connection that writes
         self._leased: sa.Connection | None = None
+        self._lock = threading.Condition()  # guards the queue
+        self._stop = threading.Event()
+        self._engine = make_engine(url)
+        chain_writes(self._engine)
+        self.name = self._engine.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
         self._file = WatchedFile(self._engine.url)
+        self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
+        self._writer.start()
+        atexit.register(self._close_at_exit)
 
     @property
     def url(self) -> sa.URL:
@@ -187,20 +200,18 @@ class SqlConnections:
         except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *OF_A_ROW) as error:
             self.failures += write
             self._doubtful |= write
+            n = len(self._queue)
+            waiting = f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
             raise StoreError(
-                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}{self._waiting()}"
+                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}{waiting}"
             ) from error
-
-    def _waiting(self) -> str:
-        """Say what waits for the next write."""
-        return ""
 
     @contextmanager
     def transaction(self, write: bool) -> Iterator[sa.Connection]:
         """Begin a transaction that is committed at its end, or rolled back by an error."""
         self._check_open()
         with self._told("write to" if write else "read", write), self._connected(write) as plain:
-            entry = self._entry() if write else None
+            entry = LedgerEntry(self.cell_id, self._clock) if write else None
             connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
             with connection.begin():
                 if write:
@@ -208,27 +219,23 @@ class SqlConnections:
                 yield connection
                 if entry is not None:
                     entry.append(connection)  # chains what the transaction added
-                if write and not getattr(self._asked, "wanted", _always)():
+                if write and not getattr(self._asked, "wanted", lambda: True)():
                     raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
             if write:
                 self._file.check()  # nobody is told that a file holds what went into another one
 
     @contextmanager
     def committing(self, wanted: Callable[[], bool]) -> Iterator[None]:
-        """Ask before each commit of this thread whether it is wanted still, for nobody may wait for it any more."""
         self._asked.wanted = wanted
         try:
             yield
         finally:
             del self._asked.wanted
 
-    def _entry(self) -> LedgerEntry:
-        return LedgerEntry(self.cell_id, self._clock)
-
     @contextmanager
     def _connected(self, write: bool) -> Iterator[sa.Connection]:
         """A connection of the pool; a leased cell writes through the one connection that holds its lease."""
-        if not write or self._lease is None:
+        if not write or not self._leasing:
             with self._engine.connect() as connection:
                 yield connection
             return
@@ -236,7 +243,7 @@ class SqlConnections:
             self._leased = self._engine.connect()
         try:
             if not self._leased.info.get("leased"):
-                self._lease(self._leased)
+                self._take_lease(self._leased)
                 self._leased.commit()
                 self._leased.info["leased"] = True
             yield self._leased
@@ -244,19 +251,34 @@ class SqlConnections:
             self._let_lease_go()
             raise
 
-    def lease(self, take: Callable[[sa.Connection], None]) -> None:
-        """Write from now on through one connection, on which a lease was taken; what `take` raises propagates."""
+    def lease(self) -> None:
+        """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
         with self._writing:
-            self._lease = take
+            self._leasing = True
             try:
                 with self.transaction(write=True):
                     pass
             except StoreError:
-                self._lease = None
+                self._leasing = False
                 raise
 
-    def disconnect(self) -> None:
-        """Let the lease and all connections go."""
+    def _take_lease(self, connection: sa.Connection) -> None:
+        """Lock the cell for as long as this PostgreSQL connection lives."""
+        connection.execute(
+            sa.text("SELECT set_config('application_name', :who, false)"), {"who": f"dengine {owner()}"[:63]}
+        )
+        digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
+        key = {"key": int.from_bytes(digest[:8], "big", signed=True)}
+        if connection.execute(sa.text("SELECT pg_try_advisory_lock(:key)"), key).scalar():
+            return
+        asked = sa.text(
+            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE l.locktype = 'advisory' "
+            "AND (l.classid::bigint << 32) + l.objid::bigint = :key AND l.objsubid = 1 AND l.granted"
+        )
+        holder = connection.execute(asked, key).scalar()
+        raise owned_by(str(holder or "another engine"), f"cell {self.cell_id!r} of {self.name}")
+
+    def _disconnect(self) -> None:
         self._let_lease_go()
         self._engine.dispose()
 
@@ -274,35 +296,6 @@ class SqlConnections:
                 f"Expected the process that opened {self.name}, {self._pid}, got its fork {os.getpid()}; "
                 "open the store after the fork, in the process that uses it."
             )
-
-
-def _always() -> bool:
-    return True
-
-
-log = logging.getLogger("dengine")
-LINGER = 0.05  # seconds that a decision waits for company before it is committed
-RETRY = 1.0  # seconds before the writer tries again after a failure
-QUEUE_BYTES = 64 << 20  # of traces that may wait in memory
-
-T = TypeVar("T")
-
-
-class SqlDatabase(SqlConnections):
-    """An open database, and the decisions on their way to it."""
-
-    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
-        """Open or create the database, and start its writer thread."""
-        self._queue: dict[str, StoredDecision] = {}
-        super().__init__(url, cell_id, clock, product)
-        self._queue_bytes = 0
-        self._clash: StoreError | None = None
-        self._lock = threading.Condition()  # guards the queue
-        self._stop = threading.Event()
-        self._left = False  # let go without writing
-        self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
-        self._writer.start()
-        atexit.register(self._close_at_exit)
 
     def write(self, work: Callable[[sa.Connection], T]) -> T:
         """Commit the queued decisions and `work` in one transaction."""
@@ -330,7 +323,7 @@ class SqlDatabase(SqlConnections):
         """Return which rows the database refuses for what they hold, each with the reason; nothing is written."""
         refused: dict[str, str] = {}
         with self._told("write to"), self._connected(write=True) as plain:
-            connection = plain.execution_options(dengine_write=True, dengine_entry=self._entry())
+            connection = plain.execution_options(dengine_write=True, dengine_entry=LedgerEntry(self.cell_id, self._clock))
             with connection.begin() as tried:
                 for item in self._not_yet_stored(connection, batch):
                     try:
@@ -349,7 +342,7 @@ class SqlDatabase(SqlConnections):
         self._forget(bad)
 
         def record(connection: sa.Connection) -> None:
-            first = self.next_number(connection, EVENT.c.number)
+            first = self.scope.next_number(connection, EVENT.c.number)
             for number, (name, reason) in enumerate(refused.items(), first):
                 text = as_text(f"a decision that the database refused, {name!r}: {reason}")
                 row = to_row(Event(number, now, "set aside", text)) | {"cell_id": self.cell_id}
@@ -358,21 +351,13 @@ class SqlDatabase(SqlConnections):
 
         self._commit(record, [])
 
-    def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
-        """Lock the cell, and its product, then number the next row of a table."""
-        return self.scope.next_number(connection, column)
-
-    def _waiting(self) -> str:
-        n = len(self._queue)
-        return f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
-
     # The queue
 
     def put(self, item: StoredDecision) -> None:
         """Queue a decision for the writer thread; where the queue is full, write it first."""
         self._check_open()
         if self._queue_bytes > QUEUE_BYTES:
-            self.write(_nothing)
+            self.write(lambda connection: None)
         with self._lock:
             if item.decision.id in self._queue:
                 raise duplicate_id(item.decision.id)
@@ -391,6 +376,17 @@ class SqlDatabase(SqlConnections):
             connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
             connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
 
+    def read(self, query: sa.Select[Any]) -> Sequence[Any]:
+        """Return the rows of a query."""
+        with self.transaction(write=False) as connection:
+            return connection.execute(query).all()
+
+    def look(self, query: sa.Select[Any]) -> Sequence[Any]:
+        """`read`, once what is queued was written; an empty queue needs no lock of a database that a cell writes to."""
+        if self._queue:
+            self.flush()
+        return self.read(query)
+
     def insert_new(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> None:
         """Add those decisions of a batch that are not stored yet."""
         stored = self._stored(connection, batch)
@@ -399,9 +395,8 @@ class SqlDatabase(SqlConnections):
     def _forget(self, batch: Sequence[StoredDecision]) -> None:
         with self._lock:
             for item in batch:
-                if self._queue.pop(item.decision.id, None) is None:
-                    continue
-                self._queue_bytes -= item.trace.nbytes
+                if self._queue.pop(item.decision.id, None) is not None:
+                    self._queue_bytes -= item.trace.nbytes
 
     def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> list[StoredDecision]:
         """After a failure: leave out what was committed although the answer got lost, and ids that were taken."""
@@ -421,7 +416,7 @@ class SqlDatabase(SqlConnections):
 
     def flush(self) -> None:
         """Return when every decision so far is committed."""
-        self.write(_nothing)
+        self.write(lambda connection: None)
         clash, self._clash = self._clash, None
         if clash is not None:
             raise clash
@@ -433,18 +428,11 @@ class SqlDatabase(SqlConnections):
                 self._lock.wait_for(lambda: self._queue or self._stop.is_set())
             self._stop.wait(RETRY if self._doubtful else LINGER)
             if not self._stop.is_set() and self._queue:
-                self._try_queue()
+                with suppress(StoreError):  # it is counted, keeps the queue, and is raised by the next flush or report
+                    self.write(lambda connection: None)
         if self._left:
             with self._writing:  # not under the hands of a write that still waits for the database
-                self.disconnect()
-
-    def _try_queue(self) -> bool:
-        """Write the queue; a failure is counted, keeps the queue, and is raised by the next flush or report."""
-        try:
-            self.write(_nothing)
-        except StoreError:
-            return False
-        return True
+                self._disconnect()
 
     # Opening and closing
 
@@ -460,7 +448,7 @@ class SqlDatabase(SqlConnections):
         with self._writing:
             self.flush()  # of what other threads put meanwhile
             self._closed = True
-        self.disconnect()
+        self._disconnect()
         atexit.unregister(self._close_at_exit)
 
     def let_go(self) -> None:
@@ -481,7 +469,3 @@ class SqlDatabase(SqlConnections):
             self.close()
         except StoreError as error:  # an engine has put into its journal what is missing here
             log.warning("a store was left open at the end of the program: %s", error)
-
-
-def _nothing(connection: sa.Connection) -> None:
-    """Write the queue and no more."""

@@ -1,24 +1,21 @@
-"""The store in memory: plain dicts, gone when the process ends.
-
-What a store in memory keeps of an engine's history: versions, events, and the corrections of people.
-
-What the store in memory shows to whoever looks back.
-"""
+"""The store in memory: plain dicts, gone when the process ends."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Action, Decision, Reason, RetrainReport, Source
+from .journal import Record
 from .records import (
     FORGOTTEN,
     KEEP,
@@ -33,6 +30,7 @@ from .records import (
     Labelled,
     ModelVersion,
     NewLabel,
+    News,
     Outcomes,
     StoredDecision,
     StoredVersion,
@@ -47,23 +45,13 @@ from .records import (
     duplicate_id,
     imported_labels,
     keeps_state,
+    mixed_shapes,
     not_kept,
     nothing_to_correct,
     refuse_repeats,
-    stack,
     unknown_decision,
 )
-from .views import (
-    HistoryFilter,
-    PastLabel,
-    PastRetrain,
-    Stretch,
-    Tally,
-    count_outcomes,
-    stretch_of,
-    summary,
-    tally_of,
-)
+from .views import HistoryFilter, PastLabel, PastRetrain, Stretch, Tally, count_outcomes, stretch_of, summary, tally_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,234 +64,22 @@ class StoredLabel:
     given: NewLabel
 
 
-class MemoryHistory:
-    """The part of `MemoryStore` that is about its history. Of versions it keeps the states that a database keeps."""
-
-    _clock: Callable[[], float]
-    _open: dict[str, StoredDecision]
-    _labels: list[StoredLabel]
-    _label_of: dict[str, StoredLabel]
-    _settings: dict[str, str]
-
-    def __init__(self) -> None:
-        self._retrains: list[RetrainReport] = []
-        self._retrained: list[tuple[float, int]] = []  # when each of them was, and the newest label that it knew of
-        self._listed: list[StoredVersion] = []
-        self._states: dict[int, ModelVersion] = {}  # those that `keeps_state` keeps, the newest last
-        self._events: list[Event] = []
-        self._corrections: list[Correction] = []
-        self._said: dict[str, bool | None] = {}  # by decision, what its newest correction says
-        # Action, predicted, audit, label or FORGOTTEN, version
-        self._became: Counter[tuple[Action, Action, bool, int | None, int]] = Counter()
-
-    # Model versions
-
-    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
-        """Record a retrain; of older versions few keep their states, as in a database. A dropped candidate has none."""
-        copies, now = check_state(report, state), self._clock()
-        self._retrains.append(report)
-        self._retrained.append((now, int(last_seq)))
-        n_bytes = sum(values.nbytes for values in (copies or {}).values())
-        kept = report.accepted and copies is not None
-        self._listed.append(StoredVersion(report.version, now, report.accepted, report.reason, n_bytes, kept))
-        if report.accepted and copies is not None:
-            held = self._states | {report.version: ModelVersion(report.version, int(last_seq), copies)}
-            self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
-        return report.version
-
-    def last_version(self) -> ModelVersion | None:
-        """Return the newest accepted version, with arrays of its own."""
-        return _copied(self._states[next(reversed(self._states))]) if self._states else None
-
-    def load_version(self, version: int) -> ModelVersion:
-        """Return an accepted version by its number, with arrays of its own; StoreError where its state is not kept."""
-        if version not in self._states:
-            raise not_kept(version, self._states)
-        return _copied(self._states[version])
-
-    def kept_version(self, version: int) -> ModelVersion | None:
-        """Return an accepted version; None where it is not kept."""
-        return _copied(self._states[version]) if version in self._states else None
-
-    def versions(self) -> list[StoredVersion]:
-        """Return every retrain, oldest first, and whether its state is kept."""
-        return [row if not row.kept or row.version in self._states else _thinned(row) for row in self._listed]
-
-    def retrains(self) -> list[RetrainReport]:
-        return list(self._retrains)
-
-    # Events
-
-    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
-        self.record(Change(kind, text, data, author))
-
-    def events(self, limit: int | None = None) -> list[Event]:
-        return self._events[0 if limit is None else max(0, len(self._events) - limit) :]
-
-    # Corrections
-
-    def record(self, change: Change) -> int:
-        """Keep what a person changed, all or none, together with its event."""
-        number, now, author = len(self._events) + 1, self._clock(), as_text(change.author)
-        event = Event(number, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
-        for name in change.decisions:
-            if name not in self._label_of:
-                raise nothing_to_correct(name) if name in self._open else unknown_decision(name)
-        if change.version is not None:
-            self.put_version(*change.version)
-        self._events.append(event)
-        for name in change.decisions:
-            self._correct(self._label_of[name], change.success, event)
-        if change.settings is not None:
-            self._settings = dict(change.settings)
-        return number
-
-    def _correct(self, label: StoredLabel, success: bool | None, event: Event) -> None:
-        before = self.counted(label)
-        was = None if before == FORGOTTEN else bool(before)
-        made = (len(self._corrections) + 1, event.time, label.item.decision.id, success, was, event.author, event.number)
-        self._corrections.append(Correction(*made, newest_seq=len(self._labels), seq=label.seq))
-        self._said[label.item.decision.id] = success
-        self.count(label.item, before, -1)
-        self.count(label.item, self.counted(label), 1)
-
-    def corrections(self, after: int = 0) -> list[Correction]:
-        return self._corrections[max(0, after) :]
-
-    def counted(self, label: StoredLabel, said: Mapping[str, bool | None] | None = None) -> int:
-        """A label as it counts: 0, 1 or FORGOTTEN."""
-        success = (self._said if said is None else said).get(label.item.decision.id, label.given.success)
-        return FORGOTTEN if success is None else int(success)
-
-    def said_to(self, corrected_to: int | None) -> dict[str, bool | None]:
-        """By decision, what its newest correction says of those up to this number."""
-        if corrected_to is None:
-            return self._said
-        return {each.decision_id: each.success for each in self._corrections[: max(0, corrected_to)]}
-
-    def count(self, item: StoredDecision, label: int | None, n: int) -> None:
-        """Count `n` more decisions of this kind and label."""
-        made = item.decision
-        self._became[made.action, made.predicted, made.audit, label, made.model_version] += n
-
-    def _corrected(self) -> dict[str, int]:
-        forgotten = sum(success is None for success in self._said.values())
-        return {"forgotten": forgotten, "corrected": len(self._said) - forgotten}
-
-
-def _thinned(row: StoredVersion) -> StoredVersion:
-    return replace(row, n_bytes=0, kept=False)
-
-
-def _copied(version: ModelVersion) -> ModelVersion:
-    copies = {name: values.copy() for name, values in version.state.items()}
-    return ModelVersion(version.version, version.last_seq, copies)
-
-
-class MemoryViews:
-    """`StoreViews` in plain dicts; decisions that were forgotten are not among them."""
-
-    _open: dict[str, StoredDecision]
-    _done: dict[str, StoredDecision]
-    _label_of: dict[str, Any]
-    _labels: list[Any]
-    _retrains: list[RetrainReport]
-    _retrained: list[tuple[float, int]]  # when each of them was, and the newest label that it knew of
-
-    if TYPE_CHECKING:  # the store's own
-
-        def counted(self, label: Any) -> int: ...
-        def labelled(self, limit: int | None = None) -> Labelled: ...
-
-    def _every(self) -> list[StoredDecision]:
-        found = [self._past(item) for kept in (self._done, self._open) for item in kept.values()]
-        return sorted(found, key=lambda past: past.key)
-
-    def _past(self, item: StoredDecision) -> StoredDecision:
-        return replace(self._known(item), trace=NO_TRACE)
-
-    def _known(self, item: StoredDecision) -> StoredDecision:
-        """A decision with its label as it counts."""
-        label = self._label_of.get(item.decision.id)
-        if label is None:
-            return item
-        said = as_label(self.counted(label))
-        return replace(item, success=said, source=label.given.source, label_seq=label.seq, label_time=label.time)
-
-    def decisions(
-        self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
-    ) -> list[StoredDecision]:
-        """Return the newest (or oldest) `limit` decisions that are meant, oldest first."""
-        found = [past for past in self._every() if where.takes(past)]
-        if newest:
-            found = [past for past in found if beyond is None or past.key < beyond]
-            return found[max(0, len(found) - limit) :]
-        return [past for past in found if beyond is None or past.key > beyond][:limit]
-
-    def past_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return one decision; None where it is unknown or forgotten."""
-        item = self._open.get(decision_id) or self._done.get(decision_id)
-        return None if item is None else self._past(item)
-
-    def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
-        return [self._past_label(row, points) for row in self._labels[max(0, after) : upto]]
-
-    def _past_label(self, row: Any, points: bool) -> PastLabel:
-        given, past = row.given, self._past(row.item)
-        return PastLabel(
-            seq=row.seq,
-            time=row.time,
-            decision_id=past.decision.id,
-            success=given.success,
-            source=given.source,
-            model_version=given.model_version,
-            content_hash=past.content_hash,
-            quarantined=past.quarantined,
-            silent=given.silent,
-            point=given.point if points else None,
-            decided=past.time,
-            lower=past.decision.lower,
-            upper=past.decision.upper,
-            novel=past.decision.reason is Reason.NOVEL,
-        )
-
-    def past_retrains(self) -> list[PastRetrain]:
-        """Return every retrain, oldest first."""
-        both = zip(self._retrained, self._retrains, strict=True)
-        return [PastRetrain(i, time, last_seq, report) for i, ((time, last_seq), report) in enumerate(both, start=1)]
-
-    def labelled_upto(self, seq: int, limit: int) -> Labelled:
-        """Return the newest `limit` labelled traces among the labels up to number `seq`."""
-        every = self.labelled()
-        here = slice(max(0, int((every.seq <= seq).sum()) - limit), int((every.seq <= seq).sum()))
-        return Labelled(every.seq[here], every.traces[here], every.labels[here], every.hashes[here])
-
-    def tally(self, last: int | None = None) -> Tally:
-        """Count the newest `last` decisions, all where it is None."""
-        every = self._every()
-        return tally_of(every if last is None else every[max(0, len(every) - last) :])
-
-    def stretches(self, n: int) -> list[Stretch]:
-        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
-        every = self._every()
-        length = max(1, -(-len(every) // n))
-        return [stretch_of(every[start : start + length]) for start in range(0, len(every), length)]
-
-
-class MemoryStore(MemoryHistory, MemoryViews):
+class MemoryStore:
     """The contract of `Store` in plain dicts, for replays and trials: nothing outlives the process.
 
     Of decisions that were never reported only the newest 10,000 are kept, trace and all; an older one is counted
-    and then forgotten, and a report on it is a `ReportError`. Labelled ones are kept for good.
+    and then forgotten, and a report on it is a `ReportError`. Labelled ones are kept for good. Of versions it keeps the
+    states that a database keeps. It has no product, no journal, and answers at once.
     """
 
     KEEP_UNLABELLED = 10_000
 
     def __init__(self, cell_id: str = "cell", clock: Callable[[], float] = time.time) -> None:
         """Open an empty store; `clock` gives the time of a decision in seconds."""
-        super().__init__()
         self.cell_id = cell_id
+        self.product: str | None = None
+        self.wait: float | None = None
+        self.remote = False
         self._clock = clock
         self._settings: dict[str, str] = {}
         self._open: dict[str, StoredDecision] = {}  # decisions without a label
@@ -314,6 +90,13 @@ class MemoryStore(MemoryHistory, MemoryViews):
         self._silent: Counter[int] = Counter()  # by the version that answered when the label came
         self._kinds: Counter[tuple[Action, Reason, bool]] = Counter()
         self._times: tuple[float | None, float | None] = (None, None)
+        self._retrains: list[PastRetrain] = []
+        self._states: dict[int, ModelVersion] = {}  # those that `keeps_state` keeps, the newest last
+        self._events: list[Event] = []
+        self._corrections: list[Correction] = []
+        self._said: dict[str, bool | None] = {}  # by decision, what its newest correction says
+        # Action, predicted, audit, label or FORGOTTEN, version
+        self._became: Counter[tuple[Action, Action, bool, int | None, int]] = Counter()
 
     def settings(self) -> dict[str, str]:
         return dict(self._settings)
@@ -321,26 +104,22 @@ class MemoryStore(MemoryHistory, MemoryViews):
     def save_settings(self, settings: Mapping[str, str]) -> None:
         self._settings = dict(settings)
 
-    def put_decision(
-        self,
-        decision: Decision,
-        trace: NDArray[np.float32],
-        content_hash: int,
-        quarantined: bool,
-    ) -> None:
-        """Keep a decision with a copy of its trace."""
+    def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
         item = checked_decision(decision, trace, content_hash, quarantined, self._clock())
         if self._holds(decision.id):
             raise duplicate_id(decision.id)
         self._open[decision.id] = item
         self._kinds[decision.action, decision.reason, item.quarantined] += 1
-        self.count(item, None, 1)
+        self._count(item, None, 1)
         self._times = (item.time if self._times[0] is None else self._times[0], item.time)
         if len(self._open) > self.KEEP_UNLABELLED:
             del self._open[next(iter(self._open))]
 
     def _holds(self, decision_id: str) -> bool:
         return decision_id in self._open or decision_id in self._done
+
+    def peers_settings(self) -> dict[str, dict[str, str]]:
+        return {}
 
     def flush(self) -> None:
         """Nothing waits here."""
@@ -353,19 +132,12 @@ class MemoryStore(MemoryHistory, MemoryViews):
         return replace(self._known(kept), trace=kept.trace.copy())
 
     def decision_ids(self) -> list[str]:
-        """Return the ids of every decision, in any order."""
         return [*self._open, *self._done]
 
     def put_label(
-        self,
-        decision_id: str,
-        success: bool,
-        source: Source,
-        model_version: int,
-        point: NDArray[np.float32] | None,
-        *,
-        silent: int = 0,
-    ) -> int:
+        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None,
+        *, silent: int = 0,
+    ) -> int:  # fmt: skip
         return int(self.put_labels([NewLabel(decision_id, success, source, model_version, point, silent)])[0])
 
     def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
@@ -384,8 +156,8 @@ class MemoryStore(MemoryHistory, MemoryViews):
         label = StoredLabel(len(self._labels) + 1, self._clock(), item, given)
         self._labels.append(label)
         self._label_of[given.decision_id] = label
-        self.count(item, None, -1)
-        self.count(item, int(given.success), 1)
+        self._count(item, None, -1)
+        self._count(item, int(given.success), 1)
         if not item.quarantined:
             self._train.append(label)
             self._silent[given.model_version] += given.silent
@@ -412,37 +184,46 @@ class MemoryStore(MemoryHistory, MemoryViews):
     def labelled(
         self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
     ) -> Labelled:
-        said, most = self.said_to(corrected_to), len(self._labels) if last is None else last
-        newest = (row for row in reversed(self._train) if first <= row.seq <= most and self.counted(row, said) != FORGOTTEN)
-        rows = list(islice(newest, limit))[::-1]
+        said = self._said
+        if corrected_to is not None:
+            said = {each.decision_id: each.success for each in self._corrections[: max(0, corrected_to)]}
+        most = len(self._labels) if last is None else last
+        newest = (row for row in reversed(self._train) if first <= row.seq <= most)
+        rows = list(islice((row for row in newest if self._counted(row, said) != FORGOTTEN), limit))[::-1]
+        return self._with_traces(rows, said)
+
+    def _with_traces(self, rows: Sequence[StoredLabel], said: Mapping[str, bool | None]) -> Labelled:
+        traces = [row.item.trace for row in rows]
+        if len(shapes := {trace.shape for trace in traces}) > 1:
+            raise mixed_shapes(shapes)
         return Labelled(
             seq=np.array([row.seq for row in rows], dtype=np.int64),
-            traces=stack([row.item.trace for row in rows], (0, 0, 0)),
-            labels=np.array([self.counted(row, said) for row in rows], dtype=np.int8),
+            traces=np.stack(traces) if rows else np.zeros((0, 0, 0), dtype=np.float32),
+            labels=np.array([self._counted(row, said) for row in rows], dtype=np.int8),
             hashes=np.array([row.item.content_hash for row in rows], dtype=np.int64),
         )
 
+    def own_labelled(self) -> Labelled:
+        return self.labelled()
+
+    def news_since(self, seq: int, limit: int) -> News:
+        after = (row for row in self._train if row.seq > seq and self._counted(row) != FORGOTTEN)
+        labelled = self._with_traces(list(islice(after, limit)), self._said)
+        return News(labelled, max(self._states, default=0), len(self._corrections))
+
     def points_since(self, seq: int, model_version: int) -> AddedPoints:
         after = [(row.seq, row.given) for row in self._labels[max(0, seq) :]]
-        rows = [(n, given.point) for n, given in after if given.point is not None and given.model_version == model_version]
-        return AddedPoints(
-            seq=np.array([n for n, _ in rows], dtype=np.int64),
-            points=stack([point for _, point in rows], (0, 0)),
+        return AddedPoints.of(
+            (n, given.point) for n, given in after if given.point is not None and given.model_version == model_version
         )
 
     def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
-        after = [row for row in self._labels[max(0, seq) :] if not row.item.quarantined]
-        after = [
-            row for row in after if row.item.decision.model_version >= since_version and self.counted(row) != FORGOTTEN
-        ]
-        return Evidence(
-            seq=np.array([row.seq for row in after], dtype=np.int64),
-            lower=np.array([row.item.decision.lower for row in after], dtype=np.float64),
-            upper=np.array([row.item.decision.upper for row in after], dtype=np.float64),
-            success=np.array([self.counted(row) for row in after], dtype=bool),
-            novel=np.array([row.item.decision.reason is Reason.NOVEL for row in after], dtype=bool),
-            silent=np.array([row.given.silent for row in after], dtype=np.int64),
-        )
+        found = []
+        for row in self._labels[max(0, seq) :]:
+            made, label = row.item.decision, self._counted(row)
+            if not row.item.quarantined and made.model_version >= since_version and label != FORGOTTEN:
+                found.append((row.seq, made.lower, made.upper, label, made.reason is Reason.NOVEL, row.given.silent))
+        return Evidence.of(found)
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first; forgotten ones are not among them."""
@@ -459,22 +240,169 @@ class MemoryStore(MemoryHistory, MemoryViews):
 
     def status(self) -> dict[str, Any]:
         """Count decisions, labels and versions; forgotten decisions are counted too."""
+        forgotten = sum(success is None for success in self._said.values())
         return summary(
             self.cell_id,
             [(action.value, reason.value, quarantined, n) for (action, reason, quarantined), n in self._kinds.items()],
-            Counter(label.given.source.value for label in self._labels if self.counted(label) != FORGOTTEN),
-            self._retrains,
+            Counter(label.given.source.value for label in self._labels if self._counted(label) != FORGOTTEN),
+            self.retrains(),
             self._times,
             max((label.time for label in self._labels), default=None),
             self.events(STATUS_EVENTS),
-            corrected=self._corrected(),
+            corrected=len(self._said) - forgotten,
+            forgotten=forgotten,
         )
 
     def close(self) -> None:
         """Nothing to let go of."""
+
+    # Model versions
+
+    def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
+        """Record a retrain; of older versions few keep their states, as in a database. A dropped candidate has none."""
+        copies, now = check_state(report, state), self._clock()
+        self._retrains.append(PastRetrain(len(self._retrains) + 1, now, int(last_seq), report))
+        if report.accepted and copies is not None:
+            held = self._states | {report.version: ModelVersion(report.version, int(last_seq), copies)}
+            self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
+        return report.version
+
+    def last_version(self) -> ModelVersion | None:
+        return _copied(self._states[next(reversed(self._states))]) if self._states else None
+
+    def load_version(self, version: int) -> ModelVersion:
+        if version not in self._states:
+            raise not_kept(version, self._states)
+        return _copied(self._states[version])
+
+    def versions(self) -> list[StoredVersion]:
+        found = []
+        for row in self._retrains:
+            of = row.report
+            kept = self._states.get(of.version) if of.accepted else None
+            n_bytes = 0 if kept is None else sum(values.nbytes for values in kept.state.values())
+            found.append(StoredVersion(of.version, row.time, of.accepted, of.reason, n_bytes, kept is not None))
+        return found
+
+    def retrains(self) -> list[RetrainReport]:
+        return [row.report for row in self._retrains]
+
+    # Events
+
+    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
+        self.record(Change(kind, text, data, author))
+
+    def events(self, limit: int | None = None) -> list[Event]:
+        return self._events[0 if limit is None else max(0, len(self._events) - limit) :]
+
+    # Corrections
+
+    def record(self, change: Change) -> int:
+        number, now, author = len(self._events) + 1, self._clock(), as_text(change.author)
+        event = Event(number, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
+        for name in change.decisions:
+            if name not in self._label_of:
+                raise nothing_to_correct(name) if name in self._open else unknown_decision(name)
+        if change.version is not None:
+            self.put_version(*change.version)
+        self._events.append(event)
+        for name in change.decisions:
+            self._correct(self._label_of[name], change.success, event)
+        if change.settings is not None:
+            self._settings = dict(change.settings)
+        return number
+
+    def _correct(self, label: StoredLabel, success: bool | None, event: Event) -> None:
+        before = self._counted(label)
+        was = None if before == FORGOTTEN else bool(before)
+        made = (len(self._corrections) + 1, event.time, label.item.decision.id, success, was, event.author, event.number)
+        self._corrections.append(Correction(*made, newest_seq=len(self._labels), seq=label.seq))
+        self._said[label.item.decision.id] = success
+        self._count(label.item, before, -1)
+        self._count(label.item, self._counted(label), 1)
+
+    def corrections(self, after: int = 0) -> list[Correction]:
+        return self._corrections[max(0, after) :]
+
+    def _counted(self, label: StoredLabel, said: Mapping[str, bool | None] | None = None) -> int:
+        """A label as it counts: 0, 1 or FORGOTTEN."""
+        success = (self._said if said is None else said).get(label.item.decision.id, label.given.success)
+        return FORGOTTEN if success is None else int(success)
+
+    def _count(self, item: StoredDecision, label: int | None, n: int) -> None:
+        """Count `n` more decisions of this kind and label."""
+        made = item.decision
+        self._became[made.action, made.predicted, made.audit, label, made.model_version] += n
+
+    # Looking back; decisions that were forgotten are not among them
+
+    def _every(self) -> list[StoredDecision]:
+        found = [replace(self._known(item), trace=NO_TRACE) for kept in (self._done, self._open) for item in kept.values()]
+        return sorted(found, key=lambda past: past.key)
+
+    def _known(self, item: StoredDecision) -> StoredDecision:
+        """A decision with its label as it counts."""
+        label = self._label_of.get(item.decision.id)
+        if label is None:
+            return item
+        said = as_label(self._counted(label))
+        return replace(item, success=said, source=label.given.source, label_seq=label.seq, label_time=label.time)
+
+    def decisions(
+        self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
+    ) -> list[StoredDecision]:
+        found = [past for past in self._every() if where.takes(past)]
+        if newest:
+            found = [past for past in found if beyond is None or past.key < beyond]
+            return found[max(0, len(found) - limit) :]
+        return [past for past in found if beyond is None or past.key > beyond][:limit]
+
+    def past_decision(self, decision_id: str) -> StoredDecision | None:
+        """Return one decision; None where it is unknown or forgotten."""
+        item = self._open.get(decision_id) or self._done.get(decision_id)
+        return None if item is None else replace(self._known(item), trace=NO_TRACE)
+
+    def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
+        found = []
+        for row in self._labels[max(0, after) : upto]:
+            of, item = row.given, row.item
+            known = (row.seq, row.time, of.decision_id, of.success, of.source, of.model_version, item.content_hash)
+            bound = (item.time, item.decision.lower, item.decision.upper, item.decision.reason is Reason.NOVEL)
+            found.append(PastLabel(*known, item.quarantined, of.silent, of.point if points else None, *bound))
+        return found
+
+    def past_retrains(self) -> list[PastRetrain]:
+        return list(self._retrains)
+
+    def tally(self, last: int | None = None) -> Tally:
+        every = self._every()
+        return tally_of(every if last is None else every[max(0, len(every) - last) :])
+
+    def stretches(self, n: int) -> list[Stretch]:
+        every = self._every()
+        length = max(1, -(-len(every) // n))
+        return [stretch_of(every[start : start + length]) for start in range(0, len(every), length)]
+
+    # An owner: there is nothing to claim or to play back
+
+    def own(self) -> None:
+        return None
+
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
+        return [], []
+
+    def let_go(self) -> None:
+        self.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def _copied(version: ModelVersion) -> ModelVersion:
+    return replace(version, state={name: values.copy() for name, values in version.state.items()})

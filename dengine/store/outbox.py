@@ -18,7 +18,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from enum import Enum, auto
 from hashlib import blake2b
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,36 +121,10 @@ WAITING = 10_000  # decisions in memory, before they go to the journal while the
 CHUNK = 500  # of a journal's records in one transaction
 
 
-@runtime_checkable
-class OwnedStore(Store, Protocol):
-    """A store that one engine owns at a time, and that has a journal.
-
-    wait : seconds that its engine waits for it at most.
-    """
-
-    wait: float
-
-    @property
-    def remote(self) -> bool:
-        """Whether it is on a server, which may be away while this machine's disk is well."""
-
-    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
-        """Within this, in this thread, a transaction that is not wanted any more when it would commit is rolled back."""
-
-    def own(self) -> Journal:
-        """Claim the cell; StoreError where another engine has it."""
-
-    def let_go(self) -> None:
-        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
-
-    def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
-        """Write what a journal held; labels' numbers by decision, and what was refused."""
-
-
 class Backlog:
     """Decisions and labels on their way to a store; used by the cell's thread and by the one that asks the store."""
 
-    def __init__(self, store: OwnedStore, journal: Journal) -> None:
+    def __init__(self, store: Store, journal: Journal) -> None:
         self.store = store
         self.journal = journal
         self.lock = threading.RLock()
@@ -356,9 +330,9 @@ class Keeper:
         self._jobs: queue.SimpleQueue[Asked[Any] | None] = queue.SimpleQueue()
         self._backlog: Backlog | None = None
         self._grace = GRACE
-        if owning and isinstance(store, OwnedStore):
-            self._grace = max(GRACE, store.wait)
-            self._backlog = Backlog(store, store.own())
+        if owning and (journal := store.own()) is not None:
+            self._grace = max(GRACE, store.wait or 0.0)
+            self._backlog = Backlog(store, journal)
             self._begin(self._backlog)
 
     def _begin(self, backlog: Backlog) -> None:

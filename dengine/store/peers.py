@@ -1,67 +1,20 @@
-"""What a cell asks of its product's other cells, and the list of all cells of a database.
-
-What cells of one product share, apart from the database: addresses, news, and the settings that must agree.
-
-open_store(address("fleet.db", "cell-7", "gear-12"))
-"""
+"""The cells of a database, and the settings that cells of one product must agree on."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any
 
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
 from ..errors import SettingError, StoreError, without_password
 from ..recipe import Recipe
 from .connections import advice, make_engine
-from .queries import cells_of, lock_product
-from .records import Labelled
-from .schema import DECISION, LABEL, OWNER_KEY, PRODUCT_KEY, RESERVED, SETTING, VERSION
+from .schema import DECISION, LABEL, OWNER_KEY, PRODUCT_KEY, SETTING, VERSION
 
-if TYPE_CHECKING:
-    from .connections import SqlDatabase
-
-RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
 EMBEDDING = ("reducer", "params", "folds", "window", "novelty")  # of a recipe: what a version's arrays were made by
-
-
-class CellAddress(str):
-    """A store's file or URL, and whose rows of it: wherever the name of a store is taken, this is too.
-
-    cell_id : the cell.  product : what it makes; None: as the store says, or nothing that is shared.
-    """
-
-    cell_id: str
-    product: str | None
-
-    def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
-        made = super().__new__(cls, url)
-        made.cell_id, made.product = cell_id, product
-        return made
-
-
-def address(store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None) -> str:
-    """A store's file or URL with its cell and product, as far as they were given."""
-    url = os.fspath(store)
-    return url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
-
-
-@dataclass(frozen=True, slots=True)
-class News:
-    """What became known in a product.
-
-    labelled : labels of all its cells, this one's too, oldest first, as they count now.
-    version : number of its newest accepted version; 0 before the first.  correction : of its newest one; 0 likewise.
-    """
-
-    labelled: Labelled
-    version: int
-    correction: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,19 +35,14 @@ class CellSummary:
     owner: str | None
 
 
-def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """A version's arrays but for what its maker's own parts taught its rule."""
-    return {name: values for name, values in state.items() if not name.startswith(RULE)}
-
-
-def must_agree(mine: Mapping[str, str], sister: Mapping[str, str], name: str, product: str) -> None:
+def must_agree(mine: Mapping[str, str], peer: Mapping[str, str], name: str, product: str) -> None:
     """SettingError where two cells of a product, by what `Store.settings` gives of each, would embed a trace differently.
 
-    name : of the sister.  A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
+    name : of the peer.  A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
     """
-    if "recipe" not in mine or "recipe" not in sister:
+    if "recipe" not in mine or "recipe" not in peer:
         return
-    have, asked = _embedding(sister), _embedding(mine)
+    have, asked = _embedding(peer), _embedding(mine)
     either = ("trace",) if None in (have["trace"], asked["trace"]) else ()  # the first trace of any cell sets the contract
     other = [key for key in have if key not in either and have[key] != asked[key]]
     if other:
@@ -109,43 +57,6 @@ def _embedding(settings: Mapping[str, str]) -> dict[str, Any]:
     recipe = Recipe.from_toml(settings["recipe"])
     own = {key: getattr(recipe, key) for key in EMBEDDING}
     return own | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
-
-
-class ProductShare:
-    """What `SqlStore` reads of its product; of a cell without one there is nothing to read."""
-
-    cell_id: str
-    _database: SqlDatabase
-
-    @property
-    def product(self) -> str | None:
-        """What the cell makes; None: it shares nothing."""
-        return self._database.scope.product
-
-    def sisters_settings(self) -> dict[str, dict[str, str]]:
-        """The settings of the product's other cells, by cell."""
-        with self._database.transaction(write=False) as connection:
-            return self._sisters(connection)
-
-    def _sisters(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
-        product = self._database.scope.product
-        if product is None:
-            return {}
-        query = sa.select(SETTING).where(SETTING.c.cell_id.in_(cells_of(product)), SETTING.c.cell_id != self.cell_id)
-        found: dict[str, dict[str, str]] = {}
-        for row in connection.execute(query.where(SETTING.c.key.not_in(RESERVED)).order_by(SETTING.c.cell_id)):
-            found.setdefault(row.cell_id, {})[row.key] = row.value
-        return found
-
-    def _refuse_disagreement(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """SettingError where a sister embeds otherwise; the product stays locked, so that no sister comes in between."""
-        product = self._database.scope.product
-        if product is None:
-            return
-        self._database.scope.lock_cell(connection)
-        lock_product(connection, product)
-        for name, theirs in self._sisters(connection).items():
-            must_agree(settings, theirs, name, product)
 
 
 @contextmanager
@@ -202,17 +113,19 @@ def list_cells(url: str) -> list[CellSummary]:
             product=products[name],
             decisions=decisions.get(name, (0, None))[0],
             labels=labels.get(name, (0, None))[0],
-            version=max((versions[n] for n in _kin(name, products) if n in versions), default=None),
+            version=max(
+                (
+                    number
+                    for other, number in versions.items()
+                    if other == name or (products[name] is not None and products[name] == products.get(other))
+                ),
+                default=None,
+            ),
             last_seen=max((row[name][1] for row in (decisions, labels) if name in row), default=None),
             owner=settings.get((name, OWNER_KEY)),
         )
         for name in names
     ]
-
-
-def _kin(name: str, products: Mapping[str, str | None]) -> list[str]:
-    product = products[name]
-    return [name] if product is None else [other for other, made in products.items() if made == product]
 
 
 def _counts(connection: sa.Connection, table: sa.Table) -> dict[str, tuple[int, float]]:

@@ -1,10 +1,4 @@
-"""What every store checks before it takes something, and the errors that it says alike.
-
-What a store is given and what it hands back: decisions, labels, traces, points, versions, events and counts.
-
-Which model versions keep their state, and what a store says of each.
-
-What both stores take in: a decision is checked and copied before it is queued, for afterwards nobody could be told.
+"""What stores take and hand back: decisions, labels, traces, versions, events; and what each checks before it takes one.
 
 A row that a database refuses is found by its writer, long after `put_decision` returned. So all that any of them refuses is
 found here, in every store alike: a replay in memory takes nothing that a cell's database would not.
@@ -14,13 +8,14 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
 from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +23,18 @@ from numpy.typing import NDArray
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
 from ..errors import ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
 from ..records import LONGEST, Action, Decision, Reason, RetrainReport, Source, as_id, as_success, is_name
+
+SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
+T = TypeVar("T")
+STATUS_EVENTS = 5  # newest ones that a status shows
+NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
+KEEP = 5  # newest versions that keep their states
+WHOLE = ("n_success", "n_failure", "model_version")
+SHARES = ("lower", "upper", "propensity")
+KINDS = {"action": Action, "predicted": Action, "reason": Reason}
+RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
+Key = tuple[float, str]  # of a decision in its history: time and id
 
 
 def unknown_decision(decision_id: str, hint: str = "") -> ReportError:
@@ -71,14 +78,6 @@ def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     return plain
 
 
-def as_channels(trace: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a float32 copy of a trace, (T,) or (C, T) -> (C, T); the caller's buffer may change afterwards."""
-    copy = np.array(trace, dtype=np.float32, order="C", ndmin=2)
-    if copy.ndim != 2:
-        raise StoreError(f"Expected a trace of shape (C, T), got {copy.shape}; store one trace at a time.")
-    return copy
-
-
 def as_hash(content_hash: int) -> int:
     """Return a content hash as a signed 64-bit integer, which is what a database holds."""
     value = int(content_hash)
@@ -87,34 +86,9 @@ def as_hash(content_hash: int) -> int:
     return value
 
 
-def as_point(point: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-    """Return a float32 copy of an embedded point, (d,)."""
-    if point is None:
-        return None
-    copy = np.array(point, dtype=np.float32, order="C")
-    if copy.ndim != 1:
-        raise StoreError(f"Expected a point of shape (d,), got {copy.shape}; flatten it before it is stored.")
-    return copy
-
-
-def _check_part(part: str | None) -> None:
-    if part is not None and (not isinstance(part, str) or len(part) > LONGEST or part != as_text(part)):
-        raise StoreError(
-            f"Expected a part's number as plain text of at most {LONGEST} characters, or None, got {shortened(part)}; "
-            "strip what a scanner added."
-        )
-
-
 def as_text(text: str) -> str:
     """Return a text for people, with escapes for what a database refuses: NUL, and half a surrogate pair."""
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
-
-
-def as_silent(silent: int) -> int:
-    """Return how many accepted parts went on unheard of since the previous label; -1: the label is of one of them."""
-    if int(silent) < -1:
-        raise StoreError(f"Expected a count of parts that went on in silence, -1 or more, got {silent}; count from 0.")
-    return int(silent)
 
 
 def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
@@ -163,13 +137,6 @@ def mixed_shapes(shapes: set[tuple[int, ...]]) -> StoreError:
     )
 
 
-SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
-T = TypeVar("T")
-STATUS_EVENTS = 5  # newest ones that a status shows
-NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
-
-
 @dataclass(frozen=True, slots=True)
 class NewLabel:
     """A label on its way into a store.
@@ -184,9 +151,6 @@ class NewLabel:
     model_version: int
     point: NDArray[np.float32] | None
     silent: int = 0
-
-
-Key = tuple[float, str]  # of a decision in its history: time and id
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,11 +205,33 @@ class Labelled:
 
 
 @dataclass(frozen=True, slots=True)
+class News:
+    """What became known in a product.
+
+    labelled : labels of all its cells, this one's too, oldest first, as they count now.
+    version : number of its newest accepted version; 0 before the first.  correction : of its newest one; 0 likewise.
+    """
+
+    labelled: Labelled
+    version: int
+    correction: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class AddedPoints:
     """References added to a model version after its swap, in label order; points : (n, d), (0, 0) if there is none."""
 
     seq: NDArray[np.int64]
     points: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple[int, NDArray[np.float32]]]) -> AddedPoints:
+        """Stack pairs of a number and a point, (d,)."""
+        each = list(rows)
+        if len(shapes := {point.shape for _, point in each}) > 1:
+            raise mixed_shapes(shapes)
+        points = np.stack([point for _, point in each]) if each else np.zeros((0, 0), dtype=np.float32)
+        return cls(np.array([seq for seq, _ in each], dtype=np.int64), points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,6 +250,13 @@ class Evidence:
     success: NDArray[np.bool_]
     novel: NDArray[np.bool_]
     silent: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple[Any, ...]]) -> Evidence:
+        """Stack rows of (seq, lower, upper, success, novel, silent)."""
+        columns = zip(*rows, strict=True)
+        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64)
+        return cls(*(np.array(next(columns, ()), dtype=kind) for kind in kinds))
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,6 +329,32 @@ class ModelVersion:
     state: dict[str, NDArray[Any]]
 
 
+def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """A version's arrays but for what its maker's own parts taught its rule."""
+    return {name: values for name, values in state.items() if not name.startswith(RULE)}
+
+
+class CellAddress(str):
+    """A store's file or URL, and whose rows of it: wherever the name of a store is taken, this is too.
+
+    cell_id : the cell.  product : what it makes; None: as the store says, or nothing that is shared.
+    """
+
+    cell_id: str
+    product: str | None
+
+    def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
+        made = super().__new__(cls, url)
+        made.cell_id, made.product = cell_id, product
+        return made
+
+
+def address(store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None) -> str:
+    """A store's file or URL with its cell and product, as far as they were given."""
+    url = os.fspath(store)
+    return url if cell_id is None and product is None else CellAddress(url, cell_id or "cell", product)
+
+
 @lru_cache
 def columns(kind: Any) -> dict[str, tuple[type, bool]]:
     """The fields of a record by name: the type that a column holds, and whether None is a value too."""
@@ -393,14 +412,13 @@ def unpack(blob: bytes) -> NDArray[np.float32]:
 
 def checked_label(label: NewLabel) -> NewLabel:
     """Return a label in the store's own types, with a point of its own."""
-    return NewLabel(
-        decision_id=as_id(label.decision_id),
-        success=as_success(label.success),
-        source=label.source,
-        model_version=int(label.model_version),
-        point=as_point(label.point),
-        silent=as_silent(label.silent),
-    )
+    name, success, silent = as_id(label.decision_id), as_success(label.success), int(label.silent)
+    point = None if label.point is None else np.array(label.point, dtype=np.float32, order="C")
+    if point is not None and point.ndim != 1:
+        raise StoreError(f"Expected a point of shape (d,), got {point.shape}; flatten it before it is stored.")
+    if silent < -1:  # -1: the label is of one of them
+        raise StoreError(f"Expected a count of parts that went on in silence, -1 or more, got {silent}; count from 0.")
+    return NewLabel(name, success, label.source, int(label.model_version), point, silent)
 
 
 def imported_labels(decisions: Sequence[Decision], labels: NDArray[np.int8], source: Source) -> list[NewLabel]:
@@ -423,22 +441,9 @@ def refuse_repeats(
         reported[label.decision_id] = now
 
 
-def stack(rows: Sequence[NDArray[np.float32]], empty: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return rows of one shape as one array; none of them as `empty`."""
-    if not rows:
-        return np.zeros(empty, dtype=np.float32)
-    shapes = {row.shape for row in rows}
-    if len(shapes) > 1:
-        raise mixed_shapes(shapes)
-    return np.stack(rows)
-
-
 def as_label(counted: int | None) -> bool | None:
     """Return a label as it counts; None where there is none, or where it is forgotten."""
     return None if counted in (None, FORGOTTEN) else bool(counted)
-
-
-KEEP = 5  # newest versions that keep their states
 
 
 class VersionError(StoreError):
@@ -489,11 +494,6 @@ def not_kept(version: int, kept: Collection[int], why: str = "is not kept") -> V
     return VersionError(f"Expected a version whose state is held, got {version}, which {why}; load one of these: {others}.")
 
 
-WHOLE = ("n_success", "n_failure", "model_version")
-SHARES = ("lower", "upper", "propensity")
-KINDS = {"action": Action, "predicted": Action, "reason": Reason}
-
-
 def checked_decision(
     decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool, time: float
 ) -> StoredDecision:
@@ -501,7 +501,10 @@ def checked_decision(
     check_decision(decision)
     if not math.isfinite(time):
         raise StoreError(f"Expected the time of a decision in seconds, got {time}; look at the store's clock.")
-    return StoredDecision(decision, as_channels(trace), as_hash(content_hash), bool(quarantined), time)
+    copy = np.array(trace, dtype=np.float32, order="C", ndmin=2)  # the caller's buffer may change afterwards
+    if copy.ndim != 2:
+        raise StoreError(f"Expected a trace of shape (C, T), got {copy.shape}; store one trace at a time.")
+    return StoredDecision(decision, copy, as_hash(content_hash), bool(quarantined), time)
 
 
 def check_decision(decision: Decision) -> None:
@@ -514,7 +517,12 @@ def check_decision(decision: Decision) -> None:
         _must(_is_whole(count), f"{name} as a whole number from 0 to below 2**63", count)
     for name in SHARES:
         _must(_is_share(getattr(decision, name)), f"{name} as a number from 0 to 1", getattr(decision, name))
-    _check_part(decision.part)
+    part = decision.part
+    if part is not None and (not isinstance(part, str) or len(part) > LONGEST or part != as_text(part)):
+        raise StoreError(
+            f"Expected a part's number as plain text of at most {LONGEST} characters, or None, got {shortened(part)}; "
+            "strip what a scanner added."
+        )
     _must(isinstance(decision.audit, bool | np.bool_), "audit as True or False", decision.audit)
     _must(_is_embedding(decision.embedding), "an embedding of numbers, (K, d), or None", decision.embedding)
 

@@ -15,18 +15,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, StoreError
 from ..files import read_archive
 from ..records import Decision, RetrainReport
-from .records import (
-    NO_TRACE,
-    Correction,
-    Event,
-    NewLabel,
-    StoredDecision,
-    columns,
-    from_row,
-    pack,
-    to_row,
-    unpack,
-)
+from .records import NO_TRACE, Correction, Event, NewLabel, StoredDecision, columns, from_row, pack, to_row, unpack
 
 SCHEMA = "1"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
@@ -211,19 +200,5 @@ def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
 
 def label_row(cell_id: str, label: NewLabel, seq: int, time: float, content_hash: int, quarantined: bool) -> dict[str, Any]:
     """The row of the table `label`; the last two are those of its decision."""
-    return {
-        "cell_id": cell_id,
-        "seq": seq,
-        "time": time,
-        "content_hash": content_hash,
-        "quarantined": quarantined,
-        **to_row(label),
-    }
-
-
-def version_row(
-    cell_id: str, report: RetrainReport, last_seq: int, time: float, state: Mapping[str, NDArray[Any]] | None
-) -> dict[str, Any]:
-    """The row of the table `model_version`, without the number of the retrain."""
-    held = {"cell_id": cell_id, "time": time, "last_seq": last_seq, "state": None if state is None else to_npz(state)}
-    return held | to_row(report)
+    of = {"content_hash": content_hash, "quarantined": quarantined}
+    return {"cell_id": cell_id, "seq": seq, "time": time, **of, **to_row(label)}

@@ -1,21 +1,18 @@
-"""What a store counts: what became of decisions, and its status.
-
-What people look back on: past decisions, labels, retrains and counts, without traces unless one is asked for.
-"""
+"""What people look back on: past labels, retrains, counts of decisions and what became of them, and a store's status."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import Action, Reason, RetrainReport, Source
-from .records import FORGOTTEN, Event, Key, Labelled, ModelVersion, Outcomes, StoredDecision
+from .records import FORGOTTEN, Event, Outcomes, StoredDecision
 
 
 def count_outcomes(kinds: Iterable[tuple[str, str, bool, int | None, int]]) -> Outcomes:
@@ -50,11 +47,13 @@ def summary(
     last_label_time: float | None,
     events: Sequence[Event],
     write_failures: int = 0,
-    corrected: Mapping[str, int] | None = None,
+    *,
+    corrected: int,
+    forgotten: int,
 ) -> dict[str, Any]:
     """Return the status of a store from its counts; kinds : (action, reason, quarantined, how many).
 
-    events : the newest STATUS_EVENTS.  corrected : decisions whose newest correction is a label, and "forgotten" ones.
+    events : the newest STATUS_EVENTS.  corrected, forgotten : decisions whose newest correction is a label, or none.
     """
     actions: Counter[str] = Counter()
     reasons: Counter[str] = Counter()
@@ -70,8 +69,8 @@ def summary(
         "quarantined": sum(n for _, _, quarantined, n in kinds if quarantined),
         "labels": sum(sources.values()),
         "sources": {source.value: sources.get(source.value, 0) for source in Source},
-        "corrected": (corrected or {}).get("corrected", 0),
-        "forgotten": (corrected or {}).get("forgotten", 0),
+        "corrected": corrected,
+        "forgotten": forgotten,
         "retrains": len(retrains),
         "versions": len(versions),
         "last_version": versions[-1] if versions else None,
@@ -198,39 +197,6 @@ class Stretch:
     bad: int
 
 
-class StoreViews(Protocol):
-    """What a store shows to whoever looks back. What is queued is written first."""
-
-    def decisions(
-        self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
-    ) -> list[StoredDecision]:
-        """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
-
-        beyond : only those before (or after) this one: the next page.
-        """
-
-    def past_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return one decision; None where it is unknown."""
-
-    def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
-
-    def past_retrains(self) -> list[PastRetrain]:
-        """Return every retrain, oldest first."""
-
-    def kept_version(self, version: int) -> ModelVersion | None:
-        """Return an accepted version; None where it is not kept."""
-
-    def labelled_upto(self, seq: int, limit: int) -> Labelled:
-        """Return the newest `limit` labelled traces among the labels up to number `seq`, as `labelled` does."""
-
-    def tally(self, last: int | None = None) -> Tally:
-        """Count the newest `last` decisions, all where it is None."""
-
-    def stretches(self, n: int) -> list[Stretch]:
-        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
-
-
 def stretch_of(decisions: Sequence[StoredDecision]) -> Stretch:
     """Count consecutive decisions."""
     accepted = [past for past in decisions if past.decision.action is Action.ACCEPT]
@@ -246,10 +212,9 @@ def stretch_of(decisions: Sequence[StoredDecision]) -> Stretch:
 
 def tally_of(decisions: Iterable[StoredDecision]) -> Tally:
     """Count decisions, oldest first."""
-    counts: dict[tuple[Action, Action, Reason, bool, bool, bool | None], int] = {}
-    times: list[float] = []
-    for past in decisions:
-        kind = (
+    each = list(decisions)
+    kinds = Counter(
+        (
             past.decision.action,
             past.decision.predicted,
             past.decision.reason,
@@ -257,7 +222,7 @@ def tally_of(decisions: Iterable[StoredDecision]) -> Tally:
             past.quarantined,
             past.success,
         )
-        counts[kind] = counts.get(kind, 0) + 1
-        times.append(past.time)
-    kinds = tuple(Kind(*kind, n) for kind, n in counts.items())
-    return Tally(kinds, times[0] if times else None, times[-1] if times else None)
+        for past in each
+    )
+    times = (each[0].time, each[-1].time) if each else (None, None)
+    return Tally(tuple(Kind(*kind, n) for kind, n in kinds.items()), *times)

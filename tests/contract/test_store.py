@@ -23,8 +23,7 @@ from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, open_store
 from dengine.store import connections as sql_queue
-from dengine.store import queries as sql_queries
-from dengine.store.queries import Scope
+from tests.support.plans import plans
 
 C, T = 2, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -785,20 +784,21 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
 
 
 def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
-        for query in (
-            sql_queries.newest_query(Scope("cell"), 100),
-            sql_queries.trace_query(Scope("cell"), 5, 10),
-            sql_queries.decision_query("cell", "a"),
-            sql_queries.evidence_query("cell", 5),
-            sql_queries.held_query("cell", ["a", "b"]),
-            sql_queries.silent_query("cell"),
-            sql_queries.event_query("cell", 5),
-        ):
-            text = query.compile(connection, compile_kwargs={"literal_binds": True})
-            plan = [row.detail for row in connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {text}")]
-            assert plan
-            assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], plan
+    with SqlStore(str(tmp_path / "a.db")) as store:
+        put(store, "a")
+        store.put_label("a", True, Source.VERIFICATION, 0, None)
+        with plans(tmp_path / "a.db") as found:
+            store.labelled(100)
+            store.get_decision("a")
+            store.evidence_since(0)
+            store.silent_total()
+            store.events(5)
+            with pytest.raises(ReportError):
+                store.put_label("a", True, Source.VERIFICATION, 0, None)
+    assert len(found) >= 7
+    for statement, plan in found:
+        assert plan
+        assert not [step for step in plan if "SCAN" in step or "TEMP B-TREE" in step], (statement, plan)
 
 
 def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:

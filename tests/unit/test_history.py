@@ -1,7 +1,6 @@
 """Looking back: pages, filters and counts of a store, in memory, in SQLite and in PostgreSQL."""
 
 import os
-import sqlite3
 import uuid
 from collections.abc import Callable, Iterator
 from itertools import count
@@ -9,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sqlalchemy.dialects import sqlite
 
 import dengine.history
 from dengine import DataEngine, SqlStore
@@ -18,8 +16,8 @@ from dengine.history.status import beside, history, interleaved
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import MemoryStore, Store
 from dengine.store.records import Event, StoredDecision
-from dengine.store.view_queries import page_query
 from dengine.store.views import HistoryFilter, PastRetrain, stretch_of, tally_of
+from tests.support.plans import plans
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 KINDS = (  # action, predicted, reason, audit
@@ -163,7 +161,7 @@ def test_stretches_are_consecutive_and_hold_everything(store: Store, n: int) -> 
 def test_an_empty_store_has_no_past(make: Callable[[Callable[[], float]], Store]) -> None:
     empty = make(lambda: 1.0)
     assert everything(empty) == list(history(empty, last=5)) == empty.stretches(10) == empty.past_labels(0) == []
-    assert (empty.tally().count(), empty.tally().first, empty.kept_version(1)) == (0, None, None)
+    assert (empty.tally().count(), empty.tally().first) == (0, None)
 
 
 def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: Store) -> None:
@@ -183,7 +181,7 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: Stor
 def test_labelled_traces_up_to_a_number_are_the_older_part_of_them_all(store: Store) -> None:
     every = store.labelled()
     cut = int(every.seq[len(every.seq) // 2])
-    found = store.labelled_upto(cut, 4)
+    found = store.labelled(4, last=cut)
     kept = np.flatnonzero(every.seq <= cut)[-4:]
     for name in ("seq", "traces", "labels", "hashes"):
         np.testing.assert_array_equal(getattr(found, name), getattr(every, name)[kept])
@@ -195,8 +193,9 @@ def test_retrains_have_their_times_and_newer_versions_are_kept(store: Store) -> 
     assert [each.number for each in retrains] == list(range(1, 7))
     assert [each.time for each in retrains] == sorted(each.time for each in retrains)
     for version in (2, 6):
-        np.testing.assert_array_equal(store.kept_version(version).state["w"], np.full(3, 10 * version - 1))
-    assert store.kept_version(7) is None
+        np.testing.assert_array_equal(store.load_version(version).state["w"], np.full(3, 10 * version - 1))
+    with pytest.raises(StoreError, match="got 7, which is not kept"):
+        store.load_version(7)
 
 
 def test_retrains_and_events_stand_where_they_happened(store: Store) -> None:
@@ -223,12 +222,11 @@ def test_an_engine_shows_what_it_decided() -> None:
 
 
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:
-    SqlStore(str(tmp_path / "engine.db")).close()
-    for newest in (True, False):
-        query = page_query("cell", HistoryFilter(action=Action.ACCEPT), 50, (5.0, "d1"), newest)
-        text = str(query.compile(dialect=sqlite.dialect(), compile_kwargs={"literal_binds": True}))
-        assert "trace" not in text
-        with sqlite3.connect(tmp_path / "engine.db") as connection:
-            plan = [row[-1] for row in connection.execute(f"EXPLAIN QUERY PLAN {text}")]
+    with SqlStore(str(tmp_path / "engine.db")) as opened, plans(tmp_path / "engine.db") as found:
+        for newest in (True, False):
+            opened.decisions(HistoryFilter(action=Action.ACCEPT), 50, (5.0, "d1"), newest)
+    assert len(found) == 2
+    for statement, plan in found:
+        assert "trace" not in statement
         assert any("decision USING INDEX decision_time" in step for step in plan), plan
         assert not any("TEMP B-TREE" in step for step in plan), plan

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import Change, MemoryStore, NewLabel, SqlStore, Store
-from dengine.store import queries as ask
-from dengine.store.queries import Scope
+from tests.support.plans import plans
 
 C, T = 1, 30
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -240,14 +238,12 @@ def test_corrections_survive_closing_and_belong_to_their_cell(place: tuple[str, 
 
 
 def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(tmp_path: Path) -> None:
-    with SqlStore(url_of("sqlite", tmp_path), "cell") as store:
+    with SqlStore(str(tmp_path / "a.db"), "cell") as store:
         fill(store)
         correct(store, None, "0")
-        with store._database.transaction(write=False) as connection:
-            text = str(
-                ask.newest_query(Scope("cell"), 3).compile(connection.engine, compile_kwargs={"literal_binds": True})
-            )
-            plan = " | ".join(row.detail for row in connection.execute(sa.text(f"EXPLAIN QUERY PLAN {text}")))
+        with plans(tmp_path / "a.db") as found:
+            store.labelled(3)
+    plan = " | ".join(found[0][1])
     assert "USING INDEX label_training" in plan
     assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan
     assert "SCAN" not in plan
