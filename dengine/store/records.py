@@ -256,7 +256,8 @@ class Evidence:
         """Stack rows of (seq, lower, upper, success, novel, silent)."""
         columns = zip(*rows, strict=True)
         kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64)
-        return cls(*(np.array(next(columns, ()), dtype=kind) for kind in kinds))
+        arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
+        return cls(*arrays)
 
 
 @dataclass(frozen=True, slots=True)

@@ -336,7 +336,7 @@ class SqlStore:
         same = (TRACE.c.cell_id == LABEL.c.cell_id) & (TRACE.c.decision_id == LABEL.c.decision_id)
         query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same)).order_by(LABEL.c.seq)
         query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
-        query = query.where(LABEL.c.seq.between(rows[0].seq, rows[-1].seq) if rows else sa.false())
+        query = query.where(LABEL.c.seq.between(*((rows[0].seq, rows[-1].seq) if rows else (1, 0))))
         for row in connection.execute(query.execution_options(yield_per=CHUNK)):
             if row.seq not in at or not _is_sound(dict(zip(TRACE.c.keys(), row, strict=False))):
                 continue
@@ -387,7 +387,7 @@ class SqlStore:
         self.flush()
         mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
         query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        inserted = sa.literal_column(INSERTED["postgresql" if self.remote else "sqlite"])
+        inserted: sa.ColumnElement[Any] = sa.literal_column(INSERTED["postgresql" if self.remote else "sqlite"])
         return [row.id for row in self._read(query.where(_since(DECISION, since_version)).order_by(IN_TIME[0], inserted))]
 
     def silent_total(self, since_version: int = 0) -> int:
@@ -499,7 +499,7 @@ class SqlStore:
         size = sa.func.length(VERSION.c.state)
         query = sa.select(*VERSION.c["version", "time", "accepted", "reason"], size)
         rows = self._read(query.where(self._scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
-        return [StoredVersion(*row[:4], row[4] or 0, row[4] is not None) for row in rows]
+        return [StoredVersion(row[0], row[1], row[2], row[3], row[4] or 0, row[4] is not None) for row in rows]
 
     def retrains(self) -> list[RetrainReport]:
         query = sa.select(*VERSION.c[REPORT]).where(self._scope.shared(VERSION.c.cell_id))
@@ -602,7 +602,7 @@ class SqlStore:
     def past_retrains(self) -> list[PastRetrain]:
         query = sa.select(*VERSION.c["retrain", "time", "last_seq"], *VERSION.c[REPORT])
         rows = self._look(query.where(VERSION.c.cell_id == self.cell_id).order_by(VERSION.c.retrain))
-        return [PastRetrain(*row[:3], RetrainReport(*row[3:])) for row in rows]
+        return [PastRetrain(row[0], row[1], row[2], RetrainReport(*row[3:])) for row in rows]
 
     def tally(self, last: int | None = None) -> Tally:
         columns = ("cell_id", "id", "time", "action", "predicted", "reason", "audit", "quarantined")
