@@ -1,17 +1,13 @@
-"""An exported file, whatever its format: what it is made from, what it says of itself, and its checksum.
-
-The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. What does is a
-signature, by `key`.
-
-Signatures: whether a file comes from who has the key, found out before a byte of it is run.
+"""An exported file, whatever its format: what it is made from, what it says of itself, its checksum and its signature.
 
     dengine export --make-key cell.key
-    dengine export engine.db --out model.ts --key cell.key          # model.ts.sig beside it
+    dengine export engine.db --out model.ts --key cell.key          # model.ts.sha256 and model.ts.sig beside it
     load_exported("model.ts", key="cell.key")
 
-HMAC-SHA256 (FIPS 198-1) with a secret that both sides have: it is symmetric, so whoever can check a signature can make
-one. Keep the key's file where only the exporter and the controller read it. An earlier file that was signed with the same
-key is as valid as the newest one.
+The checksum guards against damage, not against an adversary: whoever can change the file can change the sum. The signature
+says who made it, before a byte of it is run: HMAC-SHA256 (FIPS 198-1) with a secret that both sides have, so whoever can
+check one can make one. Keep the key's file where only the exporter and the controller read it. An earlier file that was
+signed with the same key is as valid as the newest one.
 """
 
 from __future__ import annotations
@@ -45,7 +41,11 @@ from .decision import FIELDS, DecisionModule
 
 PREFIX = "hmac-sha256:"
 SHORTEST_KEY = 16  # bytes
-KEY_BYTES = 32
+SCHEMA = 2
+METADATA = "dengine.json"
+SHA256 = re.compile(r"[0-9a-f]{64}")
+SUM_BYTES = 2**16
+UNREADABLE = (zipfile.BadZipFile, zlib.error, StopIteration, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 KeyFile = str | os.PathLike[str]
 
@@ -61,62 +61,36 @@ def make_key(path: KeyFile) -> Path:
     except FileExistsError as error:
         raise ExportError(f"{target} is there already, and files may be signed with it; name a new one.") from error
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise ExportError(
+            f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
+        ) from error
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(secrets.token_hex(KEY_BYTES) + "\n")
+        file.write(secrets.token_hex(32) + "\n")
         file.flush()
         os.fsync(file.fileno())
     return target
 
 
-def _unwritable(target: Path, error: OSError) -> ExportError:
-    return ExportError(f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable.")
-
-
-def read_key(path: KeyFile) -> bytes:
-    """The secret in a key's file, without the line end; ExportError for what is too short to be one."""
+def signature(content: bytes, key: KeyFile) -> str:
+    """What a signature's line begins with, by the secret in a key's file; ExportError for what is too short to be one."""
     try:
-        key = Path(path).read_bytes().rstrip(b"\r\n")
+        secret = Path(key).read_bytes().rstrip(b"\r\n")
     except OSError as error:
         raise ExportError(
-            f"The key's file {path} cannot be read: {error.strerror}; dengine export --make-key writes one."
+            f"The key's file {key} cannot be read: {error.strerror}; dengine export --make-key writes one."
         ) from error
-    if len(key) < SHORTEST_KEY:
+    if len(secret) < SHORTEST_KEY:
         raise ExportError(
-            f"Expected a key of {SHORTEST_KEY} bytes or more in {path}, got {len(key)}; use dengine export --make-key."
+            f"Expected a key of {SHORTEST_KEY} bytes or more in {key}, got {len(secret)}; use dengine export --make-key."
         )
-    return key
-
-
-def signature_file(path: Path) -> Path:
-    """Where the signature lies."""
-    return path.with_name(path.name + ".sig")
-
-
-def signature(content: bytes, key: bytes) -> str:
-    """What a signature's line begins with."""
-    return PREFIX + hmac.new(key, content, hashlib.sha256).hexdigest()
-
-
-def listed(text: str, name: str) -> list[str]:
-    """The first words of the lines that are about a file, or about none in particular.
-
-    A file that was renamed together with its one line is still known by it.
-    """
-    found: list[str] = []
-    others: list[str] = []
-    for line in text.splitlines():
-        word, _, about = line.strip().partition(" ")
-        if word:
-            (found if about.lstrip(" *") in ("", name) else others).append(word)
-    return others if not found and len(others) == 1 else found
+    return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 
 def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
     """ExportError unless the content was signed with this key."""
-    found = signature(content, read_key(key))
+    found = signature(content, key)
     try:
-        known = listed(signature_file(path).read_text(encoding="utf-8"), path.name)
+        known = listed(beside(path, "sig").read_text(encoding="utf-8"), path.name)
     except FileNotFoundError as error:
         raise ExportError(
             f"A key was given, and {path} is not signed: {error.filename} is missing; export it anew with it."
@@ -127,12 +101,24 @@ def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
         raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
 
 
-SCHEMA = 2
-METADATA = "dengine.json"
-SHA256 = re.compile(r"[0-9a-f]{64}")
-SUM_BYTES = 2**16
-TRIES = 3
-UNREADABLE = (zipfile.BadZipFile, zlib.error, StopIteration, ValueError, EOFError, NotImplementedError, RuntimeError)
+def beside(path: Path, suffix: str) -> Path:
+    """Where a checksum (sha256, as `sha256sum --check` reads it) or a signature (sig) lies."""
+    return path.with_name(f"{path.name}.{suffix}")
+
+
+def sum_file(path: Path) -> Path:
+    """Where the checksum lies."""
+    return beside(path, "sha256")
+
+
+def listed(text: str, name: str) -> list[str]:
+    """The first words of the lines that are about a file, or about none in particular.
+
+    A file that was renamed together with its one line is still known by it.
+    """
+    lines = [line.strip().partition(" ") for line in text.splitlines() if line.strip()]
+    found = [word for word, _, about in lines if about.lstrip(" *") in ("", name)]
+    return [lines[0][0]] if not found and len(lines) == 1 else found
 
 
 def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
@@ -150,7 +136,7 @@ def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
 
 def decision_module(source: Exportable) -> DecisionModule:
     """The decision of a fitted model as one eager module; ExportError where a part of it does not compile."""
-    model, index = source.model, source.model.index
+    model = source.model
     if not model.rule.scriptable:
         raise ExportError(
             f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not compile to TorchScript; "
@@ -160,13 +146,15 @@ def decision_module(source: Exportable) -> DecisionModule:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:
         raise ExportError(f"{model.name} cannot be scripted: it has no module; use conv, pca or rocket instead.")
-    size = model.n_spaces, index.dim
+    size = model.n_spaces, model.index.dim
     return DecisionModule(source.trace, model.predictor, *size, source.audit_rate, source.seed, source.stops_all)
 
 
 def describe(source: Exportable) -> dict[str, Any]:
     """What the file says of itself, readable without loading it."""
-    model, index = source.model, source.model.index
+    model, index, rule = source.model, source.model.index, type(source.model.rule)
+    ours = rule.__module__ == DecisionRule.__module__
+    named = next((name for name, rules in RULES.items() if ours and rule.__name__ in rules.values()), "")
     return {
         "schema": SCHEMA,
         "dengine": __version__,
@@ -176,7 +164,7 @@ def describe(source: Exportable) -> dict[str, Any]:
         "alpha": model.classifier.alpha,
         "lower_bound": model.classifier.lower_bound,
         "interval": model.classifier.interval,
-        "guarantee": _guarantee_of(model.rule),
+        "guarantee": named or f"{rule.__module__}:{rule.__qualname__}",
         "stops": "all" if source.stops_all else "some",
         "novelty": model.novelty,
         "spaces": model.n_spaces,
@@ -195,14 +183,6 @@ def describe(source: Exportable) -> dict[str, Any]:
     }
 
 
-def _guarantee_of(rule: Any) -> str:
-    """What `Policy.guarantee` calls a rule of this class."""
-    kind = type(rule)
-    own = kind.__module__ == DecisionRule.__module__
-    named = next((name for name, rules in RULES.items() if kind.__name__ in rules.values()), "") if own else ""
-    return named or f"{kind.__module__}:{kind.__qualname__}"
-
-
 def write_export(
     path: str | os.PathLike[str],
     content: bytes,
@@ -215,24 +195,25 @@ def write_export(
     ExportError where they must not or cannot be written. A file, its sum and its signature are renames of their own:
     where a kill comes between, the file is refused as damaged until it is exported again.
     """
-    target, secret, digest = Path(path), None if key is None else read_key(key), hashlib.sha256(content).hexdigest()
+    target, digest = Path(path), hashlib.sha256(content).hexdigest()
+    written = [(target, content), (sum_file(target), f"{digest}  {target.name}\n".encode())]
+    if key is not None:
+        written.append((beside(target, "sig"), f"{signature(content, key)}  {target.name}\n".encode()))
     check_target(target, force)
     if source is not None and source.note is not None:
         source.note("export", f"{digest} {target.name}, version {source.model_version}")
     with _as_export_error():
-        write_output(target, content, force)
-        write_output(sum_file(target), f"{digest}  {target.name}\n".encode(), force)
-        if secret is not None:
-            write_output(signature_file(target), f"{signature(content, secret)}  {target.name}\n".encode(), force)
-        elif force:
-            signature_file(target).unlink(missing_ok=True)  # of the file that was replaced
+        for each, what in written:
+            write_output(each, what, force)
+        if key is None and force:
+            beside(target, "sig").unlink(missing_ok=True)  # of the file that was replaced
     return target
 
 
 def check_target(path: str | os.PathLike[str], force: bool) -> None:
     """ExportError where a file, its sum or its signature must not be written: before the work of an export."""
     with _as_export_error():
-        for each in (Path(path), sum_file(Path(path)), signature_file(Path(path))):
+        for each in (Path(path), sum_file(Path(path)), beside(Path(path), "sig")):
             check_output(each, force)
 
 
@@ -242,11 +223,6 @@ def _as_export_error() -> Iterator[None]:
         yield
     except OutputError as error:
         raise ExportError(str(error)) from error
-
-
-def sum_file(path: Path) -> Path:
-    """Where the checksum lies, in the form that `sha256sum --check` reads."""
-    return path.with_name(path.name + ".sha256")
 
 
 def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
@@ -260,7 +236,7 @@ def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
     libtorch itself does not notice flipped bits.
     """
     _read(path, most=0)  # of the two it is the file itself that is named where both are missing
-    for _ in range(TRIES):  # an export may replace file and sums between the two looks
+    for _ in range(3):  # an export may replace file and sums between the two looks
         sums = _sums_of(path)
         content = _read(path)
         found = hashlib.sha256(content).hexdigest()

@@ -39,9 +39,8 @@ EXPORTED = "export"  # the kind of the events that record a model's sum
 
 @dataclass(frozen=True, slots=True)
 class JournalLine:
-    """A part in a cell program's journal: its trace (C, T), its label, and what was decided on it, as in `Decision`.
+    """A part: its trace (C, T), its label, None where nothing was heard of it, and what was decided, as in `Decision`.
 
-    label : None where nothing was heard of an accepted part.
     late : whether the label came after the next part was decided on; an accepted part has a line of its own before it then.
     """
 
@@ -61,9 +60,8 @@ class JournalLine:
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """A journal that was read.
+    """Lines in the order in which they became known; whether the last part was accepted and nothing came after it.
 
-    lines : in the order in which they became known.  waits : whether the last part was accepted and nothing came after it.
     sum : the SHA-256 of the export that it belongs to.  cut : bytes of a last line that was cut while it was written.
     """
 
@@ -74,7 +72,10 @@ class Journal:
 
 
 def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
-    """The lines of a cell program's journal."""
+    """The lines of a cell program's journal.
+
+    Left out are rejected parts, which went back to the bin, and verified ones of which nothing was heard yet.
+    """
     *whole, tail = Path(path).read_bytes().split(b"\n")
     head = whole[0].decode("utf-8", errors="replace").split() if whole else []
     if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
@@ -85,7 +86,9 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
     reader = _Reader(spec)
     for number, raw in enumerate(whole[1:], start=2):
         reader.take(raw, f"line {number} of {path}")
-    waits, lines = reader.waits, reader.labelled()
+    waits = reader.open is not None and reader.open.action is Action.ACCEPT
+    reader.settle()
+    lines = [line for line in reader.lines if line.label is not None or line.action is Action.ACCEPT]
     if not lines:
         raise DataError(f"{path} holds no labels yet.")
     return Journal(lines, waits, head[3], len(tail))
@@ -97,21 +100,11 @@ class _Reader:
     def __init__(self, spec: TraceSpec) -> None:
         self.spec = spec
         self.lines: list[JournalLine] = []
+        self.open: JournalLine | None = None  # the part that was decided on last, while nothing was heard of it
         self._parts: dict[str, JournalLine] = {}  # by id, as known by now
-        self._open: JournalLine | None = None  # the part that was decided on last, while nothing was heard of it
-
-    @property
-    def waits(self) -> bool:
-        """Whether the last part was accepted, and nothing came after it."""
-        return self._open is not None and self._open.action is Action.ACCEPT
-
-    def labelled(self) -> list[JournalLine]:
-        """Without rejected parts, which went back to the bin, and verified ones of which nothing was heard yet."""
-        self._settle()
-        return [line for line in self.lines if line.label is not None or line.action is Action.ACCEPT]
 
     def take(self, raw: bytes, where: str) -> None:
-        """One line."""
+        """Check one line, and take it in."""
         said, _, crc = raw.rpartition(b",")
         if f"{zlib.crc32(said):08x}".encode() != crc:
             raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
@@ -131,18 +124,18 @@ class _Reader:
             raise DataError(
                 f"Expected one line of the part {line.id}, {where} is another; the journal was pasted together."
             )
-        self._settle()
+        self.settle()
         self._parts[line.id] = line
         if line.label is None:
-            self._open = line
+            self.open = line
         else:
             self.lines.append(line)
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
         """The next part comes: no sooner is an accepted one counted of which nothing was heard."""
-        if self._open is not None:
-            self.lines.append(self._open)
-        self._open = None
+        if self.open is not None:
+            self.lines.append(self.open)
+        self.open = None
 
     def _take_label(self, words: list[str], where: str) -> None:
         if len(words) != 2 or words[0] not in self._parts or words[1] not in LABELS:
@@ -152,11 +145,11 @@ class _Reader:
         known, label = self._parts[words[0]], LABELS[words[1]]
         if known.action is Action.REJECT or known.label is not None:
             raise DataError(f"Expected one label of a part that was not rejected in {where}, got another of {known.id}.")
-        late = known is not self._open
+        late = known is not self.open
         self._parts[known.id] = replace(known, label=label, late=late)
         self.lines.append(self._parts[known.id])
         if not late:
-            self._open = None
+            self.open = None
 
     def _part(self, words: list[str], where: str) -> JournalLine:
         id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
@@ -193,11 +186,10 @@ def import_journal(
 ) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
-    Parts keep their numbers, the bounds that they were decided by and the sources of their labels, so that the rule and the
-    certificate count them as the engine's own. The report counts labels.
+    Rule and certificate count the parts as the engine's own. The report counts labels.
     any_model : take a journal of a model that the store has not noted as exported from it.
-    Raises DataError, before anything is stored, for a journal that is damaged, or of a model of another store; StoreError
-    while an engine runs on the cell.
+    Raises DataError, before anything is stored, for a damaged journal, or one of another store's model; StoreError while an
+    engine runs on the cell.
     """
     with opening(store, must_exist=True) as opened:
         opened.own()  # an engine that runs would never learn of these labels
@@ -209,22 +201,16 @@ def import_journal(
             )
         policy = Recipe.from_toml(known["recipe"]).policy
         journal = read_journal(path, spec)
-        if not any_model:
-            _must_be_of(opened, journal, path)
+        exports = {event.text.split()[0] for event in opened.events() if event.kind == EXPORTED}
+        if exports and journal.sum not in exports and not any_model:
+            raise DataError(
+                f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
+                "which is none of its exports; name the store that it came from, or say --any-model if it is right."
+            )
         lines = _with_known_outcomes(journal, policy.stops)
         report = _import_lines(opened, lines, spec, policy, on_traces)
     opened.close()
     return replace(report, cut=journal.cut)
-
-
-def _must_be_of(store: Store, journal: Journal, path: str | os.PathLike[str]) -> None:
-    """DataError where a journal's model was not exported from the store."""
-    exports = {event.text.split()[0] for event in store.events() if event.kind == EXPORTED}
-    if exports and journal.sum not in exports:
-        raise DataError(
-            f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
-            "which is none of its exports; name the store that it came from, or say --any-model if it is right."
-        )
 
 
 def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
@@ -235,17 +221,13 @@ def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
     if stops == "some":
         return journal.lines
     late = {line.id: line.label for line in journal.lines if line.late}
-    waits = [line for line in journal.lines if line.label is None][-1:] if journal.waits else []
+    waits = next((line for line in reversed(journal.lines) if line.label is None), None) if journal.waits else None
     return [
         replace(line, label=True) if line.label is None else line
         for line in journal.lines
-        if not any(line is each for each in waits) and not _is_elsewhere(line, late.get(line.id))
+        # A late label has a line of its own: it brings the stop, and the first line the confirmation.
+        if line is not waits and not (line.action is Action.ACCEPT and late.get(line.id) == line.late)
     ]
-
-
-def _is_elsewhere(line: JournalLine, late: bool | None) -> bool:
-    """Whether another line brings an accepted part's label: the late one its stop, the first one its confirmation."""
-    return line.action is Action.ACCEPT and late is not None and line.late == late
 
 
 def _import_lines(
@@ -262,7 +244,11 @@ def _import_lines(
             line, (fault, hash_) = lines[i], looks[i]
             held = store.get_decision(line.id)
             if held is None:
-                decision = _decided(line, fault, policy.audited_share)
+                audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
+                counted = line.lower, line.upper, line.n_success, line.n_failure
+                propensity = 1.0 if line.predicted is Action.VERIFY else policy.audited_share
+                acted = line.id, line.action, line.predicted
+                decision = Decision(*acted, *counted, None, 0, reason, audit, propensity, line.part)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault))
             elif held.source is not None:  # a forgotten one has a label too
                 if line.label is not None:
@@ -283,10 +269,3 @@ def _import_lines(
     return ImportReport(
         counts["imported"], counts["quarantined"], counts["known"], True, contradicted=counts["contradicted"]
     )
-
-
-def _decided(line: JournalLine, fault: int, audit_rate: float) -> Decision:
-    audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
-    counted = line.lower, line.upper, line.n_success, line.n_failure
-    propensity = 1.0 if line.predicted is Action.VERIFY else audit_rate
-    return Decision(line.id, line.action, line.predicted, *counted, None, 0, reason, audit, propensity, line.part)

@@ -20,49 +20,31 @@ NOBODY = -1  # waits for a label
 
 
 class DecisionModule(nn.Module):
-    """The whole decision, raw trace in, action out: gate, predictor and audits. What the cell controller runs.
+    """Gate, predictor and audits: raw trace in, action out, as positions in `Action` and `Reason`.
 
-    Actions are positions in `Action` (0 verify, 1 accept, 2 reject), reasons in `Reason`.
+    A labelled trace becomes a reference, bounded, in its own fold's space, the oldest one leaving first whatever its label,
+    and the rule is told. Encoder and novelty stay. With `stops_all` the next `decide` confirms an accepted part.
 
-    `decide(trace, part)` answers on one trace in scalars; `forward(traces)` on a batch in tensors; both in the order of
-    `FIELDS`. `learn(trace, success, part)` takes in what became of a part after its `decide` and before the next one;
-    `stop` is that of an accepted part that was bad. The trace becomes a reference, bounded, in its own fold's space, the
-    oldest one leaving first whatever its label, and the rule is told. Encoder and novelty stay as they are. Where the
-    policy says that all stops are reported (`stops_all`), the next `decide` confirms a part that was accepted.
-
-    The decision that waits for its label: waits, its action, NOBODY where there is none; alone, what the model alone would
-    have done; own and content, the hashes of part and trace; novel; lower and upper; place (K, d). silent: accepted parts
-    since the last label of which nothing was heard. All of it is saved with the module.
+    Of the decision that waits for its label: waits, its action or NOBODY; alone, what the model alone would have done; own
+    and content, the hashes of part and trace; novel, lower, upper, place (K, d). silent: accepted parts since the last
+    label of which nothing was heard. All of it is saved with the module.
     """
 
     place: Tensor
 
     def __init__(
-        self,
-        spec: TraceSpec,
-        predictor: Predictor,
-        n_spaces: int,
-        dim: int,
-        audit_rate: float,
-        seed: int,
-        stops_all: bool = False,
-    ) -> None:
+        self, spec: TraceSpec, predictor: Predictor, n_spaces: int, dim: int,
+        audit_rate: float, seed: int, stops_all: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.gate = TraceGate(spec)
         self.predictor = predictor
-        self.channels = spec.channels
-        self.samples = spec.samples
-        self.fit = FITS.index(spec.fit)
-        self.n_spaces = n_spaces
-        self.dim = dim
-        self.audit_below = int(audit_rate * 2**COIN_BITS)
-        self.salt = audit_salt(seed)
-        self.mix = MIX
-        self.shift = 63 - COIN_BITS
-        self.mask = 2**COIN_BITS - 1
+        self.channels, self.samples, self.fit = spec.channels, spec.samples, FITS.index(spec.fit)
+        self.n_spaces, self.dim = n_spaces, dim
+        self.audit_below, self.salt = int(audit_rate * 2**COIN_BITS), audit_salt(seed)
+        self.mix, self.shift, self.mask = MIX, 63 - COIN_BITS, 2**COIN_BITS - 1
         self.stops_all = stops_all
-        self.audit_reason, self.novel_reason = AUDIT, NOVEL
-        self.nobody = NOBODY
+        self.audit_reason, self.novel_reason, self.nobody = AUDIT, NOVEL, NOBODY
         # Plain attributes: a scripted float that is assigned to an element of a tensor goes through float32.
         self.waits, self.alone, self.own, self.content, self.silent = NOBODY, 0, 0, 0, 0
         self.novel, self.lower, self.upper = False, 0.0, 1.0

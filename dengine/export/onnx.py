@@ -14,8 +14,6 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -76,10 +74,11 @@ def export_onnx(
     source = source_of(engine_or_model, trace)
     decision_module(source)  # the same refusals as for TorchScript
     _refuse_what_changes(source)
-    twin = Twin(source).eval()
     metadata = describe(source) | {"format": "onnx", "learns": False}
-    program = _to_onnx(twin, source.trace)
-    golden = _golden(OnnxModel(program.SerializeToString(), metadata))
+    program = _to_onnx(Twin(source).eval(), source.trace)
+    x = golden_trace(source.trace)
+    found = OnnxModel(program.SerializeToString(), metadata).decide(x)
+    golden = {"trace": x.tolist(), "embedding": found.embedding.tolist()}
     onnx.helper.set_model_props(program, {METADATA: json.dumps(metadata | {"golden": golden})})
     content = program.SerializeToString()
     _check(OnnxModel(content, metadata), source.model, source.trace)
@@ -167,7 +166,10 @@ class Twin(nn.Module):
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
         """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
-        fault = self.fault(trace)
+        low, high = trace.min(), trace.max()
+        finite = (trace.abs() < float("inf")).all()
+        saturated = torch.where(torch.maximum(high, -low) >= self.limit, SATURATED, 0)
+        fault = torch.where(finite, torch.where(low == high, CONSTANT, saturated), NOT_FINITE)  # as of `TraceGate`
         good = fault == 0
         x = torch.where(good, trace, torch.zeros_like(trace))
         z = self.encoder(x.unsqueeze(0))[0] / self.scale  # (K, d)
@@ -188,13 +190,6 @@ class Twin(nn.Module):
             torch.where(good, z, float("nan")),
         )
 
-    def fault(self, x: Tensor) -> Tensor:
-        """`TraceGate`'s reason, () int64; 0 where there is none."""
-        low, high = x.min(), x.max()
-        finite = (x.abs() < float("inf")).all()
-        saturated = torch.where(torch.maximum(high, -low) >= self.limit, SATURATED, 0)
-        return torch.where(finite, torch.where(low == high, CONSTANT, saturated), NOT_FINITE)
-
     def counted(self, distances: Tensor) -> tuple[Tensor, ...]:
         """`RadiusNeighbours.forward` on (n,) squared distances."""
         wide = self.look(distances, self.fraction)
@@ -205,23 +200,17 @@ class Twin(nn.Module):
         return tuple(torch.where(rejects, few, many) for few, many in zip(narrow, wide, strict=True))
 
     def look(self, distances: Tensor, fraction: float) -> tuple[Tensor, ...]:
-        """action, lower, upper, n_success, n_failure of one ball."""
-        inside = self.inside(distances, fraction)
+        """action, lower, upper, n_success, n_failure of one ball, as of `ReferenceRing.count_near`."""
+        if fraction == 0.0:
+            inside = distances <= self.radius * self.radius
+        else:
+            k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
+            inside = distances <= distances.topk(k, largest=False)[0].max().clamp(max=FARTHEST)
         n_success = (inside & (self.success == 1)).to(torch.int64).sum()
         n_failure = (inside & (self.success == 0)).to(torch.int64).sum()
         lower, upper = self.bound(n_success.to(torch.float64), n_failure.to(torch.float64))
         accepts, rejects = lower >= self.rule.accept_at, upper <= self.rule.reject_at
         return torch.where(accepts, 1, torch.where(rejects, 2, 0)), lower, upper, n_success, n_failure
-
-    def inside(self, distances: Tensor, fraction: float) -> Tensor:
-        """(n,) bool, as `ReferenceRing.count_near`."""
-        if fraction == 0.0:
-            ball: Tensor = distances <= self.radius * self.radius
-            return ball
-        k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
-        limit = distances.topk(k, largest=False)[0].max().clamp(max=FARTHEST)
-        within: Tensor = distances <= limit
-        return within
 
     def bound(self, n_success: Tensor, n_failure: Tensor) -> tuple[Tensor, Tensor]:
         """`DecisionRule.bound` of two () float64; no neighbours: (0, 1)."""
@@ -239,21 +228,20 @@ class Twin(nn.Module):
 
 
 def _to_onnx(twin: Twin, spec: TraceSpec) -> Any:
-    """By way of torch.export, which does not need TorchScript."""
+    """By way of torch.export, which does not need TorchScript; silent on every package that it could use and need not."""
     example = (torch.linspace(-1.0, 1.0, spec.channels * spec.samples).reshape(spec.channels, spec.samples),)
-    with _silence():
-        program = torch.onnx.export(
-            twin, example, dynamo=True, input_names=["trace"], output_names=list(FIELDS), opset_version=OPSET, verbose=False
-        )
+    options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            program = torch.onnx.export(twin, example, input_names=["trace"], output_names=list(FIELDS), **options)
+    finally:
+        logging.disable(level)
     if program is None:
         raise ExportError("torch gave no ONNX program; export torchscript instead.")
     return program.model_proto
-
-
-def _golden(found: OnnxModel) -> dict[str, Any]:
-    """A trace and its embedding, for a loader to check that its machine computes the same."""
-    x = golden_trace(found.trace)
-    return {"trace": x.tolist(), "embedding": found.decide(x).embedding.tolist()}
 
 
 def _check(found: OnnxModel, model: Any, spec: TraceSpec) -> None:
@@ -275,16 +263,3 @@ def _package(name: str) -> ModuleType:
     if missing:
         raise ExportError(f"ONNX needs {', '.join(missing)}; pip install dengine[onnx].")
     return import_module(name)
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    # The exporter reports every package that it could use and does not need.
-    level = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(level)

@@ -4,14 +4,11 @@
 >>> load_exported("model.ts").decide(trace)    # checked before it is loaded, ready at the first call
 
 An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files. Load only what you
-made, or what was signed with a key of yours.
-
-The C and C++ sources that run an exported file: a library with a C interface, and a program.
+made, or what was signed with a key of yours. The C and C++ sources that run an exported file depend on no model, so they
+come by a verb of their own:
 
     dengine export --cpp cell_cpp
     cmake -S cell_cpp -B build/cpp -DCMAKE_PREFIX_PATH="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
-
-They depend on no model, so they come by a verb of their own and not with each export.
 """
 
 from __future__ import annotations
@@ -48,27 +45,23 @@ from .bundle import (
 )
 from .decision import METHODS
 
-SOURCES = Path(__file__).parent / "cpp"
+WARM_UP = 3
+TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
 
 
 def export_sources(folder: str | os.PathLike[str]) -> Path:
-    """Write the sources into a new or an empty folder, and return it.
-
-    ExportError where the folder holds anything, or cannot be written.
-    """
+    """Write the sources into a new or an empty folder, and return it; ExportError for one that cannot be written."""
     target = Path(folder)
     try:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise ExportError(f"Expected a new or an empty folder for the sources, {target} holds something; name another.")
-        shutil.copytree(SOURCES, target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            Path(__file__).parent / "cpp", target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
+        )
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
     except OSError as error:
         raise ExportError(f"Cannot write {target}: {error}; choose a folder that is writable.") from error
     return target
-
-
-WARM_UP = 3
-TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
 
 
 def export_torchscript(
@@ -94,8 +87,11 @@ def export_torchscript(
         frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=list(METHODS))
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
-    metadata = describe(source) | {"golden": _golden(frozen, source.trace)}
-    return write_export(path, _content(frozen, metadata), force, key, source)
+    x = golden_trace(source.trace)
+    with torch.inference_mode():
+        embedding = frozen(torch.from_numpy(x)[None])[6][0]  # `decide` would wait for its label
+    golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
+    return write_export(path, _content(frozen, describe(source) | {"golden": golden}), force, key, source)
 
 
 def _content(module: Any, metadata: dict[str, Any]) -> bytes:
@@ -106,18 +102,9 @@ def _content(module: Any, metadata: dict[str, Any]) -> bytes:
 
 
 def golden_trace(spec: TraceSpec) -> NDArray[np.float32]:
-    """The trace (C, T) that a loader tries itself on."""
+    """The trace (C, T) that a loader tries itself on, to check that its machine computes the same embedding."""
     x = np.sin(np.arange(spec.channels * spec.samples, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
-    whole: NDArray[np.float32] = x if spec.limit is None else x * np.float32(0.5 * spec.limit)
-    return whole
-
-
-def _golden(module: Any, spec: TraceSpec) -> dict[str, Any]:
-    """A trace and its embedding, for the loader to check that this machine computes the same."""
-    x = golden_trace(spec)
-    with torch.inference_mode():
-        embedding = module(torch.from_numpy(x)[None])[6][0]  # `decide` would wait for its label
-    return {"trace": x.tolist(), "embedding": embedding.tolist()}
+    return np.asarray(x if spec.limit is None else x * np.float32(0.5 * spec.limit))
 
 
 class ExportedDecision(NamedTuple):
@@ -193,9 +180,6 @@ def _hash_of(part: Any) -> int:
 def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> ExportedModel:
     """Check, load, warm up. Uses one torch thread, steadier by far at these sizes.
 
-    An untrusted file runs as a program when it is loaded: it can read and write what you can. The checksum beside it says
-    only that it was not damaged. A signature says who made it.
-
     key : the key's file that it was signed with; it is checked before torch sees a byte. None: no signature is asked for.
     Raises ExportError, before anything is loaded, for a file that is missing, damaged, truncated, foreign or newer, or that
     was not signed with the key, and after loading where this machine does not reproduce the golden embedding.
@@ -213,10 +197,9 @@ def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
     try:
         # A copy runs the same compiled code, and this module must not learn of the golden trace.
         _check_golden(ExportedModel(copy.deepcopy(module), dict(metadata)), target)
-        model = ExportedModel(module, metadata)
+        return ExportedModel(module, metadata)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise ExportError(f"{target} is not a dengine export: its description does not fit its module: {error}.") from error
-    return model
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:

@@ -93,33 +93,24 @@ def test_a_rule_that_learns_is_refused(data: Dataset, tmp_path: Path, rule: Deci
         export_onnx(model, tmp_path / "model.onnx")
 
 
-def test_parts_that_came_again_are_refused(data: Dataset, tmp_path: Path) -> None:
+def test_what_the_twin_cannot_do_is_refused(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashes = np.arange(1, len(data) + 1)
     hashes[7] = hashes[3]
     model = ModelPrediction("pca").fit(data.X, data.y, hashes=hashes)
     with pytest.raises(ExportError, match="ONNX carries no votes: 1 of the references"):
         export_onnx(model, tmp_path / "model.onnx")
-
-
-def test_an_interval_without_a_module_is_refused(data: Dataset, tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="use wilson or binomial"):
         export_onnx(fitted(data, interval="jeffreys"), tmp_path / "model.onnx")
-
-
-def test_a_missing_package_names_the_extra(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object())
     with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
         export_onnx(fitted(data), tmp_path / "model.onnx")
 
 
-def test_the_file_says_what_it_is(file: Path) -> None:
-    metadata = load_onnx(file).metadata
-    assert metadata["format"] == "onnx"
-    assert metadata["learns"] is False
-    assert metadata["references"] == 300
-
-
 def test_a_damaged_file_and_a_foreign_one_are_refused(file: Path, tmp_path: Path) -> None:
+    metadata = load_onnx(file).metadata
+    assert (metadata["format"], metadata["learns"], metadata["references"]) == ("onnx", False, 300)
+    with pytest.raises(TraceError, match="Expected 100 samples, got 98"):
+        load_onnx(file).decide(np.ones(98))
     copy, content = tmp_path / "model.onnx", file.read_bytes()
     total = copy.with_name("model.onnx.sha256")
     total.write_text(hashlib.sha256(content).hexdigest())
@@ -130,8 +121,3 @@ def test_a_damaged_file_and_a_foreign_one_are_refused(file: Path, tmp_path: Path
     copy.write_bytes(b"garbage")
     with pytest.raises(ExportError, match="is not a dengine export in ONNX"):
         load_onnx(copy)
-
-
-def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
-    with pytest.raises(TraceError, match="Expected 100 samples, got 98"):
-        load_onnx(file).decide(np.ones(98))
