@@ -351,8 +351,8 @@ def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float,
     for name, colour, style in (("false_positive", BAD, "-"), ("false_negative", GOOD, "-.")):
         wrong = np.stack([getattr(r, name) for r in replays]).mean(axis=0)
         label = f"{name.replace('_', ' ')}s, of all cycles"
-        x, look = np.arange(1, len(wrong) + 1), {"color": colour, "linestyle": style}
-        bottom.plot(x, 100 * sliding_mean(wrong, window), linewidth=1.2, label=label, **look)
+        x = np.arange(1, len(wrong) + 1)
+        bottom.plot(x, 100 * sliding_mean(wrong, window), style, color=colour, linewidth=1.2, label=label)
     bottom.axhline(100 * (1 - bound), label="100 - LB", **LIMIT)
 
 
@@ -437,8 +437,8 @@ def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
     axes.plot(x, found.trace[channel], color=BLACK, linewidth=1.6, label="this trace")
     outside = [each for each in band.excesses if each.channel == channel and each.widths >= CLEAR] if band else []
     for i, each in enumerate(outside):
-        ends, label = np.array([each.from_s, each.to_s]) + [-0.5, 0.5] / np.float64(found.spec.rate_hz), "outside the band"
-        axes.axvspan(*ends, color=ORANGE, alpha=0.3, linewidth=0, label=label if i == 0 else "_", zorder=0)
+        half, label = 0.5 / found.spec.rate_hz, "outside the band" if i == 0 else "_"
+        axes.axvspan(each.from_s - half, each.to_s + half, color=ORANGE, alpha=0.3, linewidth=0, label=label, zorder=0)
 
 
 def _draw_distances(axes: Axes, found: Explanation) -> None:
@@ -453,7 +453,8 @@ def _draw_distances(axes: Axes, found: Explanation) -> None:
     for success, name, colour, _, marker in KINDS:
         some = [(each.distance, spaces.index(each.space)) for each in near if each.success is success]
         if some:
-            axes.scatter(*zip(*some, strict=True), s=34, color=colour, marker=marker, alpha=0.8, label=name)
+            x, y = zip(*some, strict=True)
+            axes.scatter(x, y, s=34, color=colour, marker=marker, alpha=0.8, label=name)
     end = max(each.distance for each in near)
     if found.radius <= 3.0 * end:
         axes.axvline(found.radius, label=f"ball, radius {found.radius:.3g}", **LIMIT)
@@ -526,8 +527,8 @@ def _mark_events(top: Axes, bottom: Axes, course: Course, ends: Floats) -> None:
     for kept, marker, colour, name in ((True, "^", GREEN, "retrained"), (False, "x", BAD, "retrain dropped")):
         at = _cycles(course, ends, [each.time for each in course.retrains if each.report.accepted is kept])
         if len(at):
-            label, look = f"{name} ({len(at)})", {"marker": marker, "color": colour}
-            top.scatter(at, np.full(len(at), 2.5), s=26, label=label, zorder=3, clip_on=False, **look)
+            look: dict[str, Any] = {"marker": marker, "color": colour, "label": f"{name} ({len(at)})"}
+            top.scatter(at, np.full(len(at), 2.5), s=26, zorder=3, clip_on=False, **look)
     for axes in (top, bottom):
         for i, (begin, end) in enumerate(_safe_modes(course, ends)):
             axes.axvspan(begin, end, color=ORANGE, alpha=0.25, linewidth=0, label="safe mode" if i == 0 else None)

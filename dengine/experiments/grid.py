@@ -109,7 +109,7 @@ class KeptReplays:
         """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
         values = {f.name: getattr(replay, f.name) for f in fields(replay)}
         about = {name: values[name] for name in ABOUT} | {"retrains": [asdict(each) for each in replay.retrains]}
-        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
         partial = self.folder / f".{uuid4().hex}.partial"
         try:
             with partial.open("xb") as file:

@@ -247,8 +247,8 @@ def _import_lines(
                 audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
                 counted = line.lower, line.upper, line.n_success, line.n_failure
                 propensity = 1.0 if line.predicted is Action.VERIFY else policy.audited_share
-                acted = line.id, line.action, line.predicted
-                decision = Decision(*acted, *counted, None, 0, reason, audit, propensity, line.part)
+                told = (*counted, None, 0, reason, audit, propensity, line.part)
+                decision = Decision(line.id, line.action, line.predicted, *told)
                 store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault))
             elif held.source is not None:  # a forgotten one has a label too
                 if line.label is not None:
