@@ -12,7 +12,7 @@ import torch
 from dengine import Action, DataEngine, Reason, ReplayCell
 from dengine.errors import ReportError, StoreError, TraceError, shortened
 from dengine.records import LONGEST, Decision, Source, as_success
-from dengine.store.base import NewLabel, open_store
+from dengine.store import NewLabel, open_store
 
 GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.array(1), np.array(True), Fraction(1)]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
