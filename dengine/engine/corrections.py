@@ -22,13 +22,13 @@ from ..records import as_success
 from ..store.outbox import Keeper
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
 from .feedback import Feedback
-from .settings import EngineSettings, EvidenceWindow, SettingsInForce
+from .settings import EvidenceWindow, SettingsInForce
 from .trainer import HUNG
 from .versions import ModelVersions
 
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops")  # what a rule is made of, and its evidence measured by
 SHADOW = {True: "shadow mode: every part is verified from now on", False: "the shadow mode ended: the model decides again"}
-SAID = {True: "success", False: "failure", None: "forgotten"}
+SAID = {True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +54,11 @@ class Corrections:
         self._store = keeper.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
-        """Say that a label was wrong, or that a forgotten one counts again: from the next decision on, it counts as this.
+        """Say that a label was wrong, or that a forgotten one counts again, from the next decision on.
 
-        The references of the model that answers, the traces of the next retrain, the rule's evidence and the certificate
-        take the label as it is corrected. Its trace's fold stays. A rival, which cannot take a label back, is trained anew
-        at once. What was reported, and what was decided, stays in the store as it was.
-        success : True or False, or 1 or 0.  author : who says so, for the record.
+        References, the next retrain, the rule's evidence and the certificate take the label as corrected; its trace's fold
+        stays. A rival, which cannot take a label back, is trained anew at once. What was reported stays in the store.
+        author : who says so, for the record.
         Raises ReportError for an unknown decision, and for one without a label. A label that is so already changes nothing.
         """
         label = as_success(success)
@@ -68,17 +67,17 @@ class Corrections:
             return self._unchanged(
                 "correct", f"Decision {known.decision.id} counts as a {SAID[label]} already; nothing changed."
             )
-        text = f"decision {known.decision.id} counts as a {SAID[label]}, was {_was(known)}"
+        was = "forgotten" if known.success is None else f"a {SAID[known.success]}"
+        text = f"decision {known.decision.id} counts as a {SAID[label]}, was {was}"
         data = {"decisions": {known.decision.id: {"was": known.success, "now": label}}}
         return self._correct(Change("correct", text, data, author, (known.decision.id,), label))
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on; `correct` brings one back.
 
-        The traces, and the labels as they were reported, stay in the store: nothing is deleted, and nothing is promised to
-        whoever asks for deletion. The next retrain is the first that never saw them; until then the encoder that was
-        trained with them goes on. A guarantee assumes that what is forgotten is chosen blind to its label; the certificate
-        takes a forgotten outcome of what was certain for a wrong decision, so that forgetting earns nothing.
+        Traces, and labels as they were reported, stay in the store; the encoder that was trained with them goes on until
+        the next retrain. A guarantee assumes that what is forgotten is chosen blind to its label; the certificate takes a
+        forgotten outcome of what was certain for a wrong decision, so that forgetting earns nothing.
         Raises ReportError for an unknown decision, and for one without a label; then none is forgotten.
         """
         if not decision_ids:
@@ -96,9 +95,8 @@ class Corrections:
     def rollback(self, version: int, author: str = "") -> Changed:
         """Let an earlier version answer again, as a new version, so that the history goes on in one line.
 
-        Labels that came since are among its references, and corrections count. The rule keeps what it was told. The next
-        retrain is due after as many new labels as after a training, and goes on from this version.
-        A reducer that is stored by its traces (umap), and a rival, are fitted again, which takes a training's time: the
+        Labels that came since are among its references, corrections count, and the rule keeps what it was told. The next
+        retrain goes on from this version. A reducer that is stored by its traces (umap), and a rival, are fitted again: the
         first on what it was fitted on, the second on the same traces with the labels as they count now.
         Raises StoreError for a version that is not kept, which names those that are.
         """
@@ -116,16 +114,12 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; every earlier one keeps the bounds that it was decided by.
 
-        Where alpha, the lower bound, the interval, the guarantee or what is known of stops changes, the rule and its pooled
-        guarantee start anew, told of what is decided from now on: a tolerance that is chosen after the data was seen is not
-        one of those that alpha was spent on, and old bounds are of another scale. The audit rate alone leaves the rule.
-        `certificate` speaks of what is decided under the policy in force, that is since this change: by itself each
-        certificate keeps its level, but one who may choose among m policies' certificates errs with up to m alpha.
-        An engine in safe mode begins the new policy in it, where its rule has one, until fresh evidence ends it.
-        A part that was accepted before, and of which nothing was heard, stays unheard of.
-
-        Raises SettingError for what is no policy, and, where a model was handed in, for anything but audit_rate and stops:
-        it decides by its own numbers.
+        Where anything but the audit rate changes, the rule starts anew, told of what is decided from now on: a tolerance
+        chosen after the data was seen is not one of those that alpha was spent on, and old bounds are of another scale.
+        `certificate` speaks of what is decided since this change; one who may choose among m policies' certificates errs
+        with up to m alpha. A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that was
+        accepted before, and of which nothing was heard, stays unheard of.
+        Raises SettingError for what is no policy, and for anything but audit_rate and stops of a model that was handed in.
         """
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
@@ -134,9 +128,8 @@ class Corrections:
     def set_shadow(self, on: bool, author: str = "") -> Changed:
         """Verify every part from the next decision on, or end that: the shadow mode, which lasts over restarts.
 
-        What the model is certain of is then an audit, each part's: `Decision.predicted` says what it would have done, and
-        its label, `Source.AUDIT`, whether that was right; all is learned from as ever. It is a setting of the policy;
-        the certificate begins anew where it begins and where it ends.
+        Each part that the model is certain of is then an audit: `Decision.predicted` says what it would have done, and all
+        is learned from as ever. The certificate begins anew where it begins and where it ends.
         """
         if not isinstance(on, bool):
             raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
@@ -159,7 +152,11 @@ class Corrections:
             )
         self._make_ready()
         anew = not own and any(name in new for name in SCORING)
-        settings = self._under(policy, anew)
+        now = self._settings.now
+        since = 0 if self._versions.answering is None else self._versions.next_number
+        evidence = EvidenceWindow(since, SAFE_MODE.index(self._feedback.safe_mode)) if anew else now.evidence
+        recipe = replace(now.recipe, policy=policy)
+        settings = replace(now, recipe=recipe, policy_since=since, evidence=evidence)
         was = {name: getattr(old, name) for name in new}
         text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
         kind = "policy"
@@ -171,13 +168,6 @@ class Corrections:
         self._settings.now = settings
         self._feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
-
-    def _under(self, policy: Policy, anew: bool) -> EngineSettings:
-        """The settings under another policy; anew : whether its rule begins without evidence."""
-        now = self._settings.now
-        since = 0 if self._versions.answering is None else self._versions.next_number
-        evidence = EvidenceWindow(since, SAFE_MODE.index(self._feedback.safe_mode)) if anew else now.evidence
-        return replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
 
     def _make_ready(self) -> None:
         """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
@@ -212,10 +202,6 @@ class Corrections:
 
     def _unchanged(self, kind: str, text: str) -> Changed:
         return Changed(kind, _sentence(text), None, self._versions.version)
-
-
-def _was(known: StoredDecision) -> str:
-    return "forgotten" if known.success is None else f"a {SAID[known.success]}"
 
 
 def _sentence(text: str) -> str:

@@ -61,10 +61,26 @@ class DecisionMaker:
         fault, content = self._gate(torch.from_numpy(x))
         hash_ = own_hash(content, part)
         reason = REASONS[fault] if fault else unasked
-        prediction = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
-        decision = self._record(prediction, part, content, version)
-        named = decision if decision_id is None else replace(decision, id=decision_id)
-        return StoredDecision(named, x, hash_, bool(fault))
+        said = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
+        certain, rate = said.action is not Action.VERIFY, self._settings.now.recipe.policy.audited_share
+        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
+        self._count += 1
+        decision = Decision(
+            id=decision_id or f"{self._run}-{self._count}",
+            action=Action.VERIFY if audit else said.action,
+            predicted=said.action,
+            lower=said.lower,
+            upper=said.upper,
+            n_success=said.n_success,
+            n_failure=said.n_failure,
+            embedding=said.embedding,
+            model_version=version,
+            reason=Reason.AUDIT if audit else said.reason,
+            audit=audit,
+            propensity=rate if certain else 1.0,
+            part=part,
+        )
+        return StoredDecision(decision, x, hash_, bool(fault))
 
     def unasked(
         self, x: NDArray[np.float32], part: str | None, version: int, reason: Reason, decision_id: str
@@ -75,33 +91,11 @@ class DecisionMaker:
         return StoredDecision(decision, x, own_hash(content, part), bool(fault))
 
     def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> StoredDecision:
-        """The decision behind a system stop whose own row was lost: an accept, on no evidence that is known."""
+        """The decision behind a system stop whose own row was lost: an accept without a check, on no known evidence."""
         fault, content = self._gate(torch.from_numpy(x))
-        accept = replace(NOTHING_KNOWN, action=Action.ACCEPT, reason=Reason.CERTAIN)
-        decision = self._record(accept, part, content, version)
-        # The part went on unchecked, whatever the audits' coin says.
-        went_on = replace(decision, id=decision_id, action=Action.ACCEPT, reason=Reason.CERTAIN, audit=False)
-        return StoredDecision(went_on, x, own_hash(content, part), bool(fault))
-
-    def _record(self, predicted: Prediction, part: str | None, content: int, version: int) -> Decision:
-        certain, rate = predicted.action is not Action.VERIFY, self._settings.now.recipe.policy.audited_share
-        audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
-        self._count += 1
-        return Decision(
-            id=f"{self._run}-{self._count}",
-            action=Action.VERIFY if audit else predicted.action,
-            predicted=predicted.action,
-            lower=predicted.lower,
-            upper=predicted.upper,
-            n_success=predicted.n_success,
-            n_failure=predicted.n_failure,
-            embedding=predicted.embedding,
-            model_version=version,
-            reason=Reason.AUDIT if audit else predicted.reason,
-            audit=audit,
-            propensity=rate if certain else 1.0,
-            part=part,
-        )
+        rate = self._settings.now.recipe.policy.audited_share
+        decision = unasked(decision_id, part, version, Reason.CERTAIN, Action.ACCEPT, rate)
+        return StoredDecision(decision, x, own_hash(content, part), bool(fault))
 
 
 def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
@@ -135,10 +129,16 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
     return known.decision
 
 
-def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
-    """To verify, for this reason, whatever the model says."""
-    said = (NOTHING_KNOWN.lower, NOTHING_KNOWN.upper, 0, 0, None, version, reason, False, 1.0, part)
-    return Decision(decision_id, Action.VERIFY, Action.VERIFY, *said)
+def unasked(
+    decision_id: str,
+    part: str | None,
+    version: int,
+    reason: Reason,
+    action: Action = Action.VERIFY,
+    propensity: float = 1.0,
+) -> Decision:
+    """A decision on which no model was asked."""
+    return Decision(decision_id, action, action, 0.0, 1.0, 0, 0, None, version, reason, False, propensity, part)
 
 
 def as_part(part: Any) -> str | None:

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import DengineError, StoreError
+from ..errors import DengineError, StoreError, UnknownDecisionError
 from ..history.explain import Explanation, Records, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
@@ -51,7 +51,7 @@ from ..store.records import StoredDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part, decided_before, unasked
-from .feedback import Feedback, unknown_stop
+from .feedback import Feedback
 from .peers import Fleet, agreed, as_peers, peers_trace
 from .resume import resume
 from .settings import EngineSettings, SettingsInForce, chosen_recipe, object_of, refuse_idle
@@ -59,9 +59,6 @@ from .trainer import Clock, EncoderTime, Limits, Retrainer, Window
 from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
-KNOWN = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}  # silence is not a success
-OPTIONS = ("model", "executor", "replaying", "clock", "on_safe_mode")  # of an opened engine
-OnSafeMode = Callable[[str], object] | None
 StoreLike = str | os.PathLike[str] | Store
 
 
@@ -92,14 +89,13 @@ class DataEngine:
     store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
     recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
-    model : any `Model`, a rival, in place of reducer and neighbours. It decides by its own rule: of a policy only
-        audit_rate and stops count then.
+    model : any `Model`, a rival, that decides by its own rule: of a policy only audit_rate and stops count then.
     on_safe_mode : called with the reason when safe mode begins, "" when it ends.
     executor : None retrains in line, between cycles; a `concurrent.futures.Executor` retrains while the cell goes on.
     replaying : stop a retrain on steps alone and never on the clock, so that a seed repeats exactly.
     clock : seconds, of any origin, by which retrains and decisions are timed.
 
-    One engine belongs to one thread, which it sets to one torch thread: steadier by far at these sizes.
+    One engine belongs to one thread, which it sets to one torch thread.
     Raises SettingError for settings that are out of range or contradict each other, StoreError for a used store.
     """
 
@@ -120,7 +116,7 @@ class DataEngine:
         executor: Executor | None = None,
         replaying: bool = False,
         clock: Clock = time.perf_counter,
-        on_safe_mode: OnSafeMode = None,
+        on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
         beside = {"radius": radius, "folds": folds, "retrain_every": retrain_every, "budget": budget, "policy": policy}
         if model is not None:
@@ -144,7 +140,7 @@ class DataEngine:
         executor: Executor | None = None,
         replaying: bool = False,
         clock: Clock = time.perf_counter,
-        on_safe_mode: OnSafeMode = None,
+        on_safe_mode: Callable[[str], object] | None = None,
         reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
@@ -212,7 +208,8 @@ class DataEngine:
         with opening(store, wait=wait) as opened:
             if not opened.settings():
                 return cls(store=opened, **as_peers(settings | {"seed": seed}, opened))
-            options = {name: settings.pop(name) for name in OPTIONS if name in settings}
+            of_open = ("model", "executor", "replaying", "clock", "on_safe_mode")
+            options = {name: settings.pop(name) for name in of_open if name in settings}
             engine = cls.open(opened, reducer=object_of(**settings), **options)
             with engine._closed_on_failure():
                 engine._settings.now.must_agree_with(settings | {"seed": seed})
@@ -229,14 +226,12 @@ class DataEngine:
     ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
-        TraceError for a wrong shape, and for a first trace of less than 10 samples; whatever else fails becomes VERIFY, a
-        store that is away too.
-        part : the part's number, where one is known: a part that comes again then has one vote, and none on itself.
+        part : the part's number, where one is known: a part that comes again has one vote, and none on itself.
         wait : return only when the decision is in the store; by default it is there before any report on it returns.
-        decision_id : of the caller's, used once, so that whoever died before the answer asks again: the same id and trace
-            have the same decision for ever, which is on the disk, in the store's journal at least, when this returns.
-            TraceError for the id of another trace, ReportError for what is no id.
+        decision_id : of the caller's: the same id and trace have the same decision for ever, on the disk when this returns.
         late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
+        Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
+        for what is no id. Whatever else fails becomes VERIFY, a store that is away too.
         """
         self._keeper.check()
         with uninterrupted():
@@ -263,10 +258,8 @@ class DataEngine:
     def decide_late(self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str) -> Decision:
         """VERIFY, `Reason.LATE`, in any thread: what `decide` in the engine's own would say comes too late.
 
-        It is on the disk when this returns, and `decide` answers the same from then on. An id that has a decision keeps it;
-        where both come to it at once, the first to record one. What is wrong with a trace is said as ever.
-        In memory, which belongs to the engine's thread, and before the first trace has set the contract, `decide` has to
-        record it, with `late`. Errors as of `decide`.
+        It is on the disk when this returns; an id that has a decision keeps it. With a store in memory, and before a first
+        trace has set the contract, `decide` has to record it, with `late`. Errors as of `decide`.
         """
         self._keeper.check()
         id_ = as_id(decision_id)
@@ -297,18 +290,15 @@ class DataEngine:
     def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
         """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
         if self.trace is None:
-            trace = self._peers_trace() or trace
+            try:
+                if self.store.product is not None:
+                    trace = self._keeper.ask(lambda: peers_trace(self.store)) or trace
+            except StoreError:  # the cell's own first trace stands
+                log.exception("the product's contract of traces cannot be had")
             self._maker.agree_on(trace)
-            self._settings.agree_on(trace, inferred)
+            self._settings.now = replace(self._settings.now, trace=trace, inferred=inferred)
+            self._settings.save()
         return self.trace or trace
-
-    def _peers_trace(self) -> TraceSpec | None:
-        """What the product's other cells agreed on; where the store is away, the cell's own first trace stands."""
-        try:
-            return self._keeper.ask(lambda: peers_trace(self.store)) if self.store.product is not None else None
-        except StoreError:
-            log.exception("the product's contract of traces cannot be had")
-            return None
 
     def _as_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
         x = as_agreed(trace, self.trace, self._settings.now.inferred and self.version + self.new_labels == 0)
@@ -326,9 +316,8 @@ class DataEngine:
 
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
-        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a report
-        on a rejected part, or a label that is neither a bool nor exactly 1 or 0; StoreError where neither the store nor its
-        journal can be written: nothing is taken then.
+        Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a
+        rejected part, or what is no label; StoreError where neither the store nor its journal can be written.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._keeper.check()
@@ -340,7 +329,10 @@ class DataEngine:
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
         if trace is None or success:
-            raise unknown_stop(decision_id)
+            raise UnknownDecisionError(
+                f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
+                "a system stop whose decision was lost can be reported with its trace."
+            )
         item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
         return self._put(item)
 
@@ -365,16 +357,14 @@ class DataEngine:
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         trace = cell.insert()
         begin = self.clock()
-        decision = self.decide(
-            trace, getattr(cell, "part", None)
-        )  # a cell that knows its parts' numbers tells the last one
+        decision = self.decide(trace, getattr(cell, "part", None))  # a cell may know its parts' numbers
         seconds = self.clock() - begin
         outcome, success, source = None, None, None
         if decision.action is Action.VERIFY:
             success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
         elif decision.action is Action.ACCEPT:
             outcome = as_outcome(cell.proceed(), f"decision {decision.id}, by proceed()")
-            success = KNOWN.get(outcome)
+            success = {Outcome.STOPPED: False, Outcome.CONFIRMED: True}.get(outcome)  # silence is not a success
         else:
             cell.reject()
         if success is not None:
@@ -428,10 +418,7 @@ class DataEngine:
         return self._keeper.find(as_id(decision_id))
 
     def know_ids(self) -> None:
-        """Learn which ids are taken, so that `decide` looks no new one up in the store: quicker, where callers name them.
-
-        It reads every id once, a second for a million of them.
-        """
+        """Learn which ids are taken (a second for a million), so that `decide` looks no new one up in the store."""
         self.flush()
         self._keeper.recent.know(self.store.decision_ids())
 
@@ -527,8 +514,7 @@ class DataEngine:
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
-        versions = self._versions
-        return explain(decision_id, Records(self.store, lambda: versions.answering, versions.version), neighbours)
+        return explain(decision_id, Records(self.store, lambda: self._versions.answering, self.version), neighbours)
 
     def __enter__(self) -> Self:
         return self

@@ -1,9 +1,8 @@
 """What becomes of parts: labels on their way to the store, the rule, the references and the next retrain.
 
-Nothing is known of an accepted part while it goes on. With `Policy(stops="all")` a bad one stops the system before the next
-decision, so that one confirms it: the rule is told, the trace becomes a reference, and its label, CONFIRMED, is stored
-with the next report, before the next retrain, or when `BATCH` wait, so that no decision waits for the disk. With "some"
-it is counted as silent, which is no success; the watch of the safe mode is told how many there were.
+With `Policy(stops="all")` a bad part stops the system before the next decision, so that one confirms an accepted part: the
+rule is told, the trace becomes a reference, and its label, CONFIRMED, is stored with the next report, before the next
+retrain, or when 100 wait. With "some" it is counted as unobserved, which is no success.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-from ..errors import StoreError, UnknownDecisionError
+from ..errors import StoreError
 from ..records import Action, Source, source_of
 from ..store.outbox import Keeper
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
@@ -19,14 +18,12 @@ from .settings import SettingsInForce
 from .versions import ModelVersions, Point
 
 log = logging.getLogger("dengine")
-BATCH = 100  # confirmed parts that wait for a report, before a decision stores them
 
 
 class Feedback:
     """Takes in what became of decided parts.
 
-    settings : whether silence until the next decision confirms an accepted part, and since which version: what an earlier
-        one accepted is not waited for.
+    settings : whether silence until the next decision confirms an accepted part, and since which version.
     on_safe_mode : called with the reason, "" where it ends, when the safe mode begins or ends; it is recorded before.
     """
 
@@ -83,7 +80,7 @@ class Feedback:
                 self._waiting.append((known, label))
             else:
                 self._silent += 1
-        if len(self._waiting) >= BATCH:
+        if len(self._waiting) >= 100:  # so many confirmed parts wait for a report
             try:
                 self.store_waiting()
             except StoreError:  # they still wait, in memory; no decision fails for it
@@ -190,11 +187,3 @@ class Feedback:
                 self.on_safe_mode(now)
         except Exception:
             log.exception("safe mode %s, and that could not be told", f"began: {now}" if now else "ended")
-
-
-def unknown_stop(decision_id: str) -> UnknownDecisionError:
-    """What is said of a report on a decision that is not known."""
-    return UnknownDecisionError(
-        f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
-        "a system stop whose decision was lost can be reported with its trace."
-    )

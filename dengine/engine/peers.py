@@ -1,18 +1,15 @@
 """An engine whose product other cells make too: their labels become its references, their newer versions answer here.
 
-Labels of a product have one sequence over all its cells. An engine keeps a part of it without gaps: its window holds
-every label up to the newest one there, so that a version, which says up to which label it knows, means the same in each
-cell. A label of its own is a reference at once, and waits for the peers' before it until it enters the window.
-
-News is asked for between two cycles, once in a while, and never by `decide`. What cannot be had is asked for again later:
-a cell whose connection is lost goes on with what it has.
+Labels of a product have one sequence over all its cells. An engine's window holds every label up to its newest there: one
+of its own is a reference at once, and waits for the peers' before it until it enters the window. News is asked for between
+two cycles, never by `decide`; a cell whose connection is lost goes on with what it has.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,15 +21,15 @@ from ..recipe import Recipe
 from ..records import TraceSpec, trace_in
 from ..store.base import Store
 from ..store.records import ModelVersion, without_rule
-from .resume import TrainedOn, join_since, known_to, restored
+from .resume import join_since, known_to, restored
 from .settings import EngineSettings
+from .trainer import TrainedOn
 from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
 NEWS_SECONDS = 1.0  # between two questions for news
 MOST = 200  # labels taken in at once: each is embedded, some tenths of a millisecond
 ROUNDS = 5  # of them before a retrain: after a long absence it need not know all
-OVERDUE = 2  # times a schedule: then a peer whose turn it was to retrain does not do it
 
 
 def agreed(settings: EngineSettings, store: Store) -> EngineSettings:
@@ -46,7 +43,7 @@ def peers_trace(store: Store) -> TraceSpec | None:
 
 
 def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
-    """What a new engine is asked for, as `DataEngine` takes it; what was left open, as a peer has it if there is one."""
+    """What a new engine is asked for; what was left open, as a peer has it if there is one."""
     known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)
     if filled.get("seed") is None:
@@ -57,26 +54,14 @@ def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
     return filled
 
 
-@dataclass(frozen=True, slots=True)
-class _Own:
-    """A label of this cell."""
-
-    trace: NDArray[np.float32]
-    label: int
-    hash: int
-
-
 class Fleet:
-    """What one engine takes in of its product: a `versions.LabelCount` of all its cells' labels.
-
-    store : of one cell of a product.  versions : whose model answers, and whose window is filled.
-    """
+    """What one engine takes in of its product: a `versions.LabelCount` of all its cells' labels."""
 
     shared = True
 
     def __init__(self, store: Store, versions: ModelVersions) -> None:
         self.store, self.versions = store, versions
-        self._ahead: dict[int, _Own] = {}  # own labels by number; of peers' before them nothing is known yet
+        self._ahead: dict[int, tuple[NDArray[np.float32], int, int]] = {}  # own labels, peers' missing
         self._since: list[tuple[int, bool]] = []  # labels since the newest retrain began: number, and whether it is own
         self._trained_to = 0  # newest label that the newest retrain knew
         self._told_to = 0  # newest own label: the rule was told of all until there
@@ -99,7 +84,7 @@ class Fleet:
 
     def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
         """Take a label of this cell that was stored, and is a reference already."""
-        self._ahead[seq], self._told_to = _Own(trace, label, hash_), max(seq, self._told_to)
+        self._ahead[seq], self._told_to = (trace, label, hash_), max(seq, self._told_to)
         if seq == self._window.newest_seq + 1:
             self._admit(trace, label, hash_, seq)
 
@@ -125,7 +110,7 @@ class Fleet:
         return self._turn(retrain_every)
 
     def _turn(self, retrain_every: int) -> bool:
-        due, late = self._since[retrain_every - 1 : retrain_every], self._since[OVERDUE * retrain_every - 1 :]
+        due, late = self._since[retrain_every - 1 : retrain_every], self._since[2 * retrain_every - 1 :]  # a peer's turn
         return any(own for _, own in (*due, *late))
 
     def begin(self) -> None:
@@ -162,16 +147,13 @@ class Fleet:
         for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
             self._admit(row[0], int(row[1]), int(row[2]), int(row[3]))
         if news.correction > self.versions.corrected_to:
-            self._correct()
+            try:
+                self.versions.correct(own=False)
+            except StoreError as error:  # asked for again with the next news
+                log.warning("corrections of product %s cannot be had yet: %s", self.store.product, error)
         n = len(labelled.seq)
         self._asked = self.versions.clock() if n < MOST else -np.inf  # more is waiting: the next cycle goes on
         return n
-
-    def _correct(self) -> None:
-        try:
-            self.versions.correct(own=False)
-        except StoreError as error:  # asked for again with the next news
-            log.warning("corrections of product %s cannot be had yet: %s", self.store.product, error)
 
     def _take_over(self, version: ModelVersion) -> None:
         """Let a peer's version answer, with every label since and this cell's own rule; one that fails is left alone."""
@@ -194,9 +176,9 @@ class Fleet:
         self._count([each for each in self._since if each[0] > self._trained_to])
 
     def _add_ahead(self, model: EngineModel, last_seq: int) -> None:
-        for seq, own in self._ahead.items():
+        for seq, (trace, label, hash_) in self._ahead.items():
             if seq > last_seq:
-                model.add_safely(model.place_safely(own.trace, own.hash), own.label, own.hash, seq)
+                model.add_safely(model.place_safely(trace, hash_), label, hash_, seq)
 
     def swapped(self, model: EngineModel) -> None:
         """A version that this cell trained answers: labels of its own that wait for peers' before them are in it too."""

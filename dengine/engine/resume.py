@@ -1,8 +1,4 @@
-"""Going on with a store: the same version, the same decisions, bit for bit.
-
-What a version's references learned since it was stored, labels and corrections, is done again in the order in which it
-happened.
-"""
+"""Going on with a store, bit for bit: what a version learned since it was stored is done again in the same order."""
 
 from __future__ import annotations
 
@@ -18,40 +14,12 @@ from ..model.base import EngineModel, Told
 from ..store.base import Store
 from ..store.records import Correction, Evidence, ModelVersion, without_rule
 from .settings import EvidenceWindow
-from .trainer import Window
-
-MANY = 500  # labels and no retrain yet: they were imported
-
-
-@dataclass(frozen=True)
-class TrainedOn:
-    """What a version was trained on.
-
-    seq : (n,) its labels.  corrected_to : newest correction that these had.  counts_from : newest label that the next
-        retrain does not wait for.
-    """
-
-    seq: NDArray[np.int64]
-    corrected_to: int
-    counts_from: int
-
-    def to_state(self) -> dict[str, NDArray[Any]]:
-        """Plain arrays for the store."""
-        numbers = {"trained_as": np.array(self.corrected_to), "counts_from": np.array(self.counts_from)}
-        return {"trained_on": self.seq} | numbers
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> TrainedOn:
-        """What `to_state` gave."""
-        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
+from .trainer import TrainedOn, Window
 
 
 @dataclass(frozen=True)
 class Resumed:
-    """Where an engine stood: the model that answered (None: no retrain yet), its version, labels since the last retrain.
-
-    trained_on : None without a model.  corrected_to : newest correction.
-    """
+    """Where an engine stood: the model that answered (None: no retrain yet), and the newest correction."""
 
     model: EngineModel | None
     version: int
@@ -64,12 +32,12 @@ def resume(store: Store, template: EngineModel, window: Window, evidence: Eviden
     """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
     version = store.last_version()  # before the labels: a peer may store both meanwhile
     labelled = store.labelled(window.capacity)
-    window.extend(labelled)
+    window.refill(labelled)
     # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
     state = {} if version is None else version.state if version.version >= evidence.since else without_rule(version.state)
     model = None if version is None else restored(store, template, state)
     if version is None or model is None:
-        if len(labelled.seq) >= MANY:
+        if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
             template.look_ahead_safely(labelled.traces)
         template.begin_safely_in(evidence.began_in)
         _tell(template, store.evidence_since(0, evidence.since))
@@ -99,10 +67,7 @@ def restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[An
 
 
 def refit(model: EngineModel, store: Store, trained_on: TrainedOn) -> bool:
-    """Train a model on what another was trained on, with the labels as they stood then.
-
-    False where a trace of these is damaged: fitted on the others, its references would lie elsewhere.
-    """
+    """Train a model on what another was trained on, with the labels of then; False where a trace of these is damaged."""
     first, last = int(trained_on.seq[0]), int(trained_on.seq[-1])
     data = store.labelled(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
@@ -126,10 +91,7 @@ def corrected_at(version: ModelVersion) -> int:
 
 
 def join_since(model: EngineModel, store: Store, version: ModelVersion, window: Window) -> int:
-    """Let a version's model learn what happened since it was stored, in that order: labels join, corrections change them.
-
-    Returns the newest correction.
-    """
+    """Let a version's model learn what came since it was stored, in order; returns the newest correction's number."""
     corrected_to = corrected_at(version)
     as_of = corrected_to if model.keeps_references else None  # a rival cannot be corrected afterwards
     # Up to the newest in the window: what peers stored since comes as their news.
@@ -150,10 +112,7 @@ def join_since(model: EngineModel, store: Store, version: ModelVersion, window: 
 
 
 def change(model: EngineModel, store: Store, correction: Correction) -> bool:
-    """Do to a model's references what a correction says; False where the reference is not what it should be.
-
-    A reference gets its new label, or leaves. What was forgotten and counts again joins as the newest.
-    """
+    """Give a reference its corrected label, take it out, or let it join again; False where it is not what it should be."""
     if not model.keeps_references:
         return True
     # As reported, of whichever cell; nothing where the part was quarantined, or the trace is damaged.

@@ -21,17 +21,8 @@ from ..store.outbox import Keeper
 log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
-LOOP = (
-    "seed",
-    "trace",
-    "retrain_every",
-    "budget",
-    "encoder_budget",
-    "max_steps",
-    "window",
-    "audit_rate",
-    "stops",
-)  # that count for any model
+# What counts for any model.
+LOOP = ("seed", "trace", "retrain_every", "budget", "encoder_budget", "max_steps", "window", "audit_rate", "stops")
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 
@@ -83,10 +74,9 @@ class EngineSettings:
 
     @classmethod
     def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
-        """What `to_store` gave. name : of the store, for errors.
+        """What `to_store` gave. name : of the store, for errors.  reducer, model : objects that it cannot bring back.
 
-        reducer, model : objects that the store cannot bring back, handed in again. Raises StoreError for a store that no
-        engine has used, SettingError where an object is missing, or is another one than the store was made with.
+        Raises StoreError for an unused store, SettingError for a missing object, or another than it was made with.
         """
         if "recipe" not in known:
             raise StoreError(f"Expected a store that an engine has used, {name} is empty; make a DataEngine with it.")
@@ -112,9 +102,14 @@ class EngineSettings:
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
         inferred = "inferred" in known
+        seed = known.get("seed", "0")
+        if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
+            raise StoreError(
+                f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy."
+            )
         policy_since, *evidence = (int(known.get(name, "0")) for name in MARKS)
-        model_, trace, seed = known.get("model"), trace_in(known), seed_in(known)
-        return cls(recipe, seed, model_, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
+        own, trace = known.get("model"), trace_in(known)
+        return cls(recipe, int(seed), own, made_with, trace, inferred, policy_since, EvidenceWindow(*evidence))
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """The settings in force, and the untrained model: the recipe's, or the one that was handed in."""
@@ -139,7 +134,7 @@ class EngineSettings:
         if not isinstance(wished.get("reducer"), str):  # an object was compared when the store was opened
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
         # A program's settings are the same in the shadow mode, which a person begins and ends.
-        counts = LOOP if self.model is not None else tuple(name for name in have if name != "shadow")
+        counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
@@ -149,10 +144,7 @@ class EngineSettings:
 
 
 def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recipe:
-    """The recipe that was asked for, or the reducer's own, with the settings that were given beside it.
-
-    SettingError where both are given and contradict each other: a recipe's radius and parameters belong to its reducer.
-    """
+    """The recipe that was asked for, or the reducer's own, with settings beside it; SettingError where the two differ."""
     base = Recipe.load(recipe if recipe is not None else "conv" if reducer is None else reducer)
     if recipe is not None and reducer is not None and reducer != base.reducer:
         raise SettingError(f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out.")
@@ -178,14 +170,6 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
         )
 
 
-def seed_in(known: Mapping[str, str]) -> int:
-    """The seed among a store's settings. StoreError for what is none."""
-    seed = known.get("seed", "0")
-    if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
-        raise StoreError(f"Expected a seed in the store's settings, got {shortened(seed)}; restore the store from a copy.")
-    return int(seed)
-
-
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
     plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
@@ -203,11 +187,6 @@ class SettingsInForce:
         self.now = settings
         self.waiting = False
         self._keeper = keeper
-
-    def agree_on(self, trace: TraceSpec, inferred: bool) -> None:
-        """Set the traces' contract."""
-        self.now = replace(self.now, trace=trace, inferred=inferred)
-        self.save()
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""

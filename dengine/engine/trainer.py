@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,19 +65,11 @@ class Window:
         self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
         self.total += 1
 
-    def extend(self, labelled: Labelled) -> None:
-        """Take in many, oldest first."""
-        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
-            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
-
     def refill(self, labelled: Labelled) -> None:
         """Hold these, oldest first, in the place of all that was held."""
         self._clear()
-        self.extend(labelled)
-
-    def after(self, seq: int) -> int:
-        """How many labels after this one are held."""
-        return len(self.newer(seq))
+        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
+            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
 
     def draw(self, n: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """Traces (m, C, T) and hashes (m,) of `n` at most, drawn blind to labels, others at each new label."""
@@ -125,13 +118,32 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Limits:
-    """What a retrain may use.
+class TrainedOn:
+    """What a version was trained on: labels seq (n,), corrected up to corrected_to.
 
-    budget : seconds of wall time for the whole; None: time decides nothing.
-    max_steps : optimiser steps; None: as many as the reducer's own settings say.
-    reserve : seconds kept for what follows the last step: re-embedding, compiling, the swap. The default serves until
-        a tail was measured.
+    counts_from : newest label that the next retrain does not wait for.
+    """
+
+    seq: NDArray[np.int64]
+    corrected_to: int
+    counts_from: int
+
+    def to_state(self) -> dict[str, NDArray[Any]]:
+        """Plain arrays for the store."""
+        numbers = {"trained_as": np.array(self.corrected_to), "counts_from": np.array(self.counts_from)}
+        return {"trained_on": self.seq} | numbers
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, NDArray[Any]]) -> TrainedOn:
+        """What `to_state` gave."""
+        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a retrain may use: seconds of wall time, and optimiser steps; None: no limit.
+
+    reserve : seconds kept for what follows the last step; the default serves until that was measured.
     """
 
     budget: float | None = None
@@ -141,7 +153,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Slice:
-    """What one run of the encoder's training may use: seconds by the clock, or steps where a seed must repeat exactly."""
+    """One run of the encoder's training: seconds by the clock, or steps where a seed must repeat exactly."""
 
     seconds: float | None
     steps: int | None
@@ -152,11 +164,10 @@ class Slice:
 
 
 class EncoderTime:
-    """The time in which the encoder may train: so much a cycle on average, saved up and taken in slices.
+    """The time in which the encoder may train: `per_cycle` seconds on average, saved up and taken in slices.
 
-    per_cycle : seconds.
     in_steps : whether a step counts as `STEP_SECONDS`, whatever it took.
-    steps : taken so far.  seconds : that they counted as.  longest : seconds by the clock of the longest slice in line.
+    steps, seconds : taken so far.  longest : seconds of the longest slice in line.
     """
 
     def __init__(self, per_cycle: float, in_steps: bool) -> None:
@@ -185,7 +196,7 @@ class EncoderTime:
     def spend(self, steps: int, seconds: float) -> None:
         """Account for steps that took so long."""
         counted = steps * STEP_SECONDS if self.in_steps else seconds
-        # What trained nothing, having nothing to train or failing at it, is not asked again at every cycle.
+        # What trained nothing is not asked again at every cycle.
         self._saved = max(0.0, self.saved - counted) if steps else 0.0
         self.steps, self.seconds = self.steps + steps, self.seconds + counted
 
@@ -214,8 +225,7 @@ class Trained:
 class Retrainer:
     """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
 
-    clock : seconds, of any origin; with a process executor it must pickle, as `time.perf_counter` does.
-    encoder_time : in which the encoder may train; None: it never does.
+    clock : in seconds; it must pickle for a process executor.  encoder_time : in which the encoder may train.
     """
 
     def __init__(
@@ -227,18 +237,10 @@ class Retrainer:
         encoder_time: EncoderTime | None = None,
     ) -> None:
         self.encoder_time = encoder_time or EncoderTime(0.0, in_steps=True)
-        self.window = window
-        self.limits = limits
-        self.executor = executor
-        self.clock = clock
+        self.window, self.limits, self.executor, self.clock = window, limits, executor, clock
         self.future: Future[Trained] | None = None
         self._began = 0.0  # monotonic seconds
         self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
-
-    @property
-    def busy(self) -> bool:
-        """Whether a retrain is under way beside the cell, or waits to be swapped in."""
-        return self.future is not None
 
     def improve(self, current: EngineModel) -> None:
         """Train the current model's encoder for a slice, in line, where one is due."""
@@ -267,7 +269,7 @@ class Retrainer:
             log.error("the executor takes no more work, retrains are in line from now on: %s", error)
             self.executor = None
         self._began, self._seq = time.monotonic(), data.seq
-        return self.busy
+        return self.future is not None
 
     def collect(self, wait: float = 0.0) -> Trained | None:
         """What was trained beside the cell, once it is done, or after `wait` seconds: what is not done then is dropped."""
@@ -311,10 +313,9 @@ def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock:
 
 
 def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
-    """Train a successor on the data; a plain function of plain arguments, so that any executor can run it.
+    """Train a successor on the data; a plain function, so that any executor can run it.
 
-    The gate reads no label. One on held-out loss belongs to each head, inside the reducer: here it would let fold k's
-    labels choose encoder k.
+    The gate reads no label: one on held-out loss would let fold k's labels choose encoder k.
     """
     begin = clock()
     deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
@@ -332,8 +333,7 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
     except Exception as error:  # no exception inside a model reaches the cell: it is recorded
         model, reason = None, _dropped(error)
     end = clock()
-    tail = end - (stop.asked_at or begin)
-    return Trained(model, reason, n_steps, end - begin, tail, seq=data.seq, begin=begin)
+    return Trained(model, reason, n_steps, end - begin, end - (stop.asked_at or begin), seq=data.seq, begin=begin)
 
 
 def _dropped(error: Exception) -> str:

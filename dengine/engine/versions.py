@@ -1,7 +1,7 @@
-"""The model that answers, what it learns from one label after the other, and how a new version takes its place.
+"""The model that answers, what it learns from each label, and how a new version takes its place.
 
-A candidate that was trained beside the cell comes in by steps that no part waits for: it learns the labels that came
-meanwhile, is stored, and then answers.
+A candidate that was trained beside the cell comes in by short steps: it learns the labels that came meanwhile, is stored,
+and then answers.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from ..reducers.base import State
 from ..store.base import Store
 from ..store.outbox import Asked, Keeper
 from ..store.records import Change, StoredDecision, without_rule
-from .resume import TrainedOn, change, join_since, refit, resume, tell_all
+from .resume import change, join_since, refit, resume, tell_all
 from .settings import EvidenceWindow
-from .trainer import HUNG, Retrainer, Trained, Window
+from .trainer import HUNG, Retrainer, Trained, TrainedOn, Window
 
 log = logging.getLogger("dengine")
 STEP = 0.001  # seconds of learning at once: some labels
@@ -34,11 +34,7 @@ Point = NDArray[np.float32]
 
 
 class Candidate:
-    """What was trained, until it answers.
-
-    previous : the model that answers, whose rule goes on.  version : its number.
-    report : what is known of it so far.  storing : its commit, once begun.
-    """
+    """What was trained, until it answers in the place of `previous`; `storing` is its commit, once begun."""
 
     def __init__(self, trained: Trained, previous: EngineModel, version: int, clock: Callable[[], float]) -> None:
         self.model, self.seq = trained.model, trained.seq
@@ -67,15 +63,12 @@ class Candidate:
 
 
 class LabelCount(Protocol):
-    """Counts the labels that the next retrain waits for: a cell's own, or those of all cells of its product.
-
-    shared : whether labels and versions are a product's.
-    """
+    """Counts the labels that the next retrain waits for: a cell's own, or (shared) those of all cells of its product."""
 
     shared: bool
 
     def resume(self) -> None:
-        """The engine has gone on from the store."""
+        """Go on: the engine has from the store."""
 
     def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
         """Take a label of this cell that was stored, and is a reference already."""
@@ -84,16 +77,16 @@ class LabelCount(Protocol):
         """Whether a retrain is this cell's turn."""
 
     def begin(self) -> None:
-        """A retrain begins."""
+        """Know what can be known before a retrain, and count from here."""
 
     def begin_counting(self) -> None:
         """Count the labels of the next retrain from here."""
 
     def recount(self, counts_from: int) -> None:
-        """The window was filled anew."""
+        """Count anew: the window was filled anew."""
 
     def swapped(self, model: EngineModel) -> None:
-        """A version that this cell trained answers."""
+        """Take notice of a version that this cell trained, and that answers now."""
 
     def complete(self) -> None:
         """Know all that was stored, before a person changes something."""
@@ -103,15 +96,16 @@ class LabelCount(Protocol):
 
 
 class OwnLabels:
-    """The `LabelCount` of a cell without a product. Every label counts as soon as it is known."""
+    """The `LabelCount` of a cell without a product, where every label counts as soon as it is known."""
 
     shared = False
 
     def __init__(self, versions: ModelVersions) -> None:
         self._versions = versions
-
-    def resume(self) -> None:
-        """Nothing beyond what the store said."""
+        self.begin = self.begin_counting
+        self.resume = self.complete = lambda: None  # nobody else has labels
+        self.swapped = lambda model: None
+        self.state: Callable[[], dict[str, NDArray[Any]]] = dict
 
     def keep(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
         """Give it to the next retrain."""
@@ -121,27 +115,13 @@ class OwnLabels:
         """Whether there are so many."""
         return self._versions.new_labels >= retrain_every
 
-    def begin(self) -> None:
-        """Count from here."""
-        self.begin_counting()
-
     def begin_counting(self) -> None:
         """None is new."""
         self._versions.new_labels = 0
 
     def recount(self, counts_from: int) -> None:
         """Those after the ones that were trained on."""
-        self._versions.new_labels = self._versions.retrainer.window.after(counts_from)
-
-    def swapped(self, model: EngineModel) -> None:
-        """Nobody else's labels are missing."""
-
-    def complete(self) -> None:
-        """Nobody else has labels."""
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Nothing."""
-        return {}
+        self._versions.new_labels = len(self._versions.retrainer.window.newer(counts_from))
 
 
 class ModelVersions:
@@ -149,11 +129,9 @@ class ModelVersions:
 
     template : untrained; what the first version is trained from.
     answering : the model that answers; None before the first retrain.  version : its number, from 1; 0 before.
-    new_labels : since the last retrain began, as `count` has them.
-    keeper : asks the store.  evidence : what the rule in force is told of.
-    journal_cleared : StoreError while labels of this cell wait in the journal.
-    store_waiting : stores what the rule was told of and the store not yet, StoreError where it cannot; called before any
-        training or swap, since a version is stored after all that its rule was told of. Both are set by the feedback.
+    new_labels : since the last retrain began, as `count` has them.  evidence : what the rule in force is told of.
+    store_waiting, journal_cleared : set by the feedback. The first stores what the rule was told of and the store not yet,
+        before any training or swap; both raise StoreError where that cannot be.
     """
 
     def __init__(
@@ -165,6 +143,7 @@ class ModelVersions:
         evidence: EvidenceWindow,
     ) -> None:
         self.template, self.retrainer, self.keeper, self.clock, self.evidence = template, retrainer, keeper, clock, evidence
+        self.store: Store = keeper.store  # asked without a time limit, so not while the cell waits
         self.answering: EngineModel | None = None
         self.version, self.new_labels, self.corrected_to = 0, 0, 0
         self.store_waiting: Callable[[], None] = lambda: None
@@ -176,11 +155,6 @@ class ModelVersions:
         self._provisional = itertools.count(-1, -1)
         self._news: RetrainReport | None = None
         self._candidate: Candidate | None = None
-
-    @property
-    def store(self) -> Store:
-        """What the keeper keeps; asked without a time limit, so not while the cell waits."""
-        return self.keeper.store
 
     @property
     def next_number(self) -> int:
@@ -241,10 +215,7 @@ class ModelVersions:
         tell_all(self.newest, known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
-        """Learn what the store's newest corrections say: references, window and rule, before the next decision.
-
-        What keeps references of its own, a rival, is trained anew at once; by the cell that corrected.
-        """
+        """Learn the store's newest corrections; a rival is trained anew, by the cell that corrected."""
         window = self.retrainer.window
         last = window.newest_seq if self.count.shared else None  # what peers stored since comes as their news
         window.refill(self.store.labelled(window.capacity, last=last))
@@ -312,21 +283,15 @@ class ModelVersions:
     def retrain(self) -> RetrainReport:
         """Train and swap, in line."""
         self.collect(HUNG)
-        self._begin()
-        self._take(self.retrainer.train(self.newest))
+        self.store_waiting()
+        self.count.begin()
+        self._candidate = Candidate(self.retrainer.train(self.newest), self.newest, self.version, self.clock)
         self._advance(to_the_end=True)
         assert self._news is not None  # nothing came in between; for the type checker
         return self._news
 
-    def _begin(self) -> None:
-        self.store_waiting()
-        self.count.begin()
-
     def work(self, retrain_every: int) -> RetrainReport | None:
-        """Do what is due between two cycles: a retrain after so many labels, else a slice of the encoder's training.
-
-        While the store is away nothing is retrained: a version answers only once it is stored.
-        """
+        """Do what is due between two cycles: a retrain, where the store is there, or a slice of encoder training."""
         if self.count.due(retrain_every) and self._ready():
             return self.start_retrain()
         if self.answering is not None:
@@ -348,7 +313,7 @@ class ModelVersions:
     @property
     def busy(self) -> bool:
         """Whether a retrain is under way beside the cell, or its version on its way in."""
-        return self.retrainer.busy or self.swapping
+        return self.retrainer.future is not None or self.swapping
 
     def start_retrain(self) -> RetrainReport | None:
         """Train beside the cell where there is an executor, unless it is at it; else in line."""
@@ -356,7 +321,8 @@ class ModelVersions:
         if self.busy:
             return None
         if self.retrainer.executor is not None:
-            self._begin()
+            self.store_waiting()
+            self.count.begin()
             if self.retrainer.start(self.newest):
                 return None
         return self.retrain()
@@ -368,12 +334,9 @@ class ModelVersions:
         to_the_end |= wait > 0.0 or self.count.shared  # peers' versions and corrections do not come in between
         trained = self.retrainer.collect(wait)
         if trained is not None:
-            self._take(trained)
+            self._candidate = Candidate(trained, self.newest, self.version, self.clock)
         if self._candidate is not None and (to_the_end or trained is None):  # to take it was a step
             self._advance(to_the_end)
-
-    def _take(self, trained: Trained) -> None:
-        self._candidate = Candidate(trained, self.newest, self.version, self.clock)
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the version on its way in a step further. One that cannot be stored is dropped."""
@@ -407,11 +370,8 @@ class ModelVersions:
         candidate.report = replace(candidate.report, seconds=candidate.seconds)  # storing it comes on top
         if model is not None:
             candidate.report = replace(candidate.report, version=self.next_number, accepted=True)
-            state = self._state(model, self._trained_on_of(candidate))
+            state = self._state(model, TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1])))
         return self.keeper.version(candidate.report, self.retrainer.window.newest_seq, state)
-
-    def _trained_on_of(self, candidate: Candidate) -> TrainedOn:
-        return TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1]))
 
     def _swap(self, candidate: Candidate, number: int | None) -> None:
         report, model = candidate.report, candidate.model
@@ -420,7 +380,7 @@ class ModelVersions:
             model.untold = model.untold or self.newest.untold
             self._newest = report.version
             self.answering, self.version = model, report.version  # one reference is swapped
-            self._trained_on = self._trained_on_of(candidate)
+            self._trained_on = TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1]))
             self.count.swapped(model)
         self._news = report
 
