@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayCell, Source
+from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source
 from dengine.errors import ReportError, StoreError, TraceError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.store import MemoryStore
+from tests.support.driving import drive as play
+from tests.support.driving import evidence
 
 LOCAL = Policy(alpha=0.1, lower_bound=0.9)
 POOLED = replace(LOCAL, guarantee="pooled")
@@ -20,45 +22,48 @@ def make(policy: Policy, **options) -> DataEngine:
     return DataEngine(recipe=replace(RECIPE, policy=policy), replaying=True, **options)
 
 
-def play(engine: DataEngine, data: Dataset, first: int = 0, last: int | None = None, **options) -> list:
-    order = np.arange(len(data))[first:last]
-    return list(engine.run(ReplayCell(data, order, **options), len(order)))
-
-
-def evidence(cycle) -> tuple:
-    d = cycle.decision
-    counted = d.n_success, d.n_failure
-    return (d.action, d.predicted, d.lower, d.upper, *counted, d.embedding, d.model_version, d.reason, cycle.safe_mode)
-
-
 @pytest.fixture(scope="module")
 def stream(make_data) -> Dataset:
     return make_data(500, samples=60, seed=3)
 
 
-def accepted(engine: DataEngine, data: Dataset) -> list:
-    """Decisions on the good traces of a stream, until one is accepted."""
+def accepted(engine: DataEngine, data: Dataset) -> Decision:
+    """The first of the good traces that is accepted; those before it are reported."""
     for x in data.X[data.y == 1]:
         decision = engine.decide(x)
         if decision.action is Action.ACCEPT:
-            return [decision, x]
-        if decision.action is Action.VERIFY:
-            engine.report(decision.id, True)
+            return decision
+        engine.report(decision.id, True)
     raise AssertionError("nothing was accepted")
 
 
-# ---------------------------------------------------------------------------------------------- silence
+def said(cycles: list) -> list[tuple]:
+    return [(*evidence(cycle.decision), cycle.safe_mode) for cycle in cycles]
 
 
-def test_silence_until_the_next_decision_confirms_a_part_where_all_stops_are_known(stream: Dataset) -> None:
+def spoiled(stream: Dataset) -> Dataset:
+    """What was good, and is bad now."""
+    good = np.flatnonzero(stream.y == 1)[:60]
+    return Dataset(stream.X[good] + np.float32(0.01), np.zeros(60, np.int8))
+
+
+def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_part(stream: Dataset) -> None:
     engine = make(replace(LOCAL, stops="all"))
     play(engine, stream, 0, 200)
-    decision, _ = accepted(engine, stream)
-    engine.flush()
-    assert engine.store.get_decision(decision.id).source is None  # nothing is known of it yet
+
+    def source(decision: Decision) -> Source | None:
+        engine.flush()
+        return engine.store.get_decision(decision.id).source
+
+    silent = accepted(engine, stream)
+    assert source(silent) is None  # nothing is known of it yet
+    stopped = accepted(engine, stream)
+    assert source(silent) is Source.CONFIRMED
+    engine.report(stopped.id, False)
     engine.decide(stream.X[0])
-    engine.flush()
-    assert engine.store.get_decision(decision.id).source is Source.CONFIRMED
+    assert source(stopped) is Source.STOP
+    with pytest.raises(ReportError, match="confirmed"):
+        engine.report(silent.id, False)  # its confirmation is stored
 
 
 def test_silence_says_nothing_by_default(stream: Dataset) -> None:
@@ -69,59 +74,14 @@ def test_silence_says_nothing_by_default(stream: Dataset) -> None:
 
 
 def test_confirmed_parts_set_off_retrains_though_nothing_is_reported(stream: Dataset) -> None:
-    engine = make(replace(LOCAL, stops="all"))
-    cycles = play(engine, stream)
+    cycles = play(make(replace(LOCAL, stops="all")), stream)
     assert sum(c.retrain is not None for c in cycles if c.decision.action is Action.ACCEPT) >= 2
-
-
-def test_a_stop_reported_in_time_is_a_stop_and_no_confirmation(stream: Dataset) -> None:
-    engine = make(replace(LOCAL, stops="all"))
-    play(engine, stream, 0, 200)
-    decision, _ = accepted(engine, stream)
-    engine.report(decision.id, False)
-    engine.decide(stream.X[0])
-    engine.flush()
-    assert engine.store.get_decision(decision.id).source is Source.STOP
-
-
-def test_a_stop_that_comes_late_is_kept_and_the_rule_is_told_what_really_happened(stream: Dataset, tmp_path: Path) -> None:
-    engine = make(replace(POOLED, stops="all"), store=str(tmp_path / "late.db"))
-    play(engine, stream, 0, 300)
-    decision, _ = accepted(engine, stream)
-    engine.decide(stream.X[0])  # takes it for confirmed
-    engine.report(decision.id, False)
-    assert engine.store.get_decision(decision.id).source is Source.STOP
-    rule = {name: value.clone() for name, value in engine.model.rule.state_dict().items()}
-    engine.close()
-    with DataEngine.open(tmp_path / "late.db", replaying=True) as again:
-        for name, value in again.model.rule.state_dict().items():
-            np.testing.assert_array_equal(value.numpy(), rule[name].numpy(), err_msg=name)
-
-
-def test_a_stop_on_a_part_whose_confirmation_is_stored_is_refused(stream: Dataset) -> None:
-    engine = make(replace(LOCAL, stops="all"))
-    play(engine, stream, 0, 200)
-    decision, _ = accepted(engine, stream)
-    engine.decide(stream.X[0])
-    engine.flush()
-    with pytest.raises(ReportError, match="confirmed"):
-        engine.report(decision.id, False)
-
-
-def test_a_thousand_accepted_parts_lose_no_confirmation(make_data) -> None:
-    data = make_data(1200, samples=40, seed=5, failures=0.1)
-    engine = make(replace(LOCAL, stops="all"))
-    cycles = play(engine, data)
-    n_accepted = sum(c.decision.action is Action.ACCEPT for c in cycles)
-    outcomes = engine.store.outcomes()
-    open_now = cycles[-1].decision.action is Action.ACCEPT and cycles[-1].source is None
-    assert outcomes.stops + outcomes.confirmed == n_accepted - open_now
 
 
 def test_a_late_stop_whose_write_failed_is_counted_once_when_it_is_told_again(stream: Dataset, monkeypatch) -> None:
     engine = make(replace(POOLED, stops="all"))
     play(engine, stream, 0, 300)
-    decision, _ = accepted(engine, stream)
+    decision = accepted(engine, stream)
     engine.decide(stream.X[0])  # takes it for confirmed
     whole = engine.store.put_labels
 
@@ -158,15 +118,11 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
 
     engine = make(replace(POOLED, stops="all"), on_safe_mode=angry)
     play(engine, stream)
-    order = np.flatnonzero(stream.y == 1)[:60]
-    play(engine, Dataset(stream.X[order] + np.float32(0.01), np.zeros(60, np.int8)))
+    play(engine, spoiled(stream))
     assert engine.safe_mode
     status = engine.store.status()
     outcomes = engine.store.outcomes()
     assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
-
-
-# ---------------------------------------------------------------------------------------------- going on
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
@@ -175,12 +131,12 @@ def test_an_engine_opened_again_decides_and_counts_on_as_if_it_had_not_stopped(
     stream: Dataset, tmp_path: Path, guarantee: str, stops: str
 ) -> None:
     policy = replace(LOCAL, guarantee=guarantee, stops=stops, audit_rate=0.1)
-    whole = [evidence(c) for c in play(make(policy), stream)]
+    whole = said(play(make(policy), stream))
     url = str(tmp_path / "parted.db")
     parted = []
     for first in range(0, 500, 125):
         with DataEngine.open_or_create(url, recipe=replace(RECIPE, policy=policy), replaying=True) as engine:
-            parted += [evidence(c) for c in play(engine, stream, first, first + 125)]
+            parted += said(play(engine, stream, first, first + 125))
     assert parted == whole
 
 
@@ -188,7 +144,7 @@ def test_a_killed_engine_confirms_after_it_was_opened_what_had_gone_on(stream: D
     url = str(tmp_path / "killed.db")
     engine = make(replace(LOCAL, stops="all"), store=url)
     play(engine, stream, 0, 200)
-    decision, _ = accepted(engine, stream)
+    decision = accepted(engine, stream)
     engine.decide(stream.X[0], wait=True)
     engine.store.close()  # the confirmation was still in memory
     with DataEngine.open(url, replaying=True) as again:
@@ -197,17 +153,12 @@ def test_a_killed_engine_confirms_after_it_was_opened_what_had_gone_on(stream: D
         assert again.store.get_decision(decision.id).source is Source.CONFIRMED
 
 
-# ---------------------------------------------------------------------------------------------- safe mode
-
-
 def collapse(stream: Dataset, policy: Policy) -> tuple[DataEngine, list, list]:
     """An engine that learned a stream, and then one in which what was good is bad."""
     heard: list[str] = []
     engine = make(policy, on_safe_mode=heard.append)
     play(engine, stream)
-    order = np.flatnonzero(stream.y == 1)[:60]
-    spoiled = Dataset(stream.X[order] + np.float32(0.01), np.zeros(60, np.int8))
-    return engine, play(engine, spoiled), heard
+    return engine, play(engine, spoiled(stream)), heard
 
 
 @pytest.mark.parametrize("guarantee", ["local", "pooled"])
@@ -228,9 +179,6 @@ def test_safe_mode_ends_when_fresh_evidence_keeps_the_tolerance(stream: Dataset,
     assert heard[-1] == ""
     assert engine.safe_mode == ""
     assert engine.store.events()[-1].kind == "safe mode ended"
-
-
-# ---------------------------------------------------------------------------------------------- parts
 
 
 def test_the_part_hash_is_fnv_1a() -> None:
@@ -255,17 +203,12 @@ def test_a_part_that_comes_often_has_one_vote_and_none_on_itself(stream: Dataset
     near = lambda: x + rng.normal(0, 0.01, x.shape).astype(np.float32)  # noqa: E731
     before = engine.decide(near(), part="other")
     for _ in range(30):
-        engine.report(engine.store.get_decision(_verified(engine, near(), "often")).decision.id, True)
+        engine.report(engine.decide(near(), part="often").id, True)
     engine.retrain()
     counted = engine.decide(near(), part="other")
     itself = engine.decide(near(), part="often")
     assert counted.n_success == itself.n_success + 1
     assert counted.n_success <= before.n_success + 1 + 8  # what the new embedding moves; not thirty
-
-
-def _verified(engine: DataEngine, x: np.ndarray, part: str) -> str:
-    """The id of a decision that can be reported."""
-    return engine.decide(x, part=part).id
 
 
 @pytest.mark.parametrize("part", ["", 1.5, True, b"7", ["7"], "a\0b", "\ud800"])
@@ -291,9 +234,6 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_are_not(make_data)
         cycles = play(engine, Dataset(X[order], y[order], part=parts))
         last = [c.retrain for c in cycles if c.retrain is not None][-1]
         assert ("give their numbers" in last.reason) is said
-
-
-# ---------------------------------------------------------------------------------------------- certificate
 
 
 def test_the_certificate_counts_what_really_happened(stream: Dataset) -> None:

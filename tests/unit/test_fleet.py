@@ -22,6 +22,7 @@ from dengine.records import RetrainReport
 from dengine.store.peers import list_cells
 from dengine.store.records import address
 from tests.conftest import insertion_like
+from tests.support.driving import learn
 from tests.support.plans import plans
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -84,14 +85,6 @@ def probe() -> np.ndarray:
     return insertion_like(40, seed=99, noise=0.3).X[:, None]
 
 
-def learn(engine: DataEngine, parts: Dataset, rows: Any) -> None:
-    """Decide on parts, and report all that may be reported."""
-    for i in rows:
-        decision = engine.decide(parts.X[i])
-        if decision.action is not Action.REJECT:
-            engine.report(decision.id, bool(parts.y[i]))
-
-
 def said(engine: DataEngine, probe: np.ndarray) -> list[Any]:
     """What an engine says of traces that nobody learns from, to the last bit."""
     return [(p.action, p.lower, p.upper, p.n_success, p.n_failure, p.embedding) for p in engine.model.predict_many(probe)]
@@ -105,10 +98,17 @@ def rule(engine: DataEngine) -> dict[str, list[float]]:
     return {name: value.tolist() for name, value in engine.model.rule.state_dict().items()}
 
 
-# ---------------------------------------------------------------------------------------------------- what is shared
+def taught(fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE) -> tuple[DataEngine, DataEngine]:
+    """Two cells of one product that learned n parts by turns, and know each other's."""
+    cells = fleet.engine("a", recipe=recipe), fleet.engine("b", recipe=recipe)
+    for i in range(n):
+        learn(cells[i % 2], parts, [i])
+    for engine in cells:
+        engine.settle()
+    return cells
 
 
-def test_a_new_sister_decides_at_once_and_as_its_sisters_do(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
+def test_a_new_cell_decides_at_once_and_as_its_peers_do(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
     first = fleet.engine("a")
     learn(first, parts, range(100))
     second = fleet.engine("b")
@@ -158,28 +158,6 @@ def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_no
     assert len(first.store.retrains()) == 1
 
 
-def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
-    fleet: Fleet, parts: Dataset, probe: np.ndarray
-) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    learn(first, parts, range(15))
-    second._versions.count._asked = np.inf  # it asks for no news: it is at it
-    take, reports = second._versions._take, []
-
-    def late(trained: Any) -> None:
-        reports.append(first.retrain())  # meanwhile
-        take(trained)
-
-    second._versions._take = late  # type: ignore[method-assign]
-    reports.append(second.retrain())
-    assert [report.version for report in reports] == [1, 2]
-    first.settle()
-    assert first.version == second.version == 2
-    learn(first, parts, range(15, 20))
-    second._versions.count.take_in()
-    assert said(first, probe) == said(second, probe)
-
-
 def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
     fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
@@ -189,11 +167,9 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
         first.start_retrain()
         learn(second, parts, range(30, 40))
         learn(first, parts, range(40, 45))
-        first._versions.collect(wait=True)
-        for engine in (first, second, first):
+        executor.shutdown(wait=True)
+        for engine in (first, second, first, second):
             engine.settle()
-        first._versions.collect(wait=True)
-        second.settle()
         assert first.version == second.version
         assert counts(first, probe) == counts(second, probe)
         assert len(first.model.index) == len(second.model.index) == sum(e.store.status()["labels"] for e in (first, second))
@@ -222,44 +198,52 @@ def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset)
         assert sum(after) == sum(before) + 1
 
 
-def test_the_newest_labels_of_the_product_fill_the_window(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
-    small = RECIPE.with_settings(window=30)
-    first, second = fleet.engine("a", recipe=small), fleet.engine("b", recipe=small)
-    for i in range(70):
+def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_gaps(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    first, second = taught(fleet, parts, 60, RECIPE.with_settings(window=30))
+    for i in range(60, 70):
+        first.report(first.decide(np.full(100, np.nan)).id, False)
         learn((first, second)[i % 2], parts, [i])
     first.settle(), second.settle()
     newest = first.store.labelled(30)
     np.testing.assert_array_equal(newest.seq, second.store.labelled(30).seq)
     assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
-    np.testing.assert_array_equal(newest.traces, second.store.labelled(30).traces)
     assert counts(first, probe) == counts(second, probe)
 
 
-def test_bad_traces_leave_gaps_and_nothing_else(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    for i in range(40):
-        bad = first.decide(np.full(100, np.nan))
-        first.report(bad.id, False)
-        learn((first, second)[i % 2], parts, [i])
-    first.settle(), second.settle()
-    assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
+def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    reports = []
+
+    class Slow(SqlStore):
+        """Its version comes to the database after a peer's."""
+
+        def put_version(self, *version: Any) -> int:
+            if not reports:
+                reports.append(first.retrain())
+            return super().put_version(*version)
+
+    first, second = fleet.engine("a"), fleet.engine("b", store=fleet.store("b", kind=Slow))
+    learn(first, parts, range(15))
+    reports.append(second.retrain())
+    assert [report.version for report in reports] == [1, 2]
+    first.settle()
+    assert first.version == second.version == 2
+    learn(first, parts, range(15, 20))
+    second.settle()
     assert said(first, probe) == said(second, probe)
-
-
-# ------------------------------------------------------------------------------------------------- what is put right
 
 
 def labelled_ids(engine: DataEngine) -> list[str]:
     return [past.decision.id for past in engine.history() if past.success is not None]
 
 
-def test_what_one_cell_puts_right_reaches_its_sisters_and_a_reopened_one(
+def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
     fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    for i in range(70):
-        learn((first, second)[i % 2], parts, [i])
-    first.settle(), second.settle()
+    first, second = taught(fleet, parts, 90)
     wrong, *gone = labelled_ids(first)[20:24]
     first.correct(wrong, not first.store.get_decision(wrong).success)
     first.forget(*gone)
@@ -268,35 +252,17 @@ def test_what_one_cell_puts_right_reaches_its_sisters_and_a_reopened_one(
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
     assert second.new_labels == first.new_labels
-    before = counts(second, probe), rule(second)
-    again = fleet.engine("", recipe=None, store=reopened(fleet, second))
-    assert (counts(again, probe), rule(again)) == before
-
-
-def test_a_version_that_one_cell_goes_back_to_answers_in_all(fleet: Fleet, parts: Dataset, probe: np.ndarray) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    for i in range(90):
-        learn((first, second)[i % 2], parts, [i])
-    first.settle(), second.settle()
+    found = [engine.store.verify() for engine in (first, second)]
+    assert [report.faults for report in found] == [(), ()]
+    assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
     second.rollback(1)
     first.settle()
     assert first.version == second.version == newest + 1
-    assert said(first, probe) == said(second, probe)
-    assert [each.reason for each in first.store.versions()][-1] == "rolled back to version 1"
-
-
-def test_every_cell_of_a_product_has_a_ledger_of_its_own(fleet: Fleet, parts: Dataset) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    for i in range(60):
-        learn((first, second)[i % 2], parts, [i])
-    first.forget(labelled_ids(first)[0])
-    found = [engine.store.verify() for engine in (first, second)]
-    assert [report.faults for report in found] == [(), ()]
-    assert found[0].cells[0].digest != found[1].cells[0].digest
-
-
-# ------------------------------------------------------------------------------------------------- what stays its own
+    assert counts(first, probe) == counts(second, probe)
+    before = counts(second, probe), rule(second)
+    again = fleet.engine("", recipe=None, store=reopened(fleet, second))
+    assert (counts(again, probe), rule(again)) == before
 
 
 def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Dataset) -> None:
@@ -311,7 +277,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     assert second.store.get_decision("nobody") is None
 
 
-def test_a_sisters_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
+def test_a_peers_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(60))
     second.settle()
@@ -321,17 +287,6 @@ def test_a_sisters_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Datase
     second.settle()
     assert second.version == first.version
     assert rule(second) == own
-
-
-def test_policies_may_differ_by_cell(fleet: Fleet, parts: Dataset) -> None:
-    bold, careful = fleet.engine("a"), fleet.engine("b", recipe=RECIPE.with_policy(lower_bound=0.95, guarantee="pooled"))
-    learn(bold, parts, range(100))
-    careful.settle()
-    assert careful.version == bold.version
-    trace = parts.X[:60, None]
-    taken = [sum(p.action is Action.ACCEPT for p in engine.model.predict_many(trace)) for engine in (bold, careful)]
-    assert taken[0] > taken[1]
-    assert fleet.engine("b", recipe=None, store=reopened(fleet, careful)).policy.lower_bound == 0.95
 
 
 def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
@@ -345,10 +300,7 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
 def test_a_reopened_cell_decides_the_same_bit_for_bit(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
-    cells = [fleet.engine(name, recipe=recipe) for name in "ab"]
-    for i in range(130):
-        learn(cells[i % 2], parts, [i])
-    for engine in cells:
+    for engine in taught(fleet, parts, 130, recipe):
         engine.settle()
         before = said(engine, probe), rule(engine), engine.version, engine.new_labels
         again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
@@ -398,15 +350,13 @@ def test_label_numbers_are_unique_and_increase_over_the_product(fleet: Fleet, pa
     assert {trace.tobytes() for trace in seen.traces} == {x.tobytes() for x in parts.X[:100]}
 
 
-# --------------------------------------------------------------------------------------------------- a lost connection
-
-
 class ShakyStore(SqlStore):
-    """A store that cannot be asked for news while `lost`."""
+    """A store that cannot be asked for news while `lost`, and counts how often it was."""
 
-    lost = False
+    lost, asked = False, 0
 
     def news_since(self, seq: int, limit: int) -> Any:
+        self.asked += 1
         if self.lost:
             raise StoreError("The connection is gone.")
         return super().news_since(seq, limit)
@@ -419,15 +369,17 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
     learn(first, parts, range(30))
     second.settle()
-    ShakyStore.lost = True
-    try:
-        for i in range(40):
-            learn((first, second)[i % 2], parts, [100 + i])
-            second.settle()
-        second.retrain()
-        assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
-    finally:
-        ShakyStore.lost = False
+    asked = shaky.asked
+    for x in parts.X[:10]:
+        second.decide(x)
+    assert shaky.asked == asked  # no decision waits for news
+    shaky.lost = True
+    for i in range(40):
+        learn((first, second)[i % 2], parts, [100 + i])
+        second.settle()
+    second.retrain()
+    assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
+    shaky.lost = False
     for engine in (second, first, second):
         engine.settle()
     assert "comes again" in caplog.text
@@ -435,24 +387,6 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     assert counts(first, probe) == counts(second, probe)
     again = fleet.engine("", recipe=None, store=reopened(fleet, second))
     assert counts(again, probe) == counts(first, probe)
-
-
-def test_decide_never_asks_for_news(fleet: Fleet, parts: Dataset) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b", store=fleet.store("b", kind=ShakyStore))
-    learn(first, parts, range(25))
-    ShakyStore.lost = True
-    try:
-        second._versions.count._lost = False
-        for x in parts.X[:10]:
-            second.decide(x)
-        assert not second._versions.count._lost
-        second.settle()
-        assert second._versions.count._lost
-    finally:
-        ShakyStore.lost = False
-
-
-# ------------------------------------------------------------------------------------------------------- who may join
 
 
 @pytest.mark.parametrize(
@@ -472,12 +406,6 @@ def test_what_decides_the_embedding_must_agree(change: dict[str, Any], named: st
         fleet.engine("b", **change)
 
 
-def test_a_sister_that_asks_for_nothing_gets_what_the_others_have(fleet: Fleet) -> None:
-    fleet.engine("a", seed=3)
-    second = fleet.engine("b", recipe=None)
-    assert (second.recipe, second.seed) == (RECIPE, 3)
-
-
 def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
     first.decide(parts.X[0])
@@ -486,31 +414,19 @@ def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Data
     assert second.trace == first.trace == fleet.engine("c").trace
 
 
-def test_a_cell_keeps_its_product(fleet: Fleet) -> None:
+def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(fleet: Fleet, parts: Dataset) -> None:
     fleet.engine("a").close()
-    with pytest.raises(StoreError, match="leave it out"):
-        fleet.store("a", "nut")
-    with fleet.store("a", None) as store:
-        assert store.product == f"gear-{fleet.tag}"
-
-
-def test_a_cell_that_worked_alone_cannot_join_a_product(fleet: Fleet, parts: Dataset) -> None:
-    learn(fleet.engine("a", None), parts, [0])
+    learn(fleet.engine("b", None), parts, [0])
     fleet.opened.pop().close()
-    with pytest.raises(StoreError, match="name a new cell"):
-        fleet.store("a", "gear")
-    with fleet.store("a", None) as store:
-        assert store.product is None
-
-
-def test_a_refused_cell_leaves_nothing_behind(fleet: Fleet) -> None:
-    fleet.engine("a", None)
-    with pytest.raises(StoreError, match="printable"):
-        SqlStore(fleet.url, f"b-{fleet.tag}", product="\n")
-    assert [cell.cell_id for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id] == [f"a-{fleet.tag}"]
-
-
-# ------------------------------------------------------------------------------------------------------------ questions
+    for cell, product, message in (
+        ("a", "nut", "leave it out"),
+        ("b", "gear", "name a new cell"),
+        ("c", "\n", "printable"),
+    ):
+        with pytest.raises(StoreError, match=message):
+            SqlStore(fleet.url, f"{cell}-{fleet.tag}", product=product if cell == "c" else f"{product}-{fleet.tag}")
+    found = {cell.cell_id: cell.product for cell in list_cells(fleet.url) if fleet.tag in cell.cell_id}
+    assert found == {f"a-{fleet.tag}": f"gear-{fleet.tag}", f"b-{fleet.tag}": None}
 
 
 def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
@@ -544,7 +460,7 @@ def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> Non
 def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset, tmp_path: Path) -> None:
     np.savez(tmp_path / "parts.npz", X=parts.X[:60], y=parts.y[:60])
     cell, product, data = f"a-{fleet.tag}", f"gear-{fleet.tag}", str(tmp_path / "parts.npz")
-    sister = f"b-{fleet.tag}"
+    peer = f"b-{fleet.tag}"
 
     def run(*words: str) -> Any:
         done = CliRunner().invoke(main, list(words))
@@ -552,16 +468,16 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
         return done.output
 
     run("train", "--data", data, "--store", fleet.url, "--reducer", "pca", "--cell", cell, "--product", product)
-    run("run", "--cell", "replay", "--data", data, "--cycles", "60", "--store", fleet.url, "--cell-id", sister,
+    run("run", "--cell", "replay", "--data", data, "--cycles", "60", "--store", fleet.url, "--cell-id", peer,
         "--product", product)  # fmt: skip
-    status = json.loads(run("status", fleet.url, "--cell", sister, "--json"))
-    assert (status["cell"], status["ever"]["decisions"], status["product"]) == (sister, 60, product)
+    status = json.loads(run("status", fleet.url, "--cell", peer, "--json"))
+    assert (status["cell"], status["ever"]["decisions"], status["product"]) == (peer, 60, product)
     assert cell in run("status", fleet.url, "--cell-id", cell)
-    run("export", fleet.url, "--cell", sister, "--out", str(tmp_path / "model.ts"))
+    run("export", fleet.url, "--cell", peer, "--out", str(tmp_path / "model.ts"))
     listed = json.loads(run("status", fleet.url, "--json"))["cells"]
-    assert [row["product"] for row in listed if row["cell_id"] in (cell, sister)] == [product, product]
+    assert [row["product"] for row in listed if row["cell_id"] in (cell, peer)] == [product, product]
     assert cell[:10] in run("status", fleet.url)
-    with SqlStore(fleet.url, sister) as store:
+    with SqlStore(fleet.url, peer) as store:
         assert len(store.labelled().seq) > len(store.own_labelled().seq) > 0
 
 

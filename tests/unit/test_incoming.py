@@ -11,7 +11,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.engine.versions import STEP
-from tests.support.driving import Counting
+from tests.support.driving import Counting, evidence, learn
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
 
@@ -26,13 +26,8 @@ class Slow(Counting):
         Slow.now += STEP / 2
 
 
-def learn(engine: DataEngine, data: Dataset, part: slice) -> None:
-    for x, y in zip(data.X[part], data.y[part], strict=True):
-        engine.report(engine.decide(x).id, bool(y))
-
-
 def said(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
-    return [(d.action, d.lower, d.n_success, d.n_failure, d.embedding) for d in map(engine.decide, probe)]
+    return [evidence(engine.decide(x)) for x in probe]
 
 
 class Held(ThreadPoolExecutor):
@@ -46,7 +41,7 @@ class Held(ThreadPoolExecutor):
 
 def trained_beside(engine: DataEngine, pool: Held, data: Dataset) -> None:
     """Forty labels set a retrain off, sixteen come in meanwhile, and it ends; nobody has looked yet."""
-    learn(engine, data, slice(0, 56))
+    learn(engine, data, range(56))
     assert engine.retraining
     assert not engine.swapping
     pool.go.set()
@@ -75,30 +70,6 @@ def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(data: Dat
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
-def test_what_is_reported_while_a_version_is_being_stored_is_in_it_and_in_the_reopened_engine(
-    data: Dataset, tmp_path: Path
-) -> None:
-    pool, probe = Held(), data.X[150:170]
-    engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / "cell.db")
-    trained_beside(engine, pool, data)
-    while engine._versions._candidate is None or engine._versions._candidate.storing is None:
-        engine.settle(brief=True)
-    assert engine.version == 0
-    engine._versions.collect = lambda *args, **options: None  # nobody looks whether it is stored
-    learn(engine, data, slice(56, 70))
-    del engine._versions.collect
-    assert engine.version == 0
-    engine.settle()
-    assert engine.version == 1
-    assert len(engine.model.index) == 70
-    learn(engine, data, slice(70, 75))
-    expected = said(engine, probe)
-    engine.close()
-    with DataEngine.open(tmp_path / "cell.db") as again:
-        assert again.version == 1
-        assert said(again, probe) == expected
-
-
 def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
     data: Dataset, tmp_path: Path
 ) -> None:
@@ -107,7 +78,7 @@ def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides
         with ThreadPoolExecutor(1) as pool:
             engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / f"{n}.db")
             for i in range(n):
-                learn(engine, data, slice(i, i + 1))
+                learn(engine, data, [i])
                 engine.settle(brief=True)
             engine.close()
         with DataEngine.open(tmp_path / f"{n}.db") as first:

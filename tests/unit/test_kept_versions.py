@@ -15,6 +15,7 @@ from dengine.experiments.rivals.baselines import AgreeingNeighbours
 from dengine.records import RetrainReport
 from dengine.store import MemoryStore, SqlStore, Store
 from dengine.store.records import KEEP, keeps_state
+from tests.support.driving import learn
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 
@@ -81,13 +82,9 @@ def test_one_that_is_not_kept_is_refused_and_those_that_are_are_named(store: Sto
             store.load_version(version)
 
 
-def test_a_store_without_versions_has_none_to_load(store: Store) -> None:
-    assert store.versions() == []
+def test_every_retrain_is_listed_for_ever(store: Store) -> None:
     with pytest.raises(StoreError, match="load one of these: none"):
         store.load_version(1)
-
-
-def test_every_retrain_is_listed_for_ever(store: Store) -> None:
     put(store, 7)
     store.put_version(report(7, accepted=False), 9, None)
     rows = store.versions()
@@ -102,12 +99,6 @@ def test_every_retrain_is_listed_for_ever(store: Store) -> None:
     assert [row.n_bytes > 0 for row in rows] == [row.kept for row in rows]
 
 
-def test_thinning_out_leaves_the_history_whole(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store:
-        put(store, 15)
-        assert store.verify().ok
-
-
 def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db"), keep_versions=None) as store:
         put(store, 12)
@@ -115,6 +106,7 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
     with SqlStore(str(tmp_path / "b.db"), keep_versions=8) as store:
         put(store, 12)
         assert kept(store) == [1, 5, 6, 7, 8, 9, 10, 11, 12]
+        assert store.verify().ok
     for keep in (1, 0, True, 2.5):
         with pytest.raises(StoreError, match="keep_versions of 2 or more"):
             SqlStore(str(tmp_path / "c.db"), keep_versions=keep)
@@ -144,22 +136,12 @@ def test_a_damaged_version_is_passed_over_and_told_of_once(tmp_path: Path) -> No
                 store.load_version(12)
 
 
-def test_where_every_version_is_damaged_there_is_none(tmp_path: Path) -> None:
-    file = tmp_path / "a.db"
-    with SqlStore(str(file)) as store:
-        put(store, 2)
-    damage(file, 1, 2)
-    with SqlStore(str(file)) as store:
-        assert store.last_version() is None
-
-
 def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
     data: Dataset, tmp_path: Path
 ) -> None:
     file = tmp_path / "engine.db"
     with DataEngine("pca", store=file, retrain_every=30) as engine:
-        for x, y in zip(data.X[:100], data.y[:100], strict=True):
-            engine.report(engine.decide(x).id, bool(y))
+        learn(engine, data, range(100))
         assert engine.version == 3
     damage(file, 3)
     with DataEngine.open(str(file)) as engine:
@@ -176,8 +158,7 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
 def test_an_engine_whose_only_version_is_damaged_verifies_and_learns_anew(data: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "engine.db"
     with DataEngine("pca", store=file, retrain_every=40) as engine:
-        for x, y in zip(data.X[:50], data.y[:50], strict=True):
-            engine.report(engine.decide(x).id, bool(y))
+        learn(engine, data, range(50))
         assert engine.version == 1
     damage(file, 1)
     with DataEngine.open(str(file)) as engine:
@@ -191,8 +172,7 @@ def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damage
     file = tmp_path / "engine.db"
     rival = AgreeingNeighbours(0.1, 0.9)
     with DataEngine(model=rival, store=file, retrain_every=40) as engine:
-        for x, y in zip(data.X[:50], data.y[:50], strict=True):
-            engine.report(engine.decide(x).id, bool(y))
+        learn(engine, data, range(50))
         assert engine.version == 1
     with sqlite3.connect(file) as connection:
         connection.execute("UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
