@@ -246,7 +246,7 @@ def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> 
     engine.model.spaces.n_components = 500  # what the next one starts from cannot be trained
     report = engine.retrain()
     assert (report.accepted, report.version) == (False, version)
-    assert "PCA to 500 dimensions" in report.reason
+    assert "PCA needs more than 500 traces" in report.reason
     assert evidence(engine.decide(good(data))) == before
     assert [r.accepted for r in engine.store.retrains()][-1] is False
 
