@@ -32,6 +32,7 @@ FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
 KEEP = 5  # newest versions that keep their states
 WHOLE = ("n_success", "n_failure", "model_version")
 SHARES = ("lower", "upper", "propensity")
+NUMBER = int | float | np.integer | np.floating
 KINDS = {"action": Action, "predicted": Action, "reason": Reason}
 RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
 Key = tuple[float, str]  # of a decision in its history: time and id
@@ -482,17 +483,12 @@ def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     return version % step == 0
 
 
-def check_keep(keep: int | None) -> int | None:
-    """Return how many newest versions keep their states, once it is a number that leaves one to fall back on."""
-    if keep is not None and (isinstance(keep, bool) or not isinstance(keep, int) or keep < 2):
-        raise StoreError(f"Expected keep_versions of 2 or more, or None for all, got {keep!r}; leave it at {KEEP}.")
-    return keep
-
-
-def not_kept(version: int, kept: Collection[int], why: str = "is not kept") -> VersionError:
+def not_kept(version: int, kept: Collection[int]) -> VersionError:
     """Return the error for a version that cannot be loaded; it names those that can."""
     others = ", ".join(str(each) for each in sorted(set(kept) - {version})) or "none"
-    return VersionError(f"Expected a version whose state is held, got {version}, which {why}; load one of these: {others}.")
+    return VersionError(
+        f"Expected a version whose state is held, got {version}, which is not kept; load one of these: {others}."
+    )
 
 
 def checked_decision(
@@ -515,9 +511,11 @@ def check_decision(decision: Decision) -> None:
         _must(isinstance(getattr(decision, name), kind), f"{name} as {kind.__name__}", getattr(decision, name))
     for name in WHOLE:
         count = getattr(decision, name)
-        _must(_is_whole(count), f"{name} as a whole number from 0 to below 2**63", count)
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool) and bool(0 <= count < 2**63)
+        _must(whole, f"{name} as a whole number from 0 to below 2**63", count)
     for name in SHARES:
-        _must(_is_share(getattr(decision, name)), f"{name} as a number from 0 to 1", getattr(decision, name))
+        share = getattr(decision, name)
+        _must(isinstance(share, NUMBER) and bool(0.0 <= share <= 1.0), f"{name} as a number from 0 to 1", share)  # no NaN
     part = decision.part
     if part is not None and (not isinstance(part, str) or len(part) > LONGEST or part != as_text(part)):
         raise StoreError(
@@ -525,29 +523,12 @@ def check_decision(decision: Decision) -> None:
             "strip what a scanner added."
         )
     _must(isinstance(decision.audit, bool | np.bool_), "audit as True or False", decision.audit)
-    _must(_is_embedding(decision.embedding), "an embedding of numbers, (K, d), or None", decision.embedding)
+    points: Any = () if decision.embedding is None else decision.embedding
+    rows = isinstance(points, tuple | list) and all(isinstance(point, tuple | list) for point in points)
+    plain = rows and all(isinstance(each, NUMBER) and not isinstance(each, bool) for point in points for each in point)
+    _must(plain, "an embedding of numbers, (K, d), or None", decision.embedding)
 
 
 def _must(fits: bool, what: str, found: Any) -> None:
     if not fits:
         raise StoreError(f"Expected a decision with {what}, got {shortened(found)}; nothing was stored.")
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(0 <= value < 2**63)
-
-
-def _is_share(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and bool(0.0 <= value <= 1.0)  # no NaN
-
-
-def _is_embedding(value: Any) -> bool:
-    return value is None or _is_row(value, lambda point: _is_row(point, _is_number))
-
-
-def _is_row(value: Any, fits: Callable[[Any], bool]) -> bool:
-    return isinstance(value, tuple | list) and all(map(fits, value))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

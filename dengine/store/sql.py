@@ -68,7 +68,6 @@ from .records import (
     as_text,
     check_decision,
     check_import,
-    check_keep,
     check_state,
     checked_decision,
     checked_label,
@@ -149,7 +148,11 @@ class SqlStore:
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
-        self.keep_versions = check_keep(keep_versions)
+        if keep_versions is not None and (type(keep_versions) is not int or keep_versions < 2):
+            raise StoreError(
+                f"Expected keep_versions of 2 or more, or None for all, got {keep_versions!r}; leave it at {KEEP}."
+            )
+        self.keep_versions = keep_versions
         self.wait: float | None = _checked_wait(wait)
         self._clock = clock
         self._database = Database(str(url), cell_id, clock, product)
