@@ -279,8 +279,8 @@ class CellCheck:
             self.digests.append(told.hex())
         numbers = [row["number"] for row in rows]
         yield from self._gaps(LEDGER.name, "entry", numbers)
-        for table, sums in self._sums.items():
-            for entry in sums.beyond(number for number in numbers if isinstance(number, int))[:SHOWN]:
+        for table, each in self._sums.items():
+            for entry in each.beyond(number for number in numbers if isinstance(number, int))[:SHOWN]:
                 yield self._fault(table, f"entry {entry}", "the ledger does not hold the entry that rows are of")
         yield from self._check_settings(settings)
 
