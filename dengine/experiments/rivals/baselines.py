@@ -25,12 +25,10 @@ from .base import (
 )
 
 
-class AlwaysVerify(Rival):
-    """Every part is verified, the cell as it is: no error, and nothing saved."""
+class Constant(Rival):
+    """The same action for every part, whatever it looks like; before an engine's first retrain it is verified all the same."""
 
-    title = "always verify"
-    bound = "no error: every part is verified"
-    action: ClassVar[Action] = Action.VERIFY
+    action: ClassVar[Action]
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Nothing to learn: labels of one class are as good as any."""
@@ -44,11 +42,16 @@ class AlwaysVerify(Rival):
         return Judgement.same(len(X), self.action)
 
 
-class NeverVerify(AlwaysVerify):
-    """Every part is accepted, whatever it looks like: all is saved, and every bad part stops the system.
+class AlwaysVerify(Constant):
+    """The cell as it is: no error, and nothing saved."""
 
-    An engine has no model before its first retrain, so the first `retrain_every` parts are verified all the same.
-    """
+    title = "always verify"
+    bound = "no error: every part is verified"
+    action = Action.VERIFY
+
+
+class NeverVerify(Constant):
+    """All is saved, and every bad part stops the system."""
 
     title = "never verify"
     bound = ""
