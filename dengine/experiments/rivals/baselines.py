@@ -26,7 +26,7 @@ from .base import (
 
 
 class Constant(Rival):
-    """The same action for every part, whatever it looks like; before an engine's first retrain it is verified all the same."""
+    """The same action for every part; before the first retrain every part is verified all the same."""
 
     action: ClassVar[Action]
 
