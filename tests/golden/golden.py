@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dengine import Action, DataEngine, Dataset, Recipe, ReplayCell, export_torchscript, load_dataset, load_exported, replay
+from dengine import Action, Recipe, replay
 
 ACTIONS = tuple(Action)
 LEARNED, ASKED = 130, 60  # traces that a kept engine learned from, and that it is asked about afterwards
@@ -58,30 +58,6 @@ REPLAYS = {
 }
 
 
-def short() -> Dataset:
-    """The bundled set, each trace cut to 200 samples around the contact: small files."""
-    data = load_dataset("insertion")
-    return replace(data, X=np.ascontiguousarray(data.X[:, 400:800:2]))
-
-
-def fill() -> DataEngine:
-    """An engine that learned, retrained, and took labels after its last retrain."""
-    recipe = replace(Recipe.load("conv"), retrain_every=50, window=200, novelty=0.0)
-    engine = DataEngine(recipe=recipe.with_policy(**LOOSE, audit_rate=0.1), seed=11, replaying=True)
-    list(engine.run(ReplayCell(short(), np.arange(LEARNED)), LEARNED))
-    return engine
-
-
-def ask(decide: Any) -> list[list[Any]]:
-    """What is decided on the traces that follow; floats survive JSON unchanged."""
-    found = []
-    for x in short().X[LEARNED : LEARNED + ASKED]:
-        d = decide(x)
-        z = None if d.embedding is None else np.asarray(d.embedding, dtype=np.float64).tolist()
-        found.append([str(d.action), str(d.reason), d.lower, d.upper, d.n_success, d.n_failure, z])
-    return found
-
-
 def machine() -> dict[str, str]:
     """What may change the last digit of a float: compared before decisions are."""
     return {
@@ -95,10 +71,7 @@ def machine() -> dict[str, str]:
 def make(folder: Path) -> None:
     for name, case in REPLAYS.items():
         np.savez_compressed(folder / f"replay-{name}.npz", **case.play())
-    with fill() as engine:
-        export_torchscript(engine, folder / "model.ts")
-    answers = {"model.ts": ask(load_exported(folder / "model.ts").decide)}
-    (folder / "answers.json").write_text(json.dumps({"machine": machine(), "answers": answers}), encoding="utf-8")
+    (folder / "machine.json").write_text(json.dumps(machine()), encoding="utf-8")
 
 
 if __name__ == "__main__":
