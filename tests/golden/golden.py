@@ -1,4 +1,4 @@
-"""Decisions that must never change by accident: replays, stores and an exported file, made once and kept.
+"""Decisions that must never change by accident: replays, made once and kept.
 
     python tests/golden/golden.py tests/golden        # makes them anew; only where a change of decisions is meant
 
@@ -21,7 +21,6 @@ import torch
 from dengine import Action, Recipe, replay
 
 ACTIONS = tuple(Action)
-LEARNED, ASKED = 130, 60  # traces that a kept engine learned from, and that it is asked about afterwards
 
 
 @dataclass(frozen=True)
