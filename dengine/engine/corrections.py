@@ -19,7 +19,7 @@ from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
 from ..errors import ReportError, SettingError
 from ..records import as_success
-from ..store.outbox import Keeper
+from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
 from .feedback import Feedback
 from .settings import EvidenceWindow, SettingsInForce
@@ -49,9 +49,9 @@ class Changed:
 class Corrections:
     """Puts things right in a store, and in what an engine has learned."""
 
-    def __init__(self, keeper: Keeper, settings: SettingsInForce, versions: ModelVersions, feedback: Feedback) -> None:
-        self._keeper, self._settings, self._versions, self._feedback = keeper, settings, versions, feedback
-        self._store = keeper.store
+    def __init__(self, outbox: Outbox, settings: SettingsInForce, versions: ModelVersions, feedback: Feedback) -> None:
+        self._outbox, self._settings, self._versions, self._feedback = outbox, settings, versions, feedback
+        self._store = outbox.store
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Say that a label was wrong, or that a forgotten one counts again, from the next decision on.
@@ -171,7 +171,7 @@ class Corrections:
 
     def _make_ready(self) -> None:
         """Swap in what an executor trains, and store what waits: a correction comes after all that was known before."""
-        self._keeper.check()
+        self._outbox.check()
         self._versions.collect(HUNG)
         self._feedback.store_all()
         self._versions.count.complete()
@@ -191,7 +191,7 @@ class Corrections:
     def _correct(self, change: Change) -> Changed:
         self._store.record(change)
         for name in change.decisions:
-            self._keeper.forget(name)
+            self._outbox.forget(name)
         self._versions.correct()
         return self._done(change)
 

@@ -46,7 +46,7 @@ from ..records import (
     source_of,
 )
 from ..store.base import Store, opening
-from ..store.outbox import CLOSE, Keeper
+from ..store.outbox import CLOSE, Outbox
 from ..store.records import StoredDecision
 from ..traces import as_agreed
 from .corrections import Changed, Corrections
@@ -147,23 +147,23 @@ class DataEngine:
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
-        self._keeper = Keeper(store, owning=not reading, patient=replaying)
-        weakref.finalize(self, self._keeper.close)  # of a program that forgot to
+        self._outbox = Outbox(store, owning=not reading, patient=replaying)
+        weakref.finalize(self, self._outbox.close)  # of a program that forgot to
         self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
-        self._settings = SettingsInForce(settings, self._keeper)
-        self._versions = ModelVersions(template, retrainer, self._keeper, clock, settings.evidence)
+        self._settings = SettingsInForce(settings, self._outbox)
+        self._versions = ModelVersions(template, retrainer, self._outbox, clock, settings.evidence)
         if store.product is not None:
             self._versions.count = Fleet(store, self._versions)
-        self._feedback = Feedback(self._keeper, self._versions, self._settings, on_safe_mode)
+        self._feedback = Feedback(self._outbox, self._versions, self._settings, on_safe_mode)
         self._maker = DecisionMaker(self._settings)
-        self._corrections = Corrections(self._keeper, self._settings, self._versions, self._feedback)
+        self._corrections = Corrections(self._outbox, self._settings, self._versions, self._feedback)
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
-            self._keeper.close()
+            self._outbox.close()
             raise
 
     @classmethod
@@ -233,7 +233,7 @@ class DataEngine:
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
         for what is no id. Whatever else fails becomes VERIFY, a store that is away too.
         """
-        self._keeper.check()
+        self._outbox.check()
         with uninterrupted():
             id_ = None if decision_id is None else as_id(decision_id)
             if id_ is not None and (known := self._known(id_)) is not None:
@@ -242,12 +242,12 @@ class DataEngine:
             self._versions.retrainer.encoder_time.cycles += 1
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
-            unasked = Reason.NO_STORE if self._keeper.away else Reason.LATE if late else None
+            unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
             known = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
             if wait:
-                self._keeper.flush()
+                self._outbox.flush()
             elif id_ is not None:
-                self._keeper.secure()
+                self._outbox.secure()
         return known.decision
 
     def _put(self, item: StoredDecision) -> StoredDecision:
@@ -261,28 +261,28 @@ class DataEngine:
         It is on the disk when this returns; an id that has a decision keeps it. With a store in memory, and before a first
         trace has set the contract, `decide` has to record it, with `late`. Errors as of `decide`.
         """
-        self._keeper.check()
+        self._outbox.check()
         id_ = as_id(decision_id)
         if (known := self._known(id_)) is None:
             number = as_part(part)
             if self.trace is None or self.store.wait is None:
                 return unasked(id_, number, self.version, Reason.LATE)
-            reason = Reason.NO_STORE if self._keeper.away else Reason.LATE
+            reason = Reason.NO_STORE if self._outbox.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
             known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
-        self._keeper.secure()
+        self._outbox.secure()
         return decided_before(known, trace, self.trace)
 
     def _record(self, item: StoredDecision) -> StoredDecision:
         """Record a decision; returns what its id has now: of two threads the first's."""
-        first = self._keeper.recent.add(item)
+        first = self._outbox.recent.add(item)
         if first is item:
-            self._keeper.decided(item)
+            self._outbox.decided(item)
         return first
 
     def _known(self, decision_id: str) -> StoredDecision | None:
         try:
-            return None if self._keeper.recent.is_new(decision_id) else self._keeper.find(decision_id)
+            return None if self._outbox.recent.is_new(decision_id) else self._outbox.find(decision_id)
         except StoreError as error:  # the store is away: what was decided lately is known all the same
             log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
             return None
@@ -292,7 +292,7 @@ class DataEngine:
         if self.trace is None:
             try:
                 if self.store.product is not None:
-                    trace = self._keeper.ask(lambda: peers_trace(self.store)) or trace
+                    trace = self._outbox.ask(lambda: peers_trace(self.store)) or trace
             except StoreError:  # the cell's own first trace stands
                 log.exception("the product's contract of traces cannot be had")
             self._maker.agree_on(trace)
@@ -320,10 +320,10 @@ class DataEngine:
         rejected part, or what is no label; StoreError where neither the store nor its journal can be written.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
-        self._keeper.check()
+        self._outbox.check()
         with uninterrupted():
             self._versions.collect()
-            known = self._keeper.find(id_) or self._lost_stop(id_, said, trace, part)
+            known = self._outbox.find(id_) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
             return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
 
@@ -338,7 +338,7 @@ class DataEngine:
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
-        self._keeper.check()
+        self._outbox.check()
         with uninterrupted():
             return self._versions.retrain()
 
@@ -388,10 +388,10 @@ class DataEngine:
         StoreError where something is left that neither the store nor its journal takes; close again when there is room.
         """
         with uninterrupted():
-            if self._keeper.usable:
+            if self._outbox.usable:
                 self._feedback.store_waiting()
                 self._versions.collect(CLOSE)
-            self._keeper.close()
+            self._outbox.close()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Say that a label was wrong, or that a forgotten one counts again; see `Corrections.correct`."""
@@ -415,17 +415,17 @@ class DataEngine:
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace, and with its label where it has one; None for an unknown id."""
-        return self._keeper.find(as_id(decision_id))
+        return self._outbox.find(as_id(decision_id))
 
     def know_ids(self) -> None:
         """Learn which ids are taken (a second for a million), so that `decide` looks no new one up in the store."""
         self.flush()
-        self._keeper.recent.know(self.store.decision_ids())
+        self._outbox.recent.know(self.store.decision_ids())
 
     def flush(self) -> None:
         """Return when all that is known so far is on the disk."""
         self._feedback.store_waiting()
-        self._keeper.flush()
+        self._outbox.flush()
 
     @property
     def retraining(self) -> bool:
@@ -480,7 +480,7 @@ class DataEngine:
     @property
     def store_fault(self) -> str:
         """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
-        return self._keeper.fault
+        return self._outbox.fault
 
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
@@ -497,7 +497,7 @@ class DataEngine:
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
         about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
-        return replace(own, note=self._keeper.event, **about, **coin)
+        return replace(own, note=self._outbox.event, **about, **coin)
 
     def history(
         self,

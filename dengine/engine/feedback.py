@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from ..errors import StoreError
 from ..records import Action, Source, source_of
-from ..store.outbox import Keeper
+from ..store.outbox import Outbox
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
 from .settings import SettingsInForce
 from .versions import ModelVersions, Point
@@ -29,12 +29,12 @@ class Feedback:
 
     def __init__(
         self,
-        keeper: Keeper,
+        outbox: Outbox,
         versions: ModelVersions,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
-        self.keeper, self.versions, self.settings = keeper, versions, settings
+        self.outbox, self.versions, self.settings = outbox, versions, settings
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
         self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
@@ -52,7 +52,7 @@ class Feedback:
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.safe_mode
-        store = self.keeper.store
+        store = self.outbox.store
         ids = store.unreported_accepts(self.settings.now.policy_since)
         if not self._stops_all:
             self._silent = len(ids) - store.silent_total(self.settings.now.policy_since)
@@ -100,7 +100,7 @@ class Feedback:
         try:
             self.store_waiting()
             label, point = self._label(known, success, source, int(self._was_silent(known)))
-            (seq,) = self.keeper.labels([label])
+            (seq,) = self.outbox.labels([label])
         except Exception:
             self._waiting += late  # nothing was stored: it still waits as it did
             raise
@@ -117,11 +117,11 @@ class Feedback:
 
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has taken by now train, and the rule is told the truth."""
-        for id_, seq in self.keeper.arrived():
+        for id_, seq in self.outbox.arrived():
             known, success = self._in_journal.pop(id_, (None, False))
             if known is not None:
                 self.versions.keep(known, success, seq)
-        if self._untrue and not self.keeper.fault:
+        if self._untrue and not self.outbox.fault:
             try:
                 self.versions.tell_anew()
                 self._untrue = False
@@ -139,7 +139,7 @@ class Feedback:
         """Commit the labels of confirmed parts, and give them to the next retrain."""
         if not self._waiting:
             return
-        seqs = self.keeper.labels([label for _, label in self._waiting])
+        seqs = self.outbox.labels([label for _, label in self._waiting])
         waiting, self._waiting = self._waiting, []
         for (known, _), seq in zip(waiting, seqs, strict=True):
             self._keep(known, True, int(seq))
@@ -182,7 +182,7 @@ class Feedback:
             return
         self._mode = now
         try:
-            self.keeper.event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
+            self.outbox.event(SAFE_MODE_BEGAN if now else SAFE_MODE_ENDED, now or safe_again)
             if self.on_safe_mode is not None:
                 self.on_safe_mode(now)
         except Exception:

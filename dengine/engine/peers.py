@@ -128,11 +128,11 @@ class Fleet:
         try:
             self.versions.journal_cleared()
             seq = self._window.newest_seq
-            news = self.versions.keeper.ask(lambda: self.store.news_since(seq, MOST))
+            news = self.versions.outbox.ask(lambda: self.store.news_since(seq, MOST))
             newer = news.version > max(self.versions.version, self._refused)
             if newer:
                 self.versions.store_waiting()  # the next model is to know of them too
-            version = self.versions.keeper.ask(self.store.last_version) if newer else None
+            version = self.versions.outbox.ask(self.store.last_version) if newer else None
         except StoreError as error:
             if not self._lost:
                 log.warning("news of product %s cannot be had; the cell goes on without: %s", self.store.product, error)

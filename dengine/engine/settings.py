@@ -16,7 +16,7 @@ from ..model.neighbours import ModelPrediction
 from ..model.rival import as_engine_model
 from ..recipe import OBJECT, Recipe, described
 from ..records import TraceSpec, is_whole, trace_in
-from ..store.outbox import Keeper
+from ..store.outbox import Outbox
 
 log = logging.getLogger("dengine")
 
@@ -183,15 +183,15 @@ class SettingsInForce:
     now : they themselves.  waiting : whether the store lacks them, and `save` is to be called again.
     """
 
-    def __init__(self, settings: EngineSettings, keeper: Keeper) -> None:
+    def __init__(self, settings: EngineSettings, outbox: Outbox) -> None:
         self.now = settings
         self.waiting = False
-        self._keeper = keeper
+        self._outbox = outbox
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""
         try:
-            self._keeper.ask(lambda: self._keeper.store.save_settings(self.now.to_store()))
+            self._outbox.ask(lambda: self._outbox.store.save_settings(self.now.to_store()))
             self.waiting = False
         except StoreError:
             self.waiting = True

@@ -21,7 +21,7 @@ from ..model.base import EngineModel, Told
 from ..records import Reason, RetrainReport
 from ..reducers.base import State
 from ..store.base import Store
-from ..store.outbox import Asked, Keeper
+from ..store.outbox import Asked, Outbox
 from ..store.records import Change, StoredDecision, without_rule
 from .resume import change, join_since, refit, resume, tell_all
 from .settings import EvidenceWindow
@@ -138,12 +138,12 @@ class ModelVersions:
         self,
         template: EngineModel,
         retrainer: Retrainer,
-        keeper: Keeper,
+        outbox: Outbox,
         clock: Callable[[], float],
         evidence: EvidenceWindow,
     ) -> None:
-        self.template, self.retrainer, self.keeper, self.clock, self.evidence = template, retrainer, keeper, clock, evidence
-        self.store: Store = keeper.store  # asked without a time limit, so not while the cell waits
+        self.template, self.retrainer, self.outbox, self.clock, self.evidence = template, retrainer, outbox, clock, evidence
+        self.store: Store = outbox.store  # asked without a time limit, so not while the cell waits
         self.answering: EngineModel | None = None
         self.version, self.new_labels, self.corrected_to = 0, 0, 0
         self.store_waiting: Callable[[], None] = lambda: None
@@ -211,7 +211,7 @@ class ModelVersions:
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
-        known = self.keeper.ask(lambda: self.store.evidence_since(0, self.evidence.since))
+        known = self.outbox.ask(lambda: self.store.evidence_since(0, self.evidence.since))
         tell_all(self.newest, known, self.evidence)
 
     def correct(self, own: bool = True) -> None:
@@ -301,9 +301,9 @@ class ModelVersions:
     def _ready(self) -> bool:
         try:
             self.store_waiting()
-        except StoreError:  # told by the keeper; the labels wait in its journal
+        except StoreError:  # told by the outbox; the labels wait in its journal
             return False
-        return not self.keeper.fault
+        return not self.outbox.fault
 
     @property
     def swapping(self) -> bool:
@@ -371,7 +371,7 @@ class ModelVersions:
         if model is not None:
             candidate.report = replace(candidate.report, version=self.next_number, accepted=True)
             state = self._state(model, TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1])))
-        return self.keeper.version(candidate.report, self.retrainer.window.newest_seq, state)
+        return self.outbox.version(candidate.report, self.retrainer.window.newest_seq, state)
 
     def _swap(self, candidate: Candidate, number: int | None) -> None:
         report, model = candidate.report, candidate.model

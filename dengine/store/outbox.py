@@ -310,7 +310,7 @@ BEAT = 1.0  # seconds between two tries, and between two looks at whether the st
 CLOSE = 5.0  # seconds that closing may take
 
 
-class Keeper:
+class Outbox:
     """What an engine asks of its store while the cell runs.
 
     owning : claim the cell; else the store is read and nothing more.
@@ -348,7 +348,7 @@ class Keeper:
             backlog.journal.close()
             raise
         backlog.take_arrived()  # what is resumed from the store knows them
-        self._thread = threading.Thread(target=self._serve, args=(backlog,), name="dengine-keeper", daemon=True)
+        self._thread = threading.Thread(target=self._serve, args=(backlog,), name="dengine-outbox", daemon=True)
         self._thread.start()
 
     @property
@@ -525,7 +525,7 @@ class Keeper:
         except StoreError as error:  # they wait in memory
             self._note(str(error), Fault.of(error))
 
-    # The keeper's thread
+    # The outbox's thread
 
     def _serve(self, backlog: Backlog) -> None:
         while backlog.journal.open:

@@ -95,8 +95,8 @@ def engine_of(cell: str) -> DataEngine:
 
 def until_back(engine: DataEngine) -> None:
     end = time.monotonic() + 30
-    while engine._keeper.fault:
-        assert time.monotonic() < end, engine._keeper.fault
+    while engine._outbox.fault:
+        assert time.monotonic() < end, engine._outbox.fault
         time.sleep(0.05)
 
 
