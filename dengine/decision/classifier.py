@@ -91,7 +91,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def predict(self, Z: ArrayLike) -> NDArray[Any]:
         """(n,) the more frequent class in the ball; never abstains."""
-        return np.asarray(self.classes_[self.predict_proba(Z).argmax(axis=1)])
+        rates = self.predict_proba(Z)
+        return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
         """The user's numbers among the settings; SettingError where one is out of range."""
