@@ -10,7 +10,6 @@ before and after. Only decisions are kept, no store and no exported file: their 
 from __future__ import annotations
 
 import json
-import platform
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+from golden import machine  # beside it
 
 from dengine import (
     Action,
@@ -252,16 +251,6 @@ def of_retrains(retrains: Iterable[RetrainReport | None]) -> Arrays:
     """One row a retrain."""
     rows = [(each.version, each.n_traces, each.n_steps, each.accepted) for each in retrains if each is not None]
     return {"retrains": np.array(rows, dtype=np.int64)}
-
-
-def machine() -> dict[str, str]:
-    """What may change the last digit of a float: compared before decisions are."""
-    return {
-        "processor": platform.machine(),
-        "capability": torch.backends.cpu.get_cpu_capability(),
-        "torch": torch.__version__.split("+")[0],
-        "numpy": np.__version__,
-    }
 
 
 def make(folder: Path) -> None:
