@@ -7,7 +7,8 @@ os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stal
 
 import shutil
 import subprocess
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 REPO = Path(__file__).resolve().parents[1]
@@ -17,8 +18,9 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import Dataset
+from dengine import Dataset, MemoryStore, SqlStore
 from dengine.export import export_sources
+from dengine.store import Store
 
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
@@ -135,6 +137,30 @@ def proof_repeats() -> int:
 def stream() -> Dataset:
     """Parts that come one after the other; a file that needs fewer, or more, has its own."""
     return insertion_like(400, samples=60, seed=3)
+
+
+POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
+NO_POSTGRES = "DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh"
+DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.skipif(not POSTGRES, reason=NO_POSTGRES))]
+
+
+def url_of(kind: str, directory: Path) -> str:
+    return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
+
+
+@pytest.fixture(params=["memory", *DATABASES])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    """A new store of each kind."""
+    cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
+    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=DATABASES)
+def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+    """A URL and a cell of its own, to open again and again."""
+    return url_of(request.param, tmp_path), uuid.uuid4().hex
 
 
 @pytest.fixture

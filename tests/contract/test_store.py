@@ -1,14 +1,12 @@
 """One contract over every store: in memory, SQLite in a file, PostgreSQL where DENGINE_TEST_POSTGRES names one."""
 
 import hashlib
-import os
 import sqlite3
 import subprocess
 import sys
 import threading
 import uuid
 import zipfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,31 +24,6 @@ from dengine.store import connections as sql_queue
 from tests.support.plans import plans
 
 C, T = 2, 30
-POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
-DATABASES = [
-    "sqlite",
-    pytest.param(
-        "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
-    ),
-]
-
-
-def url_of(kind: str, directory: Path) -> str:
-    return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
-
-
-@pytest.fixture(params=["memory", *DATABASES])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
-    cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
-    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
-    yield made
-    made.close()
-
-
-@pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
-    """A URL and a cell of its own, to open again and again."""
-    return url_of(request.param, tmp_path), uuid.uuid4().hex
 
 
 def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:

@@ -2,13 +2,11 @@
 
 import hashlib
 import json
-import os
 import random
 import shutil
 import sqlite3
 import struct
 import threading
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -25,7 +23,6 @@ from dengine.store import Change, NewLabel, SqlStore, verify_history
 from dengine.store.ledger import START, entry_digest, row_sum
 from dengine.store.schema import CHAINED
 
-POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
 TABLES = ("decision", "trace", "label", "model_version", "event", "correction", "ledger", "setting")
 T = 200
 
@@ -73,18 +70,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def file(written: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(written, tmp_path / "engine.db"))
-
-
-@pytest.fixture(
-    params=[
-        "sqlite",
-        pytest.param(
-            "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
-        ),
-    ]
-)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
-    return (str(tmp_path / "engine.db") if request.param == "sqlite" else str(POSTGRES)), uuid.uuid4().hex
 
 
 def execute(file: Path, *statements: str) -> None:

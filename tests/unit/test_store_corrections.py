@@ -1,8 +1,6 @@
 """One contract over every store: a correction is a later row, and the newest one of a decision counts."""
 
-import os
 import uuid
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,31 +14,6 @@ from dengine.store import Change, MemoryStore, NewLabel, SqlStore, Store
 from tests.support.plans import plans
 
 C, T = 1, 30
-POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
-DATABASES = [
-    "sqlite",
-    pytest.param(
-        "postgres", marks=pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
-    ),
-]
-
-
-def url_of(kind: str, directory: Path) -> str:
-    return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
-
-
-@pytest.fixture(params=["memory", *DATABASES])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
-    cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
-    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
-    yield made
-    made.close()
-
-
-@pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
-    """A URL and a cell of its own, to open again and again."""
-    return url_of(request.param, tmp_path), uuid.uuid4().hex
 
 
 def trace(seed: int = 0) -> np.ndarray:
