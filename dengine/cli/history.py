@@ -19,9 +19,7 @@ from .options import Known, Naming
 from .output import duration, facts, show, when, write_json
 
 if TYPE_CHECKING:
-    from ..history.envelope import Envelope, Excess
-    from ..history.explain import Explanation, Neighbour
-    from ..history.status import Happened
+    from ..history.explain import Envelope, Excess, Explanation, Neighbour
     from ..records import Decision
     from ..store.records import Event, StoredDecision
     from ..store.views import PastRetrain
@@ -79,16 +77,14 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
     with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
-        others = beside(opened, since, asked["until"]) if events else None
+        others = beside(opened, since, asked["until"]) if events else {}
     if as_json:
         from ..records import plain
 
-        listed = {} if others is None else {"retrains": others.retrains, "events": others.events}
         decisions = [plain(past) | {"label": past.label} for past in found]
-        write_json({"verb": "history", "store": store, "decisions": decisions} | listed)
+        write_json({"verb": "history", "store": store, "decisions": decisions} | others)
         return
-    happened: Iterator[Happened] = iter(found) if others is None else interleaved(found, others)
-    for line in lines(list(happened)):
+    for line in lines(list(interleaved(found, others))):
         click.echo(line)
 
 
@@ -117,7 +113,7 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which 
 PART = list(COLUMNS).index("<part")
 
 
-def lines(happened: Sequence[Happened]) -> list[str]:
+def lines(happened: Sequence[StoredDecision | PastRetrain | Event]) -> list[str]:
     """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
     from ..store.records import StoredDecision
 

@@ -28,7 +28,7 @@ from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import DengineError, StoreError, UnknownDecisionError
-from ..history.explain import Explanation, Records, explain
+from ..history.explain import Circumstances, Explanation, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
@@ -499,22 +499,15 @@ class DataEngine:
         about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
         return replace(own, note=self._outbox.event, **about, **coin)
 
-    def history(
-        self,
-        last: int | None = None,
-        action: Action | str | None = None,
-        reason: Reason | str | None = None,
-        label: str | None = None,
-        since: float | None = None,
-        until: float | None = None,
-        predicted: Action | str | None = None,
-    ) -> Iterator[StoredDecision]:
-        """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.history`."""
-        return history(self.store, last, action, reason, label, since, until, predicted)
+    def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
+        """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.status.history`."""
+        return history(self.store, last, **where)
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
-        return explain(decision_id, Records(self.store, lambda: self._versions.answering, self.version), neighbours)
+        now = self._settings.now
+        under = Circumstances(now.recipe, now.trace, now.model, now.seed)
+        return explain(self.store, decision_id, neighbours, under, lambda: (self._versions.answering, self.version))
 
     def __enter__(self) -> Self:
         return self
@@ -525,16 +518,15 @@ class DataEngine:
 
 def explain_stored(store: Store, decision_id: str, neighbours: int = 10) -> Explanation:
     """`DataEngine.explain` of a store that no engine has open here; nothing in it changes."""
-    last = store.past_retrains()
-    version = max((each.report.version for each in last if each.report.accepted), default=0)
-    return explain(decision_id, Records(store, lambda: _present(store), version), neighbours)
+    return explain(store, decision_id, neighbours, present=lambda: _present(store))
 
 
-def _present(store: Store) -> EngineModel | None:
-    """The model that answers now, rebuilt; None where it needs an object that the store cannot name."""
+def _present(store: Store) -> tuple[EngineModel | None, int]:
+    """The model that answers now, rebuilt, and its version; None where it needs an object that the store cannot name."""
     try:
         settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
-        return resume(store, template, Window(settings.recipe.window), settings.evidence).model
+        resumed = resume(store, template, Window(settings.recipe.window), settings.evidence)
+        return resumed.model, resumed.version
     except DengineError as error:
         log.info("the present model cannot be rebuilt from the store alone: %s", error)
-        return None
+        return None, 0

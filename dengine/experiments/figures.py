@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from ..datasets import Dataset
 from ..errors import OutputError
 from ..files import write_output
-from ..history.explain import Explanation
-from ..history.sentences import Bound
+from ..history.explain import Bound, Explanation
 from ..history.status import Course
 from ..recipe import Recipe
 from ..records import Action

@@ -1,6 +1,6 @@
 """Why a decision came out as it did: its evidence as it was recorded, and what can be found again around it.
 
-    for sentence in explain("0123456789ab-412", Records(store)).said: ...
+    for sentence in explain(store, "0123456789ab-412").said: ...
 
 What was recorded (counts, bound, action, reason) is shown as it is. Neighbours, the novelty score and the levels of a
 guarantee are found again, without a reducer, by the version that answered where the store keeps it: `Explanation.notes`
@@ -9,32 +9,31 @@ says by which. A store keeps each version's references, each trace's place, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..decision.intervals import INTERVALS
 from ..decision.novelty import NoveltyGate
-from ..decision.policy import Policy
+from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex, math_ceil
-from ..decision.rule import DecisionRule
+from ..decision.rule import NOBODY, DecisionRule
 from ..errors import ReportError, StoreError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
-from ..model.base import EngineModel
+from ..model.base import Embedding, EngineModel
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceSpec, plain, trace_in
+from ..records import Action, Decision, Reason, Source, TraceSpec, plain, trace_in
 from ..store.base import Store
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
 from ..store.views import PastLabel
-from .envelope import Envelope, envelope_of
-from .sentences import Bound, Circumstances, Novelty, bound_of, verdict
-from .status import safe_mode_event
 
-Embedding = tuple[tuple[float, ...], ...]
 STRIDE = 100_000  # labels after a version at most that are read: a cell that never retrains again
+Levels = tuple[float, float]  # accepted where lower >= the first, rejected where 1 - upper >= the second
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Answering:
     """A version as it stood at a moment.
 
     version : its number.  index : its references.  known : the labels behind them, oldest first.
-    gate : of novelty, None where it was off.  rule : what it had been told by then, None where that is not kept.
+    gate : of novelty, None where it was off.  levels : that a bound had to reach, None where that is not kept.
     last_seq : the newest label that it could know.
     """
 
@@ -50,7 +49,7 @@ class Answering:
     index: RadiusIndex
     known: list[PastLabel]
     gate: NoveltyGate | None
-    rule: DecisionRule | None
+    levels: Levels | None
     last_seq: int
 
     def labels_of_references(self) -> list[PastLabel | None]:
@@ -68,19 +67,15 @@ def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision
     if "points" not in stored.state:  # a rival keeps nothing
         return None
     retrains = [each.last_seq for each in store.past_retrains() if each.report.accepted and each.report.version > version]
-    upto = min(retrains[0] if retrains else stored.last_seq + STRIDE, stored.last_seq + STRIDE)
-    stops_all = recipe.policy.stops == "all"
-    later = [
-        label
-        for label in store.past_labels(stored.last_seq, upto, points=True)
-        if then is None or _known_at(label, then, stops_all)
-    ]
-    first = int(stored.state["trained_on"][0])
-    before = store.past_labels(first - 1, stored.last_seq)
+    upto = min([*retrains[:1], stored.last_seq + STRIDE])
+    later = store.past_labels(stored.last_seq, upto, points=True)
+    if then is not None:
+        later = [label for label in later if _known_at(label, then, recipe.policy.stops == "all")]
+    before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     known = [label for label in (*before, *later) if not label.quarantined]
     last = max((label.seq for label in known), default=stored.last_seq)
     index = _index(stored, [label for label in later if label.model_version == version], recipe)
-    return Answering(version, index, known, _gate(stored), _rule(stored, later, recipe.policy), last)
+    return Answering(version, index, known, _gate(stored), _levels(stored, later, recipe.policy), last)
 
 
 def _known_at(label: PastLabel, then: StoredDecision, stops_all: bool) -> bool:
@@ -109,6 +104,13 @@ def _gate(stored: ModelVersion) -> NoveltyGate | None:
     return gate
 
 
+def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
+    if (policy.guarantee, policy.stops) == ("local", "some") and not _buffers(stored, "rule."):
+        return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
+    rule = _rule(stored, told, policy)
+    return None if rule is None or rule.evidence is None else (float(rule.evidence.open[0]), float(rule.evidence.open[1]))
+
+
 def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> DecisionRule | None:
     rule, kept = policy.rule(), _buffers(stored, "rule.")
     if {name: value.shape for name, value in rule.state_dict().items()} != {name: v.shape for name, v in kept.items()}:
@@ -124,15 +126,338 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
 def rule_now(store: Store, policy: Policy) -> DecisionRule | None:
     """The rule as it stands now; None before the first version, and where it is not kept."""
     stored = store.last_version()
-    if stored is None:
+    if stored is None or "untold" in stored.state:  # it missed something: an engine that is opened tells it all anew
         return None
-    untold = "untold" in stored.state  # it missed something: an engine that is opened tells it all anew
-    return None if untold else _rule(stored, store.past_labels(stored.last_seq), policy)
+    return _rule(stored, store.past_labels(stored.last_seq), policy)
 
 
 def _buffers(stored: ModelVersion, prefix: str) -> dict[str, torch.Tensor]:
     found = {name: value for name, value in stored.state.items() if name.startswith(prefix)}
     return {name.removeprefix(prefix): torch.from_numpy(np.array(value)) for name, value in found.items()}
+
+
+# The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.
+
+CENTRAL = 0.95  # of the successes, at each sample, that the band holds
+FEWEST = 20  # successes: the band of fewer is what the outermost of them happen to be
+NARROWEST = 0.05  # of a channel's median width: where all successes agree, the noise of a sensor is no excess of a hundred
+SUCCESSES = 1000  # newest labelled traces that it is made of
+
+
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """A piece of one channel that lies outside on one side: samples `first` to `last`, both outside.
+
+    from_s, to_s : their times in seconds.  above : whether it lies above the band.
+    widths : the largest distance from the band, in widths that the band has there.
+    """
+
+    channel: int
+    first: int
+    last: int
+    from_s: float
+    to_s: float
+    above: bool
+    widths: float
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """The band of the known successes, and where one trace leaves it.
+
+    n : successes.  low, median, high : (C, T), the band's edges and its middle, in the trace's unit.
+    outside : share of the trace's samples that lie outside.  usual : below which that share lies for 95 % of the successes.
+    not_finite : samples of the trace that are NaN or infinite, and lie nowhere.
+    excesses : where it leaves the band, in order of channel and time.
+    largest : the excess that goes farthest, in widths of the band; None where there is none.
+    """
+
+    n: int
+    low: NDArray[np.float32] = field(metadata={"apart": True})
+    median: NDArray[np.float32] = field(metadata={"apart": True})
+    high: NDArray[np.float32] = field(metadata={"apart": True})
+    outside: float
+    usual: float
+    not_finite: int
+    excesses: tuple[Excess, ...]
+    largest: Excess | None
+
+
+def envelope_of(successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float) -> Envelope | None:
+    """The band of successes (n, C, T) and where a trace (C, T) leaves it; None: they are too few, or of another shape."""
+    if len(successes) < FEWEST or successes.shape[1:] != trace.shape:
+        return None
+    tail = (1.0 - CENTRAL) / 2.0
+    low, median, high = np.quantile(successes, (tail, 0.5, 1.0 - tail), axis=0).astype(np.float32)
+    finite = np.isfinite(trace)
+    width = (high - low).astype(np.float64)
+    width = np.maximum(width, NARROWEST * np.median(width, axis=1, keepdims=True) + 1e-9)
+    x = np.where(finite, trace, low).astype(np.float64)
+    beyond = np.where(x > high, (x - high) / width, np.where(x < low, (x - low) / width, 0.0))  # (C, T) in widths
+    excesses = tuple(_excesses(beyond, rate_hz))
+    return Envelope(
+        n=len(successes),
+        low=low,
+        median=median,
+        high=high,
+        outside=float((beyond != 0.0).sum() / max(1, finite.sum())),
+        usual=float(np.quantile(((successes < low) | (successes > high)).mean(axis=(1, 2)), 0.95)),
+        not_finite=int((~finite).sum()),
+        excesses=excesses,
+        largest=max(excesses, key=lambda each: each.widths, default=None),
+    )
+
+
+def _excesses(beyond: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
+    for channel, row in enumerate(beyond):
+        side = np.sign(row)
+        edges = np.flatnonzero(np.diff(side, prepend=0.0, append=0.0))  # where a piece of one side begins or ends
+        for first, end in pairwise(edges.tolist()):
+            if side[first]:
+                widest = float(np.abs(row[first:end]).max())
+                yield Excess(channel, first, end - 1, first / rate_hz, (end - 1) / rate_hz, bool(side[first] > 0), widest)
+
+
+# The evidence of one decision
+
+NEIGHBOURS = 10  # nearest references that are shown
+MOST = 20_000  # more labels in a ball than that are not thought of
+BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
+DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
+
+
+@dataclass(frozen=True, slots=True)
+class Novelty:
+    """Squared distance to the nearest reference over its limit, in level and in texture: above 1 it is novel."""
+
+    level: float
+    texture: float
+
+    @property
+    def is_novel(self) -> bool:
+        """Whether either is beyond its limit."""
+        return not max(self.level, self.texture) <= 1.0
+
+    def __str__(self) -> str:
+        return f"in level {self.level:.2f} times the limit, in texture {self.texture:.2f} times the limit"
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A bound, and what it was held against.
+
+    interval, alpha : by which it was made.  n_success, n_failure, lower, upper : as recorded.
+    ball : which references were counted, in words.
+    accept_at, reject_at : accepted where lower >= accept_at, rejected where upper <= reject_at; None where nothing was
+        let pass on that side, or where it is not known.
+    level : what set these two, in words.
+    successes_needed, failures_needed : more labels of this kind, and none of the other, that would have been accepted, or
+        rejected; 0 where it was; None where no number would do.
+    repeats : whether the recorded bound is what the settings give for the recorded counts.
+    """
+
+    interval: str
+    alpha: float
+    n_success: int
+    n_failure: int
+    lower: float
+    upper: float
+    ball: str
+    accept_at: float | None
+    reject_at: float | None
+    level: str
+    successes_needed: int | None
+    failures_needed: int | None
+    repeats: bool
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What a decision is explained by: an engine's settings, and what is known of that moment.
+
+    spec : the traces' contract, None before the first.  model : what a model that was handed in is called.
+    levels : that held, None where that is not kept.  safe_mode : why everything was verified, "" where it was not.
+    """
+
+    recipe: Recipe = field(default_factory=Recipe)
+    spec: TraceSpec | None = None
+    model: str | None = None
+    seed: int = 0
+    levels: Levels | None = None
+    novelty: Novelty | None = None
+    safe_mode: str = ""
+
+    @classmethod
+    def of(cls, store: Store) -> Self:
+        """The settings that a store keeps; StoreError for one that no engine has used."""
+        known = store.settings()
+        if "recipe" not in known:
+            raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
+        return cls(Recipe.from_toml(known["recipe"]), trace_in(known), known.get("model"), int(known.get("seed", "0")))
+
+    @property
+    def rival(self) -> str:
+        """The name of a model that counts and decides by its own, "" where the recipe says how."""
+        return self.model if self.model is not None and self.levels is None else ""
+
+
+def bound_of(made: Decision, found: Circumstances) -> Bound | None:
+    """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
+    if made.reason not in BOUNDED or _was_lost(made):
+        return None
+    policy = found.recipe.policy
+    accept_at, reject_at, level = _thresholds(found)
+    again = INTERVALS[policy.interval](made.n_success, made.n_failure, policy.alpha)
+    return Bound(
+        interval=policy.interval,
+        alpha=policy.alpha,
+        n_success=made.n_success,
+        n_failure=made.n_failure,
+        lower=made.lower,
+        upper=made.upper,
+        ball=_reach(made, found),
+        accept_at=accept_at,
+        reject_at=reject_at,
+        level=level,
+        successes_needed=None if accept_at is None else _needed(policy, made, accept_at, 1),
+        failures_needed=None if reject_at is None else _needed(policy, made, reject_at, 0),
+        repeats=found.model is not None or bool(np.allclose(again, (made.lower, made.upper), atol=1e-6)),
+    )
+
+
+def _was_lost(made: Decision) -> bool:
+    """Whether the row was made from a stop whose decision was lost: an accept on no evidence."""
+    return (made.reason, made.action, made.lower, made.upper) == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
+
+
+def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
+    policy = found.recipe.policy
+    if found.rival or policy.guarantee not in RULES:
+        return None, None, f"{found.rival or policy.guarantee} decides by its own rule"
+    if policy.guarantee == "local" and not found.safe_mode:
+        return policy.lower_bound, 1.0 - policy.lower_bound, "LB, of the ball around the part"
+    if found.levels is None:
+        return None, None, "the levels that held then are not kept"
+    accept_at, reject_at = found.levels
+    held = "the lowest level that held then" if policy.guarantee == "pooled" else "what held in safe mode"
+    return accept_at if accept_at < NOBODY else None, 1.0 - reject_at if reject_at < NOBODY else None, held
+
+
+def _reach(made: Decision, found: Circumstances) -> str:
+    recipe = found.recipe
+    if found.rival:
+        return "as the model counts them"
+    if recipe.fraction is None:
+        return f"within the radius {recipe.radius:g}"
+    narrow = recipe.reject_fraction if made.predicted is Action.REJECT else None
+    return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
+
+
+def _needed(policy: Policy, made: Decision, threshold: float, success: int) -> int | None:
+    more = np.arange(MOST + 1)
+    counts = made.n_success + success * more, made.n_failure + (1 - success) * more
+    lower, upper = INTERVALS[policy.interval](*counts, policy.alpha)
+    enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
+    return int(enough[0]) if len(enough) else None
+
+
+def _verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) -> Iterator[str]:
+    """The sentences: what was done and why, how the bound came out, and what became of the part."""
+    made = past.decision
+    lost = ": the row was made from a stop whose decision was lost; on what evidence is not known."
+    yield DID[made.action].capitalize() + (lost if _was_lost(made) else WHY[made.reason](made, past.trace, found))
+    if bound is not None:
+        yield from _bound_sentences(made, bound, found)
+    if found.novelty is not None and made.reason is not Reason.NOVEL:
+        yield f"It is not novel: {found.novelty}."
+    source = "" if past.source is None else f" ({past.source.value})"
+    known = past.success is not None
+    yield f"The part turned out {past.label}{source}." if known else "Nothing was reported of the part."
+
+
+def _audit(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    (coin,) = toss(content_hash(trace[None]), audit_salt(found.seed)).tolist()
+    return (
+        f" as an audit: the model alone would have {DID[made.predicted]} it. The audits' coin fell on "
+        f"{coin / 2**COIN_BITS:.4f}, below the audit rate {made.propensity:g}; it is a function of the trace and the seed."
+    )
+
+
+def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    spec = found.spec
+    if spec is None or spec.limit is None:
+        return ": the trace touched the sensor's range."
+    touching = np.argwhere(np.abs(trace) >= spec.limit)
+    if not len(touching):
+        return f": the trace touched the sensor's range, which is now {spec.limit:g} {spec.unit}."
+    channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
+    return (
+        f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, first after "
+        f"{sample / spec.rate_hz:.3f} s (channel {channel + 1})."
+    )
+
+
+def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    n = int((~np.isfinite(trace)).sum())
+    return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
+
+
+WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
+    Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
+    Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
+    Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
+    Reason.AUDIT: _audit,
+    Reason.NOT_FINITE: _not_finite,
+    Reason.CONSTANT: lambda made, trace, found: (
+        f": every sample is {trace.flat[0]:g} {found.spec.unit if found.spec else ''}: a dead sensor."
+    ),
+    Reason.SATURATED: _saturated,
+    Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
+    Reason.NOVEL: lambda made, trace, found: (
+        f": unlike all that was learned from{'' if found.novelty is None else f': {found.novelty}'}. "
+        "What its neighbours say does not count then."
+    ),
+    Reason.SAFE_MODE: lambda made, trace, found: (
+        f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
+    ),
+    Reason.NO_STORE: lambda *_: (
+        ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
+    ),
+    Reason.LATE: lambda *_: (
+        ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."
+    ),
+}
+
+
+def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iterator[str]:
+    n, reach = made.n_success + made.n_failure, f"{made.lower:.3f} to {made.upper:.3f}"
+    if found.rival:
+        yield f"{found.rival} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
+        return
+    counted = f"{made.n_success} of {n} labels {bound.ball} are successes" if n else f"No label {bound.ball}"
+    name = bound.interval.replace("_", "-").capitalize()
+    yield f"{counted}; {name} at alpha {bound.alpha:g} bounds the success rate by {reach}."
+    if bound.accept_at is None and bound.reject_at is None:
+        why = found.safe_mode or ("" if found.levels is None else "no level of evidence held yet")
+        yield f"Nothing could pass, whatever the bound: {why}." if why else f"What it had to reach: {bound.level}."
+        return
+    if made.predicted is not Action.REJECT:
+        yield _side("accept", f"lower must be at least {{:.4g}} ({bound.level}); it is {made.lower:.3f}", bound)
+    if made.predicted is not Action.ACCEPT:
+        yield _side("reject", f"upper must be at most {{:.4g}} ({bound.level}); it is {made.upper:.3f}", bound)
+
+
+def _side(action: str, must: str, bound: Bound) -> str:
+    """What one action would have needed."""
+    ways = {
+        "accept": (bound.accept_at, bound.successes_needed, "success", "successes", "failure"),
+        "reject": (bound.reject_at, bound.failures_needed, "failure", "failures", "success"),
+    }
+    threshold, needed, one, many, other = ways[action]
+    if threshold is None:
+        return f"To {action}: no level held, so nothing could be {action}ed."
+    more = "no number of labels" if needed is None else f"{needed} more {one if needed == 1 else many} and no {other}"
+    return f"To {action}, {must.format(threshold)}" + (", enough." if needed == 0 else f": {more} would do.")
 
 
 @dataclass(frozen=True)
@@ -149,10 +474,6 @@ class Ball:
     radius: float
     n_success: int
     n_failure: int
-
-
-NEIGHBOURS = 10  # nearest references that are shown
-SUCCESSES = 1000  # newest labelled traces that the envelope is made of
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,66 +523,48 @@ class Explanation:
     def record(self) -> dict[str, Any]:
         """All but the arrays, as plain values for a machine."""
         said: dict[str, Any] = plain(self)
-        if self.envelope is not None:
-            said["envelope"]["largest"] = plain(self.envelope.largest)
         return said
 
 
-@dataclass(frozen=True)
-class Records:
-    """Where an explanation is read from.
-
-    store : the engine's.  present : gives the model that answers now, or None; asked where the version that answered is
-        not kept.  version : its number.
-    """
-
-    store: Store
-    present: Callable[[], EngineModel | None] = lambda: None
-    version: int = 0
+Present = Callable[[], tuple[EngineModel | None, int]]
 
 
-def explain(decision_id: str, records: Records, neighbours: int = NEIGHBOURS) -> Explanation:
-    """Explain one decision; neighbours : how many of the nearest references to show.
+def explain(
+    store: Store,
+    decision_id: str,
+    neighbours: int = NEIGHBOURS,
+    settings: Circumstances | None = None,
+    present: Present = lambda: (None, 0),
+) -> Explanation:
+    """Explain one decision.
 
+    neighbours : how many of the nearest references to show.  settings : of the engine; None: as the store keeps them.
+    present : gives the model that answers now, or None, and its version; asked where the one that answered is not kept.
     Raises ReportError for an id that the store does not hold, StoreError for a store that no engine has used.
     """
-    store, known = records.store, records.store.settings()
-    if "recipe" not in known:
-        raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
+    settings = settings or Circumstances.of(store)
     past = store.get_decision(decision_id)
     if past is None:
         raise ReportError(
             f"Expected the id of a decision of cell {store.cell_id!r}, got {decision_id!r}, which its store does not hold; "
             "`dengine history STORE` lists the ids, newest last."
         )
-    made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
-    spec = trace_in(known) or TraceSpec(samples=trace.shape[1], channels=trace.shape[0])
+    made, trace, recipe = past.decision, past.trace, settings.recipe
+    spec = settings.spec or TraceSpec(samples=trace.shape[1], channels=trace.shape[0])
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
-    around = _around(past, answering, records, recipe)
-    mode = safe_mode_event(store, past.time)
-    (coin,) = toss(content_hash(trace[None]), audit_salt(int(known.get("seed", "0")))).tolist()
-    novelty = None
-    if answering is not None and answering.gate is not None and not past.quarantined:
-        with torch.inference_mode():
-            novelty = Novelty(*answering.gate.scores(torch.from_numpy(trace)).tolist())
-    found = Circumstances(
-        recipe=recipe,
-        spec=spec,
-        model=known.get("model"),
-        rule=None if answering is None else answering.rule,
-        novelty=novelty,
-        coin=coin / 2**COIN_BITS,
-        safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
-    )
+    around = _around(store, past, answering, recipe, present)
+    found = replace(settings, spec=spec, safe_mode=_safe_mode(store, past))
+    if answering is not None:
+        found = replace(found, levels=answering.levels, novelty=_novelty(past, answering))
     bound = bound_of(made, found)
     return Explanation(
         decision=past,
         trace=trace,
         spec=spec,
-        said=tuple(verdict(past, bound, found)),
-        notes=tuple(_notes(past, answering, around, bound)),
+        said=tuple(_verdict(past, bound, found)),
+        notes=tuple(_notes(past, around, bound)),
         bound=bound,
-        novelty=novelty,
+        novelty=found.novelty,
         neighbours=() if around is None else tuple(_nearest(store, around, neighbours)),
         neighbours_version=None if around is None else around.answering.version,
         radius=None if around is None else around.radius,
@@ -269,14 +572,30 @@ def explain(decision_id: str, records: Records, neighbours: int = NEIGHBOURS) ->
     )
 
 
-def _around(past: StoredDecision, answering: Answering | None, records: Records, recipe: Recipe) -> Ball | None:
+def _safe_mode(store: Store, past: StoredDecision) -> str:
+    if past.decision.reason is not Reason.SAFE_MODE:
+        return ""
+    began = (each.text for each in reversed(store.events()) if each.kind == SAFE_MODE_BEGAN and each.time <= past.time)
+    return next(began, "")
+
+
+def _novelty(past: StoredDecision, answering: Answering) -> Novelty | None:
+    if answering.gate is None or past.quarantined:
+        return None
+    with torch.inference_mode():
+        return Novelty(*answering.gate.scores(torch.from_numpy(past.trace)).tolist())
+
+
+def _around(
+    store: Store, past: StoredDecision, answering: Answering | None, recipe: Recipe, present: Present
+) -> Ball | None:
     """The ball that decided, or the one of the version that answers now; None where nothing embeds the trace."""
     z, own = past.decision.embedding, True
     if past.quarantined or past.decision.reason is Reason.MODEL_ERROR:
         return None
     if answering is None or z is None:
-        model, own = records.present(), False
-        answering = None if model is None else as_it_stood(records.store, records.version, recipe, None)
+        own, (model, version) = False, present()
+        answering = None if model is None else as_it_stood(store, version, recipe, None)
         if model is None or model.untold or answering is None:
             return None
         z = model.predict_one(past.trace, past.content_hash).embedding
@@ -301,14 +620,14 @@ def _ball(answering: Answering, own: bool, z: Embedding, part: int, radius: floa
     return Ball(answering, own, distances, radius, n_success, n_failure)
 
 
-def _nearest(store: Store, ball: Ball, most: int) -> list[Neighbour]:
-    index, behind, found = ball.answering.index, ball.answering.labels_of_references(), []
+def _nearest(store: Store, ball: Ball, most: int) -> Iterator[Neighbour]:
+    index, behind = ball.answering.index, ball.answering.labels_of_references()
     for slot in np.argsort(ball.distances, kind="stable")[:most]:
         if not np.isfinite(ball.distances[slot]):
-            break
+            return
         label = behind[slot]
         stored = None if label is None else store.get_decision(label.decision_id)
-        one = Neighbour(
+        yield Neighbour(
             decision_id=None if label is None else label.decision_id,
             part=None if stored is None else stored.decision.part,
             success=bool(index.labels[slot]),
@@ -318,8 +637,6 @@ def _nearest(store: Store, ball: Ball, most: int) -> list[Neighbour]:
             inside=bool(ball.distances[slot] <= ball.radius),
             trace=None if stored is None else stored.trace,
         )
-        found.append(one)
-    return found
 
 
 def _envelope(store: Store, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
@@ -332,25 +649,22 @@ def _envelope(store: Store, past: StoredDecision, answering: Answering | None, s
     return None
 
 
-def _notes(past: StoredDecision, answering: Answering | None, around: Ball | None, bound: Bound | None) -> list[str]:
-    version, found = past.decision.model_version, []
+def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None) -> Iterator[str]:
+    version = past.decision.model_version
     if past.quarantined:
-        found.append("The trace is quarantined: it was not embedded, is never trained on, and has no neighbours.")
+        yield "The trace is quarantined: it was not embedded, is never trained on, and has no neighbours."
     elif around is None:
-        found.append("Nothing that embeds this trace is kept, so no neighbours are shown.")
+        yield "Nothing that embeds this trace is kept, so no neighbours are shown."
     elif around.own:
         recorded, again = (past.decision.n_success, past.decision.n_failure), (around.n_success, around.n_failure)
-        found.append(f"Neighbours: the references of version {version}, which answered, as they stood then.")
+        yield f"Neighbours: the references of version {version}, which answered, as they stood then."
         if past.decision.reason is not Reason.NOVEL and again != recorded:
-            found.append(
+            yield (
                 f"Counted again, the ball holds {again[0]} successes and {again[1]} failures; recorded were {recorded[0]} "
                 f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."
             )
     else:
         why = "no version answered then" if version == 0 else f"version {version}, which answered, is not kept any more"
-        found.append(f"Neighbours: by version {around.answering.version}, the present one; {why}.")
-    if answering is not None and answering.rule is None and bound is not None:
-        found.append(f"What the rule of version {version} had learned is not kept; its thresholds are not shown.")
+        yield f"Neighbours: by version {around.answering.version}, the present one; {why}."
     if bound is not None and not bound.repeats:
-        found.append("By the store's present settings these counts give another bound; the recorded one is shown.")
-    return found
+        yield "By the store's present settings these counts give another bound; the recorded one is shown."

@@ -8,12 +8,11 @@ for past in history(store, last=50, action="accept", label="bad"): ...
 from __future__ import annotations
 
 import heapq
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from enum import StrEnum
-from itertools import chain
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
@@ -22,7 +21,7 @@ from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec, trace_in
 from ..store.base import Store
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Evidence, Key, Outcomes, StoredDecision
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Key, Outcomes, StoredDecision
 from ..store.views import LABELS, HistoryFilter, PastRetrain, Stretch, Tally
 
 PAGE = 500  # decisions read at a time
@@ -30,7 +29,6 @@ NEWEST = 500  # decisions that are looked at apart
 RECENT = 200  # labels that the share of novel traces is told of
 EVENTS = 5  # newest ones that a status shows
 
-Happened = StoredDecision | PastRetrain | Event
 Name = TypeVar("Name", bound=StrEnum)
 
 
@@ -175,9 +173,11 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
     if "recipe" not in settings:
         raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
     recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.past_retrains()
-    every, policy, mode = store.tally(), recipe.policy, safe_mode_event(store)
-    recent = _newest_evidence(store, counts["labels"])
-    outcomes = every.outcomes
+    every, policy, events = store.tally(), recipe.policy, store.events()
+    mode = next((event for event in reversed(events) if event.kind in MODES), None)
+    # Labels are numbered from 1, or over a whole product.
+    recent = store.evidence_since(counts["labels"] - RECENT if store.product is None else 0)
+    outcomes, silent = every.outcomes, recent.silent[-RECENT:]
     return Status(
         cell=store.cell_id,
         product=counts.get("product"),
@@ -194,31 +194,18 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
         newest=_span(store.tally(last), retrains, policy),
         ever=_span(every, retrains, policy),
         unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
-        recent=len(recent.seq) + int(recent.silent.sum()),
-        recent_novel=int(recent.novel.sum()),
+        recent=len(silent) + int(silent.sum()),
+        recent_novel=int(recent.novel[-RECENT:].sum()),
         certificate=policy.certificate(store.outcomes(int(settings.get("policy_since", 0)))),
         retrains=tuple(retrains),
-        events=tuple(store.events(EVENTS)),
+        events=tuple(events[-EVENTS:]),
         watch=watch(store, recipe) if watching else None,
         **{name: counts[name] for name in COUNTED},
     )
 
 
+MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
 COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten", "last_label_time", "write_failures")
-
-
-def safe_mode_event(store: Store, until: float = float("inf")) -> Event | None:
-    """The newest event that began or ended the safe mode, up to a time; None where there is none."""
-    modes = [each for each in store.events() if each.kind in (SAFE_MODE_BEGAN, SAFE_MODE_ENDED) and each.time <= until]
-    return modes[-1] if modes else None
-
-
-def _newest_evidence(store: Store, labels: int) -> Evidence:
-    """What became of the decisions with the newest labels, RECENT at most."""
-    known = store.evidence_since(
-        labels - RECENT if store.product is None else 0
-    )  # numbered from 1, or over a whole product
-    return Evidence(*(getattr(known, field.name)[-RECENT:] for field in fields(known)))
 
 
 def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
@@ -307,7 +294,7 @@ FEWEST = 20  # decisions of a stretch: a share of fewer jumps
 
 def course(store: Store, recipe: Recipe, last: int) -> Course:
     """Read what a picture is drawn from."""
-    modes = [event for event in store.events() if event.kind in (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)]
+    modes = [event for event in store.events() if event.kind in MODES]
     n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
     return Course(store.stretches(n), store.past_retrains(), modes, 1.0 - recipe.policy.lower_bound, last)
 
@@ -335,7 +322,7 @@ def history(
     if label is not None and label not in LABELS:
         raise SettingError(f"Expected label to be one of {', '.join(LABELS)}, got {label!r}.")
     where = HistoryFilter(_named(Action, action), _named(Reason, reason), label, since, until, _named(Action, predicted))
-    return _forward(store, where) if last is None else iter(_newest(store, where, last))
+    return _forward(store, where) if last is None else _newest(store, where, last)
 
 
 def _named(kind: type[Name], value: Name | str | None) -> Name | None:
@@ -353,34 +340,24 @@ def _forward(store: Store, where: HistoryFilter) -> Iterator[StoredDecision]:
         beyond = page[-1].key
 
 
-def _newest(store: Store, where: HistoryFilter, last: int) -> list[StoredDecision]:
-    pages: list[list[StoredDecision]] = []
+def _newest(store: Store, where: HistoryFilter, last: int) -> Iterator[StoredDecision]:
+    found: deque[StoredDecision] = deque()
     beyond: Key | None = None
-    left = last
-    while left and (page := store.decisions(where, min(PAGE, left), beyond)):
-        pages.append(page)
-        beyond, left = page[0].key, left - len(page)
-    return list(chain.from_iterable(reversed(pages)))
+    while len(found) < last and (page := store.decisions(where, min(PAGE, last - len(found)), beyond)):
+        found.extendleft(reversed(page))
+        beyond = page[0].key
+    return iter(found)
 
 
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """What happened beside the decisions, oldest first."""
-
-    retrains: tuple[PastRetrain, ...]
-    events: tuple[Event, ...]
-
-
-def beside(store: Store, since: float | None = None, until: float | None = None) -> Beside:
-    """The retrains and events of a store between two times in seconds; None: from its beginning, to now."""
-
-    def meant(time: float) -> bool:
-        return (since is None or time >= since) and (until is None or time < until)
-
-    retrains = tuple(each for each in store.past_retrains() if meant(each.time))
-    return Beside(retrains, tuple(each for each in store.events() if meant(each.time)))
+def beside(store: Store, since: float | None = None, until: float | None = None) -> dict[str, list[PastRetrain | Event]]:
+    """What happened beside the decisions, retrains and events, oldest first, between two times in seconds; None: any."""
+    first, end = since or float("-inf"), float("inf") if until is None else until
+    past: dict[str, list[Any]] = {"retrains": store.past_retrains(), "events": store.events()}
+    return {name: [each for each in happened if first <= each.time < end] for name, happened in past.items()}
 
 
-def interleaved(decisions: list[StoredDecision], others: Beside) -> Iterator[Happened]:
+def interleaved(
+    decisions: list[StoredDecision], others: Mapping[str, list[PastRetrain | Event]]
+) -> Iterator[StoredDecision | PastRetrain | Event]:
     """All of it in the order in which it happened; what has the same time keeps that order too."""
-    return heapq.merge(others.retrains, others.events, decisions, key=lambda each: each.time)
+    return heapq.merge(*others.values(), decisions, key=lambda each: each.time)

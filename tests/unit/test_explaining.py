@@ -17,9 +17,7 @@ from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, ReplayC
 from dengine.engine.engine import explain_stored
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash
-from dengine.history.envelope import envelope_of
-from dengine.history.explain import Explanation
-from dengine.history.sentences import WHY, Circumstances, bound_of
+from dengine.history.explain import WHY, Circumstances, Explanation, bound_of, envelope_of
 from dengine.store import MemoryStore, Store
 from tests.support.driving import Counting
 

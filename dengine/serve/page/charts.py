@@ -14,8 +14,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
 
-from ...history.explain import Explanation
-from ...history.sentences import Bound
+from ...history.explain import Bound, Explanation
 from ...history.status import Course, Judged
 
 Floats = NDArray[np.floating]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...experiments.figures import is_probability
-from ...history.explain import Explanation, Records, as_it_stood, explain
+from ...history.explain import Explanation, as_it_stood, explain
 from ...history.status import Course, Status, Watch, course, status, watch
 from ...records import Action, Reason, Source
 from ...store.records import Correction, Event, Key, StoredDecision
@@ -108,7 +108,7 @@ def part_view(looking: Looking, decision_id: str) -> PartView | None:
     corrections = store.corrections()
     # What was known then does not change, but for corrections: the evidence of a part is read once.
     fits = past, len(corrections)
-    found = looking.kept(("explained", decision_id), fits, lambda: explain(decision_id, Records(store)))
+    found = looking.kept(("explained", decision_id), fits, lambda: explain(store, decision_id))
 
     def newest_bads() -> NDArray[np.float32]:
         labelled = store.labelled(AMONG)
