@@ -141,12 +141,12 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
     def learn(self: Any, known: Any, success: bool, point: Any, silent: int) -> None:
-        lower, upper = known.lower, known.upper
+        lower, upper = known.decision.lower, known.decision.upper
         self.newest.add_safely(point, int(success), known.content_hash, 0)
         if self.answering is not None:
             now = self.answering.predict_one(known.trace)
             lower, upper = now.lower, now.upper
-        self.newest.tell_safely(Told(lower, upper, success, known.reason is Reason.NOVEL, silent))
+        self.newest.tell_safely(Told(lower, upper, success, known.decision.reason is Reason.NOVEL, silent))
         self.new_labels += 1
 
     patch.setattr(ModelVersions, "learn", learn)
