@@ -37,7 +37,7 @@ from rich.table import Table
 from dengine import DataEngine, Dataset, Recipe, load_dataset
 from dengine.cli.output import progress
 from dengine.records import ACTIONS
-from dengine.serve.retraining import retraining_process
+from dengine.serve.retraining import RetrainingProcess
 from dengine.serve.server import quick_switches
 from dengine.store import open_store
 
@@ -175,7 +175,7 @@ def over_the_network(data: Dataset, n: int, recipe: Path, folder: Path, pace: fl
 
 def within(data: Dataset, n: int, recipe: Path, folder: Path, pace: float) -> dict[str, list[float]]:
     """The engine itself, with the same store, retraining in the same kind of process."""
-    with quick_switches(), retraining_process() as executor:
+    with quick_switches(), RetrainingProcess() as executor:
         options = {"recipe": Recipe.load(recipe), "executor": executor}
         with DataEngine.open_or_create(folder / "engine.db", **options) as engine:
             engine.know_ids()

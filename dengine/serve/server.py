@@ -28,7 +28,7 @@ from ..records import RetrainReport
 from .auth import Access, in_url, is_loopback, read_token
 from .connections import Places
 from .http import INTERFACES, Beside, create_app
-from .retraining import retraining_process
+from .retraining import RetrainingProcess
 from .robot_calls import Recorder
 from .service import DEADLINE, Answer, CellService, Told
 
@@ -123,7 +123,7 @@ def serve(
     with (
         bound(serving.host, serving.port) as listening,
         log_lines_to(sys.stderr),
-        retraining_process() as executor,
+        RetrainingProcess() as executor,
         serving.recorder() if serving.recorder else nullcontext() as recorder,
     ):
         service = CellService(lambda: make(executor), store, serving.deadline)

@@ -66,14 +66,15 @@ class Process:
 
 
 @contextmanager
-def server(folder: Path, *words: str) -> Iterator[Process]:
+def server(folder: Path, *words: str, wait: bool = True) -> Iterator[Process]:
+    """A server's process. wait : until it says where it listens."""
     command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--no-page", *words]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     environment = os.environ | {"PYTHONPATH": str(REPO)}
     process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
     try:
-        said = next(line for line in process.stdout if "is served at" in line or process.poll() is not None)
-        yield Process(process, int(said.partition("127.0.0.1:")[2].partition(",")[0]))
+        said = next(line for line in process.stdout if "is served at" in line or process.poll() is not None) if wait else ""
+        yield Process(process, int(said.partition("127.0.0.1:")[2].partition(",")[0] or 0))
     finally:
         if process.poll() is None:
             process.kill()
@@ -163,6 +164,21 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
                 answer["reason"],
                 answer["lower"],
             )
+
+
+@pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
+def test_a_server_that_is_killed_leaves_no_retraining_process_behind(tmp_path: Path, parts: Dataset, at_work: bool) -> None:
+    recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
+    (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
+    with server(tmp_path, "--recipe", "recipe.toml", "--rate", "0", wait=at_work) as process:
+        if at_work:
+            threads = Robots(process.ask, parts).start(1)
+            until(lambda: process.ask("/status")["retraining"])
+        below = until(lambda: children(process.process.pid))
+        process.process.kill()
+        until(lambda: not any(map(is_alive, below)), WAIT / 4)
+    for each in threads if at_work else ():
+        each.join(WAIT)
 
 
 class Insertions:
