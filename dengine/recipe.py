@@ -50,7 +50,6 @@ class Recipe:
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
-    encoder_budget : seconds a cycle, on average, in which a reducer that trains without labels may do so; 0: never.
     max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
     novelty : a trace is novel where its squared distance to the nearest learned one, in level or in texture, is more than
@@ -66,7 +65,6 @@ class Recipe:
     folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
-    encoder_budget: float = 0.0
     max_steps: int | None = None
     window: int = 10_000
     novelty: float = NOVELTY
@@ -79,8 +77,6 @@ class Recipe:
                 raise SettingError(f"Expected {name} to be an integer of at least {least}, got {got}; at most {most:,}.")
         if not (is_number(self.budget) and self.budget > 0.0):
             raise SettingError(f"Expected budget > 0 seconds, got {shortened(self.budget)}.")
-        if not (is_number(self.encoder_budget) and 0.0 <= self.encoder_budget < float("inf")):
-            raise SettingError(f"Expected encoder_budget >= 0 seconds a cycle, got {shortened(self.encoder_budget)}.")
         if not (is_number(self.novelty) and 0.0 <= self.novelty < float("inf")):
             raise SettingError(f"Expected a finite novelty of 0 or more, got {shortened(self.novelty)}; 0 turns it off.")
         self._check_params()
@@ -243,7 +239,7 @@ def _value(value: Any) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    "conv": Recipe("conv", radius=0.05, encoder_budget=0.01),  # radius of a probability: the encoder's own unit
+    "conv": Recipe("conv", radius=0.05),  # radius of a probability: the encoder's own unit
     "umap": Recipe("umap"),
     "pca": Recipe("pca", radius=0.2),
     "rocket": Recipe("rocket", radius=0.05),

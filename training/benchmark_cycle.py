@@ -32,12 +32,10 @@ def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repe
     """Every quantity, a row each."""
     played = [replay(data, recipe, seed) for seed in range(replays)]
     retrains = np.array([each.seconds for one in played for each in one.retrains])
-    slices = [one.slice_max_s for one in played]
     engine = filled_engine(data, recipe)
     whole = np.array([engine.retrain().seconds for _ in range(repeats)])  # as the last one of a long run sees it
     rows = [
         row(f"retrain, all of {replays} replays", retrains, BUDGET),
-        row("the longest slice of the encoder's training in each", slices, BUDGET),
         row(f"retrain on {len(data)} traces", whole, BUDGET),
     ]
     decide = decide_times(filled_engine(data, recipe), data)

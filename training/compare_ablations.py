@@ -3,9 +3,8 @@
     python training/compare_ablations.py --data insertion --seeds 100:110 --out out/ablations
     python training/compare_ablations.py --data screw_driving.npz --samples 400 --only radius,folds,length
 
-Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), training (seconds of it in a
-replay), augmentations (what the encoder's views are distorted by), length (a part is decided on the beginning of its trace:
-0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
+Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), length (a part is decided on
+the beginning of its trace: 0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
 Writes ablations.csv, a row a replay, and ablations.png. Finished replays are kept in --keep, so that an interrupted run
 goes on.
 """
@@ -29,7 +28,6 @@ from dengine.experiments.figures import GREEN, LIMIT, save
 from dengine.experiments.grid import Task, play_tasks
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
-from dengine.reducers.training import AUGMENTATIONS
 
 CYCLES = 1503
 
@@ -56,21 +54,9 @@ def features(data: Dataset, base: Recipe) -> Variants:
     others = {
         "14 kernels": replace(base, params={**base.params, "kernels": 14}),
         "32 directions": replace(base, params={**base.params, "width": 32}),
-        "rocket": replace(base, reducer="rocket", params={}, encoder_budget=0.0),
+        "rocket": replace(base, reducer="rocket", params={}),
     }
     return {"all of conv's": Variant(data, base)} | {name: Variant(data, recipe) for name, recipe in others.items()}
-
-
-def training(data: Dataset, base: Recipe) -> Variants:
-    """Seconds that the encoder trains in a whole replay, as a replay counts them."""
-    return {f"{s:g} s": Variant(data, replace(base, encoder_budget=s / CYCLES)) for s in (0, 3, 10, 15, 60)}
-
-
-def augmentations(data: Dataset, base: Recipe) -> Variants:
-    """What distorts the views that the encoder trains on, each left out in turn."""
-    left = {name: " ".join(each for each in AUGMENTATIONS if each != name) for name in AUGMENTATIONS}
-    recipes = {f"no {name}": replace(base, params={**base.params, "augmentations": kept}) for name, kept in left.items()}
-    return {name: Variant(data, recipe) for name, recipe in recipes.items()}
 
 
 def length(data: Dataset, base: Recipe) -> Variants:
@@ -108,8 +94,6 @@ AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
     "retrain": setting("retrain_every", (25, 50, 100, 200, 400)),
     "folds": setting("folds", (2, 3, 5, 10)),
     "features": features,
-    "training": training,
-    "augmentations": augmentations,
     "length": length,
     "channels": channels,
     "feedback": feedback,

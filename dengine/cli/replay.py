@@ -278,7 +278,7 @@ def _report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out
         show(tables.pooled_table(rows, title), *tables.promise_lines(rows))
         for name, some in by_name.items():
             retrains = [each for one in some for each in one.retrains]
-            show(f"{name}: {tables.retrain_line(retrains)}{tables.encoder_line(some)}")
+            show(f"{name}: {tables.retrain_line(retrains)}")
         many = "" if len(replays) == 1 else "s"
         kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
         took = f"{duration(core)} of one core's time, in {duration(finished.seconds)}{kept}."

@@ -75,7 +75,7 @@ class Corrections:
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on; `correct` brings one back.
 
-        Traces, and labels as they were reported, stay in the store; the encoder that was trained with them goes on until
+        Traces, and labels as they were reported, stay in the store; the version that was trained with them goes on until
         the next retrain. A guarantee assumes that what is forgotten is chosen blind to its label; the certificate takes a
         forgotten outcome of what was certain for a wrong decision, so that forgetting earns nothing.
         Raises ReportError for an unknown decision, and for one without a label; then none is forgotten.

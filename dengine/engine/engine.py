@@ -55,7 +55,7 @@ from .feedback import Feedback
 from .peers import Fleet, agreed, as_peers, peers_trace
 from .resume import resume
 from .settings import EngineSettings, SettingsInForce, chosen_recipe, object_of, refuse_idle
-from .trainer import Clock, EncoderTime, Limits, Retrainer, Window
+from .trainer import Clock, Limits, Retrainer, Window
 from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
@@ -145,8 +145,7 @@ class DataEngine:
     ) -> None:
         torch.set_num_threads(1)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
-        encoder_time = EncoderTime(settings.recipe.encoder_budget, in_steps=replaying)
-        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock, encoder_time)
+        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._outbox = Outbox(store, owning=not reading, patient=replaying)
         weakref.finalize(self, self._outbox.close)  # of a program that forgot to
         self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
@@ -239,7 +238,6 @@ class DataEngine:
             if id_ is not None and (known := self._known(id_)) is not None:
                 return decided_before(known, trace, self.trace)
             self._versions.collect()
-            self._versions.retrainer.encoder_time.cycles += 1
             x, number = self._as_trace(trace), as_part(part)
             self._feedback.settle()
             unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
@@ -373,7 +371,7 @@ class DataEngine:
         return Cycle(index, decision, outcome, success, source, seconds, self.settle(), self.safe_mode)
 
     def settle(self, brief: bool = False) -> RetrainReport | None:
-        """Do what need not wait for a report: a retrain, a new version, a slice of training; the newest retrain, once.
+        """Do what need not wait for a report: a retrain, a new version; the newest retrain, once.
 
         brief : bring a version that an executor has trained a step further, a few milliseconds, and not to the end.
         """
@@ -436,11 +434,6 @@ class DataEngine:
     def swapping(self) -> bool:
         """Whether a version that an executor has trained is on its way in, a step each time that the engine is asked."""
         return self._versions.swapping
-
-    @property
-    def encoder_time(self) -> EncoderTime:
-        """What the encoder's training took so far."""
-        return self._versions.retrainer.encoder_time
 
     @property
     def recipe(self) -> Recipe:

@@ -22,7 +22,7 @@ log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
-LOOP = ("seed", "trace", "retrain_every", "budget", "encoder_budget", "max_steps", "window", "audit_rate", "stops")
+LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops")
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 

@@ -25,10 +25,6 @@ log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
 SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
 MARGIN = 1.2  # the tail grows a little with each retrain
-SLICE_SECONDS = 0.2  # that the encoder trains between two cycles
-STEP_SECONDS = 0.01  # of one step of the encoder's training, as a replay counts it
-MOST_SECONDS = 2.0  # that it may have saved up: in the executor all of it at once
-DRAWN = 1024  # traces that a slice trains on
 
 Clock = Callable[[], float]
 
@@ -70,12 +66,6 @@ class Window:
         self._clear()
         for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
             self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
-
-    def draw(self, n: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Traces (m, C, T) and hashes (m,) of `n` at most, drawn blind to labels, others at each new label."""
-        assert self._traces is not None  # the caller knows of labels; for the type checker
-        slots = np.random.default_rng(self.total).permutation(len(self))[:n]
-        return self._traces[slots], self._hashes[slots]
 
     def snapshot(self) -> Labelled:
         """What is held, oldest first. Nobody writes to these arrays afterwards."""
@@ -152,62 +142,11 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Slice:
-    """One run of the encoder's training: seconds by the clock, or steps where a seed must repeat exactly."""
-
-    seconds: float | None
-    steps: int | None
-
-    def stop(self, clock: Clock) -> StopRule:
-        """The rule, from now on."""
-        return StopRule(None if self.seconds is None else clock() + self.seconds, self.steps, clock)
-
-
-class EncoderTime:
-    """The time in which the encoder may train: `per_cycle` seconds on average, saved up and taken in slices.
-
-    in_steps : whether a step counts as `STEP_SECONDS`, whatever it took.
-    steps, seconds : taken so far.  longest : seconds of the longest slice in line.
-    """
-
-    def __init__(self, per_cycle: float, in_steps: bool) -> None:
-        self.per_cycle, self.in_steps = per_cycle, in_steps
-        self.cycles = 0  # begun since the last look
-        self._saved = 0.0
-        self.steps, self.seconds, self.longest = 0, 0.0, 0.0
-
-    @property
-    def saved(self) -> float:
-        """Seconds that it may train by now."""
-        for _ in range(self.cycles):
-            self._saved = min(self._saved + self.per_cycle, max(MOST_SECONDS, self.per_cycle))
-        self.cycles = 0
-        return self._saved
-
-    def take(self, least: float = 0.0, most: float = MOST_SECONDS) -> Slice | None:
-        """Up to `most` seconds of what is saved up, where it is `least` at least; None: nothing is due."""
-        seconds = min(self.saved, most)
-        if seconds <= 0.0 or self.saved < least:
-            return None
-        if self.in_steps:
-            return Slice(None, steps) if (steps := round(seconds / STEP_SECONDS)) else None
-        return Slice(seconds, None)
-
-    def spend(self, steps: int, seconds: float) -> None:
-        """Account for steps that took so long."""
-        counted = steps * STEP_SECONDS if self.in_steps else seconds
-        # What trained nothing is not asked again at every cycle.
-        self._saved = max(0.0, self.saved - counted) if steps else 0.0
-        self.steps, self.seconds = self.steps + steps, self.seconds + counted
-
-
-@dataclass(frozen=True)
 class Trained:
     """The outcome of a training.
 
     model : to swap in; None: dropped.  reason : why, in words.
     seconds : of the whole.  tail : of what followed the last step, the next retrain's reserve.
-    encoder_steps, encoder_seconds : that the encoder trained before, beside the cell.
     seq : the labels it was trained on.  begin : when, by the retrainer's clock.
     """
 
@@ -216,8 +155,6 @@ class Trained:
     n_steps: int = 0
     seconds: float = 0.0
     tail: float = 0.0
-    encoder_steps: int = 0
-    encoder_seconds: float = 0.0
     seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     begin: float = 0.0
 
@@ -225,33 +162,14 @@ class Trained:
 class Retrainer:
     """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
 
-    clock : in seconds; it must pickle for a process executor.  encoder_time : in which the encoder may train.
+    clock : in seconds; it must pickle for a process executor.
     """
 
-    def __init__(
-        self,
-        window: Window,
-        limits: Limits,
-        executor: Executor | None,
-        clock: Clock = time.perf_counter,
-        encoder_time: EncoderTime | None = None,
-    ) -> None:
-        self.encoder_time = encoder_time or EncoderTime(0.0, in_steps=True)
+    def __init__(self, window: Window, limits: Limits, executor: Executor | None, clock: Clock = time.perf_counter) -> None:
         self.window, self.limits, self.executor, self.clock = window, limits, executor, clock
         self.future: Future[Trained] | None = None
         self._began = 0.0  # monotonic seconds
         self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
-
-    def improve(self, current: EngineModel) -> None:
-        """Train the current model's encoder for a slice, in line, where one is due."""
-        piece = self.encoder_time.take(SLICE_SECONDS, SLICE_SECONDS)
-        if piece is None or self.executor is not None or not len(self.window):
-            return
-        begin = self.clock()
-        steps = current.improve_safely(*self.window.draw(DRAWN), piece.stop(self.clock))
-        seconds = self.clock() - begin
-        self.encoder_time.spend(steps, seconds)
-        self.encoder_time.longest = max(self.encoder_time.longest, seconds)
 
     def train(self, current: EngineModel) -> Trained:
         """Train a successor of the current model, in line."""
@@ -262,9 +180,9 @@ class Retrainer:
     def start(self, current: EngineModel) -> bool:
         """Train a successor of the current model beside the cell; False where the executor takes no more work."""
         assert self.executor is not None  # the caller asked; for the type checker
-        data, piece = self.window.snapshot(), self.encoder_time.take()
+        data = self.window.snapshot()
         try:
-            self.future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock, piece)
+            self.future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock)
         except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
             log.error("the executor takes no more work, retrains are in line from now on: %s", error)
             self.executor = None
@@ -281,7 +199,6 @@ class Retrainer:
             trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # recorded, and the old version goes on answering
             trained = Trained(None, self._failed(future, error), seq=self._seq)
-        self.encoder_time.spend(trained.encoder_steps, trained.encoder_seconds)
         return self._measured(replace(trained, begin=self.clock() - trained.seconds))
 
     def _failed(self, future: Future[Trained], error: Exception) -> str:
@@ -303,13 +220,9 @@ class Retrainer:
         return trained
 
 
-def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock, piece: Slice | None) -> Trained:
+def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
     torch.set_num_threads(1)  # per thread, and first thing in each
-    begin, steps = clock(), 0
-    if piece is not None and len(data.seq):
-        steps = successor.improve_safely(data.traces, data.hashes, piece.stop(clock))
-    seconds = clock() - begin
-    return replace(train_candidate(successor, data, limits, clock), encoder_steps=steps, encoder_seconds=seconds)
+    return train_candidate(successor, data, limits, clock)
 
 
 def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:

@@ -291,11 +291,9 @@ class ModelVersions:
         return self._news
 
     def work(self, retrain_every: int) -> RetrainReport | None:
-        """Do what is due between two cycles: a retrain, where the store is there, or a slice of encoder training."""
+        """Do what is due between two cycles: a retrain, where the store is there."""
         if self.count.due(retrain_every) and self._ready():
             return self.start_retrain()
-        if self.answering is not None:
-            self.retrainer.improve(self.answering)
         return None
 
     def _ready(self) -> bool:

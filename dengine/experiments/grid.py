@@ -44,7 +44,7 @@ Folder = str | os.PathLike[str]
 OnDone = Callable[[Replay], None] | None
 TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
 # What of a replay is no array, beside its recipe.
-ABOUT = ("name", "dataset", "seed", "confirm", "seconds", "encoder_steps", "encoder_seconds", "slice_max_s")
+ABOUT = ("name", "dataset", "seed", "confirm", "seconds")
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
 DAMAGED = (  # what reading a damaged file ends in, by where the damage is
     OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError

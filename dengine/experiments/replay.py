@@ -91,8 +91,7 @@ class Replay:
     Of a replay alone:
     index : (n,) position in the data set of the trace that each cycle played.  dataset : its name.
     seed : of the shuffle and of the engine.  confirm : whether accepted good parts were confirmed by the cell.
-    seconds : wall time of the whole replay.  encoder_steps : of label-free training between cycles.
-    encoder_seconds : so many a step, whatever they took, so that a seed repeats exactly.  slice_max_s : their longest.
+    seconds : wall time of the whole replay.
     """
 
     action: NDArray[np.str_]
@@ -116,9 +115,6 @@ class Replay:
     seed: int = 0
     confirm: bool = False
     seconds: float = float("nan")
-    encoder_steps: int = 0
-    encoder_seconds: float = 0.0
-    slice_max_s: float = 0.0
 
     def __len__(self) -> int:
         return len(self.action)
@@ -218,8 +214,6 @@ class Replay:
             "retrains": len(self.retrains),
             "retrain_p50_s": quantile(retrain_s, 0.5),
             "retrain_max_s": quantile(retrain_s, 1.0),
-            "encoder_s": self.encoder_seconds,
-            "slice_max_s": self.slice_max_s,
             "decide_p50_us": 1e6 * quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * quantile(self.decide_seconds, 0.99),
             "saved_s": Costs().saved(certain),
@@ -337,7 +331,6 @@ def collect(
     """Drive any engine over a replay cell and gather its cycles; a model of your own comes in through the engine."""
     begin = time.perf_counter()
     log = watch(engine, cell, len(cell.order), on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
-    spent = engine.encoder_time
     return replace(
         log,
         truth=log.truth.astype(np.bool_),
@@ -347,7 +340,4 @@ def collect(
         dataset=data.name,
         seed=seed,
         seconds=time.perf_counter() - begin,
-        encoder_steps=spent.steps,
-        encoder_seconds=spent.seconds,
-        slice_max_s=spent.longest,
     )

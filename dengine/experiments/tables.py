@@ -30,8 +30,6 @@ COUNTS = ["certain", "accepted", "rejected", "false_positive", "false_negative",
 TIMES = {  # of a pooled row, and how the replays' are put together
     "retrain_p50_s": "median",
     "retrain_max_s": "max",
-    "encoder_s": "mean",
-    "slice_max_s": "max",
     "decide_p50_us": "median",
     "decide_p99_us": "max",
     "first_certain": "mean",
@@ -76,8 +74,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
         three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
         `certain_sd` and `false_positive_sd` the standard deviations over the replays (NaN of one).
     error_lower, error_upper : 95 % interval of the share of bad ones among the accepted parts; NaN without replays.
-    retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, slice_max_s, decide_p99_us : the worst replay's.
-    encoder_s : seconds of label-free training that a replay assumed, the mean.
+    retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, decide_p99_us : the worst replay's.
     """
     groups = frame.reset_index(drop=True).groupby(CONDITION, sort=False)
     return [
@@ -178,15 +175,6 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     last = f"; {len(dropped)} dropped, the last for: {dropped[-1].reason.removeprefix('dropped: ')}" if dropped else ""
     many = "" if len(retrains) == 1 else "s"
     return f"{len(retrains)} retrain{many}, the worst in {worst:.3f} s{last}."
-
-
-def encoder_line(replays: Sequence[Replay]) -> str:
-    """How much label-free training the replays of one contender assumed; "" where nothing was trained."""
-    if not any(one.encoder_steps for one in replays):
-        return ""
-    seconds = sum(one.encoder_seconds for one in replays) / len(replays)
-    longest = max(one.slice_max_s for one in replays)
-    return f" {seconds:.1f} s of the encoder's training assumed a replay, the longest slice in {longest:.3f} s."
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:

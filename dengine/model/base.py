@@ -109,10 +109,6 @@ class EngineModel(ABC):
     ) -> Self:
         """Learn from traces (n, C, T), labels, content hashes and labels' numbers (n,), from where a training ended."""
 
-    def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
-        """Train what reads no label further, apart from what answers; see `Reducer.improve`."""
-        return 0
-
     def look_ahead(self, X: NDArray[np.float32]) -> int:
         """Begin with a training on traces (n, C, T) as far as no label is read; see `Reducer.look_ahead`."""
         return 0
@@ -191,13 +187,7 @@ class EngineModel(ABC):
         """What an exporter starts from; ExportError where there is nothing that can be exported."""
         raise ExportError(f"{self.name} is a rival method and stays in Python; only dengine's own model can be exported.")
 
-    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these six.
-
-    def improve_safely(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
-        """`improve`, or 0 where it fails."""
-        return _guarded(
-            lambda: self.improve(X, hashes, stop), 0, "the encoder cannot be trained further; it goes on as it is"
-        )
+    # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
         """`look_ahead`, or nothing where it fails."""

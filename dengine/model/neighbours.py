@@ -138,9 +138,6 @@ class ModelPrediction(EngineModel):
         self._compiled = None  # built by `prepare`, or when it is asked
         return self
 
-    def improve(self, X: ArrayLike, hashes: Ints, stop: StopRule) -> int:
-        return self.spaces.improve(as_traces(X), hashes, stop)
-
     def look_ahead(self, X: NDArray[np.float32]) -> int:
         return self.spaces.look_ahead(X)
 

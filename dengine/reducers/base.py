@@ -104,14 +104,6 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         self.fit(X, y if self.uses_labels else None)
         return self.embed_own(X, folds)
 
-    def improve(self, X: Floats, parts: Ints, stop: StopRule) -> int:
-        """Train further what reads no label, apart from what answers; the next `train` takes it over. Returns steps taken.
-
-        X : (n, C, T) traces, labelled or not.  parts : (n,) hashes of their parts.  stop : asked before each step.
-        0 where a kind has nothing that trains so.
-        """
-        return 0
-
     def look_ahead(self, X: Floats) -> int:
         """Do now what `train` on traces X (n, C, T) would begin with, as far as no label is read; of how many traces."""
         return 0

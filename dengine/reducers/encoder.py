@@ -4,32 +4,25 @@
       -> conv, F kernels of 9 taps at each of D dilations, at P places                           (B, D, P, F)
       -> a ramp from 0 to 1 around a threshold, its mean over R regions, plus twice that over all (B, D*R*F)
       -> standardised, clipped
-      -> linear: W principal components of these, and W directions that `training.py` trains     (B, 2*W)
+      -> linear: W principal components of these, and W of the first traces' own               (B, 2*W)
 
-It starts as MiniRocket does, from kernels of fixed weights and thresholds drawn from what they give on the first traces;
-then kernels, thresholds and half of the linear layer are trained without labels, so one encoder is honest for every fold.
-Instead of a hard share of positive values it counts by a ramp two deviations wide: that has a gradient, and measured better
-untrained (docs/explanation/measured.md).
+As in MiniRocket the kernels have fixed weights, and thresholds are drawn from what they give on the first traces. No label
+is read, so one encoder is honest for every fold. Instead of a hard share of positive values it counts by a ramp two
+deviations wide, which measured better (docs/explanation/measured.md).
 
 Sources: Dempster, Schmidt and Webb (2021), MiniRocket, KDD, arXiv:2012.08791, for kernels, dilations and thresholds; Tan,
 Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36, for several channels.
 """
-
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..errors import SettingError
-from ..files import read_archive
 from .features import CLIP, TAPS, Carry, Features, dilations_of, rocket_kernels
 
 WHOLE = 2.0  # weight of the mean over the whole trace beside that over a region: where it does not matter when
 SHARE = 50.0  # variance of each half of the output together, so that the ridge of a head weighs them alike
-START = 4.0  # size of the trained directions before they are trained: outputs of about one deviation
-LEARNED = ("kernel", "threshold", "slope", "unit", "middle", "mix")  # what a start from another encoder takes over
 
 
 class ConvEncoder(Features):
@@ -41,9 +34,11 @@ class ConvEncoder(Features):
 
     taps: Tensor
     pool: Tensor
+    kernel: Tensor
+    threshold: Tensor
     slope: Tensor
-    middle: Tensor
     unit: Tensor
+    mix: Tensor
     basis: Tensor
     centre: Tensor
 
@@ -60,12 +55,10 @@ class ConvEncoder(Features):
         self.n_dilations, self.n_regions, self.n_kernels, self.n_places = len(taps), regions, kernels, places
         self.register_buffer("taps", torch.from_numpy(taps.ravel()))
         self.register_buffer("pool", _pool(regions, places // regions))
-        # Trained by a copy of this module (`training.py`); the one that answers takes the values over.
-        self.kernel = nn.Parameter(torch.zeros(channels * TAPS, kernels), requires_grad=False)
-        self.threshold = nn.Parameter(torch.zeros(len(taps), 1, kernels), requires_grad=False)
-        self.mix = nn.Parameter(torch.zeros(n_pooled, width), requires_grad=False)
+        self.register_buffer("kernel", torch.zeros(channels * TAPS, kernels))
+        self.register_buffer("threshold", torch.zeros(len(taps), 1, kernels))
+        self.register_buffer("mix", torch.zeros(n_pooled, width))
         self.register_buffer("slope", torch.ones(len(taps), 1, kernels))
-        self.register_buffer("middle", torch.zeros(n_pooled))
         self.register_buffer("unit", torch.ones(n_pooled))
         self.register_buffer("basis", torch.zeros(n_pooled, 2 * width))
         self.register_buffer("centre", torch.zeros(2 * width))
@@ -87,7 +80,7 @@ class ConvEncoder(Features):
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, D*R*F), not standardised."""
-        return self.pooled(self.averaged(x), self.taps, self.pool)
+        return self.pooled(self.averaged(x))
 
     def averaged(self, x: Tensor) -> Tensor:
         """(B, C, T) raw -> (B, C, L), one scale a channel."""
@@ -95,55 +88,40 @@ class ConvEncoder(Features):
             x = nn.functional.avg_pool1d(x[:, :, self.head :], self.average)  # half the time of a mean over an axis
         return torch.addcmul(self.shift, x, self.scale)
 
-    def pooled(self, a: Tensor, taps: Tensor, pool: Tensor) -> Tensor:
-        """(B, C, L) -> (B, D*R*F): how far each kernel is above its threshold, in the mean over each region.
-
-        taps, pool : (D*P*9,) and (R, P), all or `thinned`.
-        """
-        h = torch.bmm(self.windows(a, taps), self.kernel * self.slope).add_(self.threshold)  # (D, B*P, F)
-        h = nn.functional.hardtanh(h, 0.0, 1.0, inplace=True).view(-1, pool.size(1), self.n_kernels)  # (D*B, P, F)
-        h = torch.bmm(pool.expand(h.size(0), pool.size(0), pool.size(1)), h)  # (D*B, R, F)
+    def pooled(self, a: Tensor) -> Tensor:
+        """(B, C, L) -> (B, D*R*F): how far each kernel is above its threshold, in the mean over each region."""
+        h = torch.bmm(self.windows(a), self.kernel * self.slope).add_(self.threshold)  # (D, B*P, F)
+        h = nn.functional.hardtanh(h, 0.0, 1.0, inplace=True).view(-1, self.n_places, self.n_kernels)  # (D*B, P, F)
+        h = torch.bmm(self.pool.expand(h.size(0), self.n_regions, self.n_places), h)  # (D*B, R, F)
         n_out = self.n_regions * self.n_kernels  # said: no traces have no size to guess it from
         h = h.view(self.n_dilations, a.size(0), n_out).transpose(0, 1)
         return h.reshape(a.size(0), self.n_dilations * n_out)
 
-    def windows(self, a: Tensor, taps: Tensor) -> Tensor:
+    def windows(self, a: Tensor) -> Tensor:
         """(B, C, L) -> (D, B*P, C*9): what each place of each dilation sees, so that a convolution is a product."""
-        n_places = taps.size(0) // (9 * self.n_dilations)
         if a.size(0) * a.size(1) == 1:  # one trace at a time, as a cell decides: 40 us less
             row = torch.cat([a.flatten(), a.new_zeros(1)])  # taps beyond the ends read zeros
-            return row.index_select(0, taps).view(self.n_dilations, n_places, 9)
+            return row.index_select(0, self.taps).view(self.n_dilations, self.n_places, 9)
         # Traces last: a tap then moves a row of them at once.
         rows = nn.functional.pad(a.permute(2, 1, 0).reshape(a.size(2), -1), [0, 0, 0, 1])
-        seen = rows.index_select(0, taps).view(self.n_dilations, n_places, 9, a.size(1), a.size(0))
-        return seen.permute(0, 4, 1, 3, 2).reshape(self.n_dilations, a.size(0) * n_places, a.size(1) * 9)
-
-    @torch.jit.unused
-    def thinned(self, first: int, step: int) -> tuple[Tensor, Tensor]:
-        """Taps and pool of every `step`-th place of each region, for an estimate in less time; of (0, 1): all."""
-        taps = self.taps.view(self.n_dilations, self.n_regions, -1, TAPS)[:, :, first::step]
-        return taps.flatten(), _pool(self.n_regions, taps.size(2))
+        seen = rows.index_select(0, self.taps).view(self.n_dilations, self.n_places, 9, a.size(1), a.size(0))
+        return seen.permute(0, 4, 1, 3, 2).reshape(self.n_dilations, a.size(0) * self.n_places, a.size(1) * 9)
 
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
         """Kernels, and thresholds from what they give on traces (n, C, T), their channels scaled."""
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         a = self.averaged((x - self.shift) / self.scale)
         self.kernel.copy_(_kernels(a.size(1), self.n_kernels, rng))
-        h = torch.matmul(self.windows(a, self.taps), self.kernel).transpose(1, 2).sort(2).values  # (D, F, n*P)
+        h = torch.matmul(self.windows(a), self.kernel).transpose(1, 2).sort(2).values  # (D, F, n*P)
         # Low-discrepancy quantiles, as in MiniRocket; none at the very ends.
         quantiles = 0.05 + 0.9 * (np.arange(1, h[..., 0].numel() + 1) * (np.sqrt(5.0) + 1.0) / 2.0 % 1.0)
         place = torch.from_numpy((quantiles * (h.size(2) - 1)).astype(np.int64)).view(*h.shape[:2], 1)
         deviation = h.std(2, unbiased=False)
         self.slope.copy_((1.0 / (2.0 * deviation + 1e-6))[:, None])  # a ramp two deviations wide
         self.threshold.copy_(0.5 - h.gather(2, place).permute(0, 2, 1) * self.slope)
-        pooled = self.pooled(a, self.taps, self.pool)
-        self.middle.copy_(pooled.mean(0))
+        pooled = self.pooled(a)
         self.unit.copy_(1.0 / (pooled.std(0, unbiased=False) + 1e-2))  # of outputs between 0 and 1
-        self.mix.copy_(principal_axes((pooled - self.middle) * self.unit, self.mix.size(1)) * START / len(self.unit) ** 0.5)
-
-    def mixed(self, pooled: Tensor) -> Tensor:
-        """(B, D*R*F) -> (B, W): the directions that are trained."""
-        return torch.mm((pooled - self.middle) * self.unit, self.mix)
+        self.mix.copy_(principal_axes((pooled - pooled.mean(0)) * self.unit, self.mix.size(1)))
 
     def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
         """Set scale, principal axes and centre from pooled outputs (n, D*R*F); returns features (n, 2*W), and a `Carry`."""
@@ -151,7 +129,7 @@ class ConvEncoder(Features):
         g, carry = super().standardise(some)
         before, centre = self.basis.double(), self.centre.clone()
         width = self.mix.size(1)
-        # The trained directions were trained on pooled * unit.
+        # The first axes were of pooled * unit.
         halves = [principal_axes(g, width), (self.unit / self.gain)[:, None] * self.mix]
         scaled = [half * (SHARE / (g @ half).var(0, unbiased=False).sum().clamp(min=1e-9)).sqrt() for half in halves]
         self.basis.copy_(torch.cat(scaled, 1))
@@ -166,39 +144,6 @@ class ConvEncoder(Features):
 
         g = g if len(some) == len(raw) else torch.addcmul(self.offset, raw, self.gain).clamp_(-CLIP, CLIP)
         return torch.addmm(self.centre, g, self.basis), carried
-
-
-def _sizes(encoder: ConvEncoder) -> dict[str, int]:
-    """C, F, D, R and W by name."""
-    sizes = {"channels": encoder.kernel.size(0) // TAPS, "kernels": encoder.n_kernels, "dilations": encoder.n_dilations}
-    return sizes | {"regions": encoder.n_regions, "width": encoder.mix.size(1)}
-
-
-def weights_of(encoder: ConvEncoder) -> dict[str, NDArray[Any]]:
-    """What an encoder learned, and its sizes, as plain arrays: what `start_from` reads from an .npz of them."""
-    learned = {name: getattr(encoder, name).detach().numpy().copy() for name in LEARNED}
-    return learned | {name: np.array(size) for name, size in _sizes(encoder).items()}
-
-
-def start_from(encoder: ConvEncoder, path: str) -> None:
-    """Set what an encoder learned from an .npz of `weights_of`; SettingError where it cannot be read, or sizes differ."""
-    own = _sizes(encoder)
-    try:
-        stored, _ = read_archive(path, (*LEARNED, *own))
-        found = {name: stored[name] for name in LEARNED}
-        sizes = {name: int(stored[name]) for name in own}
-    except (ValueError, KeyError, TypeError) as error:
-        raise SettingError(f"Cannot read start {path!r} as an .npz of an encoder's weights: {error}.") from error
-    if own["channels"] != 1:
-        raise SettingError(f"Expected traces of 1 channel to start from weights, got {own['channels']}; leave start out.")
-    differing = ", ".join(f"{name} {sizes[name]} instead of {size}" for name, size in own.items() if sizes[name] != size)
-    if differing:
-        raise SettingError(f"Expected start of the encoder's own sizes, got {path!r} with {differing}.")
-    for name, value in found.items():
-        shape = tuple(getattr(encoder, name).shape)
-        if value.shape != shape or value.dtype != np.float32 or not np.isfinite(value).all():
-            raise SettingError(f"Expected {name} in {path!r} as {shape} finite float32, got {value.shape} {value.dtype}.")
-        getattr(encoder, name).data.copy_(torch.from_numpy(value))
 
 
 def averaging(traces: Tensor) -> int:

@@ -125,19 +125,13 @@ class KeptFeatures:
     def of(self, traces: Floats, compute: Callable[[Tensor], Tensor], keys: Sequence[bytes] | None = None) -> Tensor:
         """(n, C, T) -> (n, P); what is not among these traces is forgotten, as it has left the window."""
         keys = keys_of(traces) if keys is None else keys
-        self.add(traces, keys, len(traces), compute)
+        missing = {key: i for i, key in enumerate(keys) if key not in self.places}
+        if missing:
+            self.places = self.places | {key: len(self) + j for j, key in enumerate(missing)}
+            self.features = torch.cat([self.features, compute(torch.from_numpy(traces[list(missing.values())]))])
         self.features = self.features[[self.places[key] for key in keys]]
         self.places = {key: i for i, key in enumerate(keys)}
         return self.features
-
-    def add(self, traces: Floats, keys: Sequence[bytes], most: int, compute: Callable[[Tensor], Tensor]) -> int:
-        """Compute those of at most so many new traces; returns how many are still missing."""
-        missing = {key: i for i, key in enumerate(keys) if key not in self.places}
-        new = dict(list(missing.items())[:most])
-        if new:
-            self.places = self.places | {key: len(self) + j for j, key in enumerate(new)}
-            self.features = torch.cat([self.features, compute(torch.from_numpy(traces[list(new.values())]))])
-        return len(missing) - len(new)
 
 
 def keys_of(traces: Floats) -> list[bytes]:

@@ -263,7 +263,6 @@ class FeatureReducer(Reducer):
             raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
         head, keys = self.net_.head, keys_of(traces)
         with torch.no_grad():
-            note = self._take_over(traces, keys)
             g, carry = self.net_.features.standardise(self.raw_features(traces, keys))
             head.carry_over(carry)  # a warm start begins where the last fit ended
             rows = torch.arange(len(g))
@@ -274,7 +273,7 @@ class FeatureReducer(Reducer):
             least = 0 if self.n_fits_ else FIRST_STEPS
             self.n_iter_ = head.train_on(g[rows], y, k, self.l2, self.max_iter, stop, least)
             self.net_.fold()
-        self._observe(head.losses.numpy(), head.kept.nonzero().flatten().tolist(), note)
+        self._observe(head.losses.numpy(), head.kept.nonzero().flatten().tolist())
         self.n_fits_ += 1
         return g
 
@@ -282,16 +281,11 @@ class FeatureReducer(Reducer):
         """(n, C, T) -> (n, P), not standardised, computed once a trace.  keys : `keys_of` the traces, where known."""
         return self.kept_.of(traces, partial(in_chunks, self.net_.features.raw), keys)
 
-    def _take_over(self, traces: Floats, keys: Sequence[bytes]) -> str:
-        """Let features that were trained apart answer from now on; what is to be said of it, "" where none were."""
-        return ""
-
-    def _observe(self, losses: NDArray[Any], kept: list[int], note: str = "") -> None:
+    def _observe(self, losses: NDArray[Any], kept: list[int]) -> None:
         self.holdout_losses_ = np.array(losses, dtype=np.float64)
         self.holdout_loss_ = float(self.holdout_losses_.mean())
         heads = ", ".join(str(k) for k in kept)
-        refused = f"kept the earlier weights of head {heads}: new ones did worse than the base rate" if kept else ""
-        self.note_ = "; ".join(filter(None, (note, refused)))
+        self.note_ = f"kept the earlier weights of head {heads}: new ones did worse than the base rate" if kept else ""
 
     @property
     def report(self) -> FitReport:

@@ -16,9 +16,7 @@ import torch
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.serve.retraining import RetrainingProcess
 
-CONV = replace(
-    Recipe.load("conv"), retrain_every=30, max_steps=20, encoder_budget=0.01, policy=Policy(alpha=0.1, lower_bound=0.9)
-)
+CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
 def learn(engine: DataEngine, data: Dataset) -> None:

@@ -2,9 +2,8 @@
 
     python tests/golden/default.py tests/golden/default    # makes them anew; only where a change of decisions is meant
 
-Made with dengine 0.7.0 before its modules were moved and merged. Novelty and the encoder's training are on, as nobody who
-names no recipe turns them off. Everything here goes through names that `dengine` itself exports, so that the same lines run
-before and after. Only decisions are kept, no store and no exported file: their forms may change, what they answer may not.
+Novelty is on, as nobody who names no recipe turns it off. Everything here goes through names that `dengine` itself
+exports, so that the same lines run before and after. Only decisions are kept, no store and no exported file: their forms may change, what they answer may not.
 """
 
 from __future__ import annotations

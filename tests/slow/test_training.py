@@ -76,30 +76,6 @@ def test_choosing_among_tries_that_are_never_certain_says_so(run: Run, tiny: Pat
     assert "Chosen of pca: none" in run("compare_reducers", *words, "--out", tmp_path)
 
 
-@pytest.fixture(scope="module")
-def causes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """200 traces of 120 samples, bad ones for one of two causes: as many as leave some to hold out."""
-    rng = np.random.default_rng(0)
-    cause = rng.choice(["none", "rim", "slip"], 200, p=[0.5, 0.3, 0.2])
-    x = np.linspace(0, 1, 120)
-    shapes = {"none": 5 * x, "rim": 5 * (x > 0.3), "slip": 5 * x * (1 - x)}
-    X = np.stack([shapes[each] for each in cause]) + rng.normal(0, 0.3, (200, 120))
-    path = tmp_path_factory.mktemp("data") / "causes.npz"
-    np.savez(path, X=X.astype(np.float32), y=(cause == "none").astype(np.int8), cause=cause)
-    return path
-
-
-def test_the_encoder_goes_on_from_its_last_run(causes: Path) -> None:
-    from dengine import ModelPrediction, Recipe, load_dataset
-
-    model = ModelPrediction.from_recipe(Recipe.load("conv"))
-    history, (before, after) = load("train_encoder").train(model, load_dataset(causes), 70)
-    assert [row["step"] for row in history] == [0, 30, 60, 70]
-    assert history[-1]["held-out loss"] < history[0]["held-out loss"]
-    assert before.shape == after.shape
-    assert not np.array_equal(before, after)
-
-
 def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import time
 
@@ -122,30 +98,3 @@ def test_a_choice_by_cost_is_tried_on_the_parts_that_it_did_not_see(run: Run, ti
     assert "2 sets of 30 parts, 2 shuffles, 4 choices" in said
     rows = (tmp_path / "cost_choice.csv").read_text(encoding="utf-8").splitlines()
     assert len(rows) == 1 + 2 * 4
-
-
-def test_a_trained_encoder_leaves_a_picture_a_card_a_model_and_weights_that_start_another(
-    run: Run, causes: Path, tmp_path: Path
-) -> None:
-    from dengine import ConvReducer, load_dataset
-    from dengine.reducers.encoder import weights_of
-
-    words = ["--data", causes, "--steps", 20, "--replays", "0:1", "--out", tmp_path]
-    assert "held-out loss" in run("train_encoder", *words, "--weights", tmp_path / "deep" / "encoder.npz")
-    assert {"training.png", "card.md", "model.ts", "model.ts.sha256", "deep"} == {p.name for p in tmp_path.iterdir()}
-    card = (tmp_path / "card.md").read_text(encoding="utf-8")
-    for figure in (
-        "20 steps",
-        "| held-out loss |",
-        "| neighbours agree |",
-        "| auroc |",
-        "certain of 200",
-        "(training.png)",
-    ):
-        assert figure in card
-    data, path = load_dataset(causes), tmp_path / "deep" / "encoder.npz"
-    encoder: Any = ConvReducer(start=str(path)).fit(data.X, data.y).net_.features
-    started = weights_of(encoder)
-    with np.load(path) as stored:
-        assert set(stored.files) == set(started)
-        assert all(np.array_equal(stored[name], value) for name, value in started.items())

@@ -7,11 +7,14 @@ import pytest
 import torch
 from sklearn.base import clone
 
-from dengine import RocketReducer
+from dengine import DataEngine, Dataset, Recipe, RocketReducer
+from dengine.datasets.importing import import_labelled
+from dengine.decision.rule import script
 from dengine.errors import SettingError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.reducers.conv import ConvReducer
+from dengine.reducers.encoder import ConvEncoder, averaging
 from dengine.reducers.heads import FIRST_STEPS, CrossFittedScores
 
 STEPS = StopRule(max_steps=20)
@@ -155,7 +158,6 @@ def test_too_little_to_learn_from_is_said_clearly():
         ({"kernels": 0}, "kernels >= 1"),
         ({"width": 0}, "width >= 1"),
         ({"regions": 40}, "regions <= 16"),
-        ({"augmentations": "scale, blur"}, "augmentations among shift, scale"),
     ],
 )
 def test_a_setting_out_of_range_is_named(params, message):
@@ -242,3 +244,64 @@ def test_traces_in_small_units_are_not_taken_for_one_another() -> None:
 def test_a_pickled_rocket_grows_as_its_traces_do_and_not_as_their_square() -> None:
     sizes = [len(pickle.dumps(RocketReducer().fit(*traces(n)))) for n in (100, 400)]
     assert sizes[1] < 4 * sizes[0]
+
+
+def test_the_features_are_the_same_whatever_the_labels() -> None:
+    X, y = traces()
+    one, two = (ConvReducer().fit(X, labels) for labels in (y, 1 - np.roll(y, 3)))
+    own, other = one.net_.features.state_dict(), two.net_.features.state_dict()
+    assert all(torch.equal(own[name], other[name]) for name in own)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(channels: int) -> None:
+    samples, dilations, kernels = 60, 3, 4
+    encoder = ConvEncoder(channels, samples, 1, kernels, dilations, 3, 2)
+    a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
+    encoder.learn_filters(a, np.random.default_rng(0))
+    found = torch.matmul(encoder.windows(a), encoder.kernel).view(dilations, 5, -1, kernels)
+    middle = encoder.taps.view(dilations, -1, 9)[:, :, 4]
+    weight = encoder.kernel.T.reshape(kernels, channels, 9)
+    for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
+        whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
+        torch.testing.assert_close(found[d], whole[:, :, middle[d]].transpose(1, 2))
+
+
+@pytest.mark.parametrize("samples", [400, 1000, 5000])
+def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_oscillation(samples: int) -> None:
+    t = np.arange(samples)
+    rng = np.random.default_rng(0)
+    slow = np.sin(2 * np.pi * (3 * t / samples + rng.random((20, 1, 1)))).astype(np.float32)
+    fast = np.sin(2 * np.pi * (0.3 * t + rng.random((20, 1, 1)))).astype(np.float32)
+    assert averaging(torch.from_numpy(slow)) == samples // 200
+    assert averaging(torch.from_numpy(fast)) == 1
+
+
+@pytest.mark.parametrize("channels", [1, 3, 12])
+@pytest.mark.parametrize("samples", [2, 3, 9, 64, 152, 5000])
+def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples: int, channels: int) -> None:
+    rng = np.random.default_rng(0)
+    X = torch.from_numpy(rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32))
+    encoder = ConvEncoder(channels, samples, averaging(X), 28, 5, 3, 64).eval()
+    with torch.no_grad():
+        encoder.learn(X, rng)
+        standard, _ = encoder.standardise(encoder.raw(X))
+        np.testing.assert_allclose(encoder(X), standard, atol=1e-4)
+        assert torch.isfinite(standard).all()
+        np.testing.assert_allclose(script(encoder)(X[:1]), encoder(X[:1]), atol=1e-6)
+
+
+@pytest.mark.parametrize("retrained_before", [True, False])
+def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path, monkeypatch, retrained_before) -> None:
+    url, recipe = str(tmp_path / "cell.sqlite"), Recipe("conv", params={"kernels": 6, "width": 8}, retrain_every=40)
+    X, y = traces(120 if retrained_before else 520)
+    if retrained_before:
+        with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
+            for x, good in zip(X, y, strict=True):
+                engine.report(engine.decide(x).id, bool(good))
+                engine.settle()
+    else:
+        import_labelled(url, Dataset(X[:, 0], y), recipe)
+    with DataEngine.open(url, replaying=True) as engine:
+        monkeypatch.setattr(ConvEncoder, "raw", None)  # computed in the retrain would be too late
+        assert engine.retrain().accepted
