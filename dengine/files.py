@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,16 @@ MOST = 8 * 2**30  # bytes
 NPY: Any = np.lib.format  # untyped
 HEADERS = {(1, 0): NPY.read_array_header_1_0, (2, 0): NPY.read_array_header_2_0}
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
-UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, OverflowError, MemoryError, RuntimeError, SyntaxError)
-UNREADABLE += (zipfile.BadZipFile, zlib.error, tokenize.TokenError)  # type: ignore[assignment]
+UNREADABLE: tuple[type[Exception], ...] = (
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+)
+UNREADABLE += (RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
 DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")  # a store, and its write-ahead log
 NO_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
 MANIFEST = "manifest.json"
@@ -44,6 +53,25 @@ def must_fit(size: float, what: object, limit: int | None = None) -> None:
             f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; split it, or read it where there is "
             "more memory."
         )
+
+
+@contextmanager
+def reading(
+    what: object, kind: str, package: str = "", extra: str = "", also: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
+    """DataError for whatever a library raises on a file that is damaged, or is not of its kind, and where it is missing.
+
+    package, extra : what reads such files, and the extra of dengine that installs it.  also : other errors of its own.
+    """
+    if package and find_spec(package) is None:
+        raise DataError(f'Expected {package} for {kind}, it is not installed: pip install "dengine[{extra}]".')
+    try:
+        yield
+    except DataError:
+        raise
+    except (*UNREADABLE, *also) as error:
+        said = " ".join(str(error)[:200].split()) or type(error).__name__
+        raise DataError(f"Cannot read {what} as {kind}: {said}.") from error
 
 
 def _size(n_bytes: float) -> str:
@@ -64,19 +92,17 @@ def read_archive(
     DataError for what is no archive, is damaged, holds Python objects, or claims too much: nothing is unpacked then.
     """
     called = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
-    try:
-        with zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else Path(source)) as archive:
-            members = {each.filename.removesuffix(".npy"): each for each in archive.infolist()}
-            wanted = {key: each for key, each in members.items() if names is None or key in names}
-            must_fit(sum(each.file_size for each in wanted.values()), called, limit)
-            for member in wanted.values():
-                with archive.open(member) as file:
-                    _check_header(file, member)
-            return {key: _read(archive, member) for key, member in wanted.items()}, list(members)
-    except DataError:
-        raise
-    except UNREADABLE as error:
-        raise DataError(f"Cannot read {called} as an .npz file of plain arrays: {str(error)[:200]}.") from error
+    with (
+        reading(called, "an .npz file of plain arrays"),
+        zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else Path(source)) as archive,
+    ):
+        members = {each.filename.removesuffix(".npy"): each for each in archive.infolist()}
+        wanted = {key: each for key, each in members.items() if names is None or key in names}
+        must_fit(sum(each.file_size for each in wanted.values()), called, limit)
+        for member in wanted.values():
+            with archive.open(member) as file:
+                _check_header(file, member)
+        return {key: _read(archive, member) for key, member in wanted.items()}, list(members)
 
 
 def _check_header(file: Any, member: zipfile.ZipInfo) -> None:

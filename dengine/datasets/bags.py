@@ -10,7 +10,6 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,15 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError
-from ..errors import listed as in_words
-from ..files import UNREADABLE, must_fit
-from .cutting import Insertion, cut_stream, usual_step
-from .dataset import Asked, Dataset, Fault, UnreadableError
-from .folders import natural
-from .labels import Labels, collect, label_of, listed
-from .lengths import Collected, as_dataset
-from .triggers import Trigger, as_trigger
+from ..errors import DataError, listed
+from ..files import must_fit, reading
+from . import labels
+from .dataset import Asked, Collected, Dataset, Fault, UnreadableError, as_dataset
+from .tables import natural
+from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
 if TYPE_CHECKING:
     from mcap.reader import McapReader
@@ -37,6 +33,10 @@ WRENCHES = ("geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Wrench")
 AXES = ("FX", "FY", "FZ", "MX", "MY", "MZ")  # in the frame that the topic is in
 ALIASES = dict(zip(("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base"), AXES, strict=True))
 SIZE = 8 * (len(AXES) + 4)  # bytes of one message, read
+AHEAD = 100  # messages: a burst of so many that come late is no gap
+SPAN = 100  # messages that the step is measured over, where single steps do not tell it
+ODD = 0.3  # of a step: so far off what they come to, single steps are of bursts
+Times = NDArray[np.float64]
 
 
 @dataclass
@@ -46,10 +46,10 @@ class Messages:
     others : of each topic asked for, (nanoseconds of the log, value) of its messages.
     """
 
+    others: dict[str, list[tuple[int, Any]]]
     stamped: list[int] = field(default_factory=list)
     logged: list[int] = field(default_factory=list)
     wrench: list[tuple[float, ...]] = field(default_factory=list)
-    others: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
 
     def add(self, message: Any, logged: int) -> None:
         header, wrench = getattr(message, "header", None), getattr(message, "wrench", message)
@@ -58,17 +58,17 @@ class Messages:
         force, torque = wrench.force, wrench.torque
         self.wrench.append((force.x, force.y, force.z, torque.x, torque.y, torque.z))
 
-    @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> Times:
         """(n,) seconds since the first, by the stamps where every message has one."""
         exact = np.array(self.logged if 0 in self.stamped else self.stamped, dtype=np.int64)
         return np.asarray((exact - exact[0]) / BILLION)
 
-    def held(self, topic: str) -> NDArray[np.float64]:
-        """(n,) the newest value of a topic when each wrench was logged; NaN before its first."""
-        found = self.others[topic]
-        known = np.array([np.nan, *(float(value) for _, value in found)])
-        return known[np.searchsorted([time for time, _ in found], self.logged, side="right")]
+    def signal(self, name: str) -> NDArray[np.float64]:
+        """(n,) an axis, or the newest value of a topic when each wrench was logged; NaN before its first."""
+        if name not in self.others:
+            return np.array(self.wrench)[:, axis_of(name)]
+        known = np.array([np.nan, *(float(value) for _, value in self.others[name])])
+        return known[np.searchsorted([time for time, _ in self.others[name]], self.logged, side="right")]
 
 
 def is_stream(source: Any) -> bool:
@@ -81,10 +81,10 @@ def is_stream(source: Any) -> bool:
     return any(path.glob(f"*{SUFFIX}")) or ((path / "metadata.yaml").is_file() and any(path.glob("*.db3")))
 
 
-def axis_of(name: str) -> int | None:
-    """Which of the six numbers a channel is; None for what is none of them."""
+def axis_of(name: str) -> int:
+    """Which of the six numbers a channel is; -1 for what is none of them."""
     known = ALIASES.get(name, name)
-    return AXES.index(known) if known in AXES else None
+    return AXES.index(known) if known in AXES else -1
 
 
 @contextmanager
@@ -95,15 +95,8 @@ def _reader(path: Path) -> Iterator[McapReader]:
     from mcap_ros2.decoder import DecoderFactory
     from zstandard import ZstdError
 
-    damaged = (McapError, ZstdError, *UNREADABLE)
-    try:
-        with path.open("rb") as file:
-            yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-    except damaged as error:
-        if isinstance(error, DataError):
-            raise
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(f"Cannot read {path} as an MCAP file: {said}.") from error
+    with reading(path, "an MCAP file", also=(McapError, ZstdError)), path.open("rb") as file:
+        yield make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
 
 
 def _topics(files: Sequence[Path]) -> dict[str, str]:
@@ -125,16 +118,16 @@ def _wrench(have: dict[str, str], path: Path, asked: str | None) -> str:
     """The topic of the force; DataError where there is none, or several and none was asked for."""
     wrenches = [topic for topic, kind in have.items() if kind in WRENCHES]
     if asked is not None and asked not in wrenches:
-        raise DataError(f"Expected a topic of a wrench in {path}, got {asked}; there are {in_words(wrenches) or 'none'}.")
+        raise DataError(f"Expected a topic of a wrench in {path}, got {asked}; there are {listed(wrenches) or 'none'}.")
     if asked is None and len(wrenches) != 1:
-        found = in_words(wrenches or have) or "none"
+        found = listed(wrenches or have) or "none"
         raise DataError(f"Expected one topic of a wrench in {path}, or the name of one (topic='...'), found {found}.")
     return asked or wrenches[0]
 
 
 def _messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Messages:
     """Every message of the wrench, and of the other topics, in the order of the log."""
-    found = Messages(others={topic: [] for topic in topics})
+    found = Messages({topic: [] for topic in topics})
     for path in files:
         with _reader(path) as reader:
             for each in reader.iter_decoded_messages(topics=[wrench, *topics]):
@@ -150,23 +143,22 @@ def _messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Mess
 
 def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
     """The insertions of an MCAP file, or of a folder of them."""
-    if find_spec("mcap") is None or find_spec("mcap_ros2") is None:
-        raise DataError('Expected mcap for MCAP files, it is not installed: pip install "dengine[mcap]".')
     if asked.trigger is None:
         raise DataError(f"Expected a trigger that cuts {path} into insertions, as 'contact=5' or 'register@/phase'.")
     trigger, channels = as_trigger(asked.trigger), asked.channels or ("FZ",)
     for channel in channels:
-        if axis_of(channel) is None:
+        if axis_of(channel) < 0:
             raise DataError(f"Expected a channel among {', '.join(AXES)} of a wrench, got {channel}.")
     files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
     if not files:
         raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
-    have = _topics(files)
+    with reading(path, "MCAP files", "mcap_ros2", "mcap"):
+        have = _topics(files)
     wrench = _wrench(have, path, asked.topic)
-    topics = [signal for signal in trigger.signals if axis_of(signal) is None] + ([asked.label] if asked.label else [])
+    topics = [signal for signal in trigger.signals if axis_of(signal) < 0] + ([asked.label] if asked.label else [])
     for topic in topics:
         if topic not in have:
-            raise DataError(f"Expected the topic {topic} in {path}, found {in_words(have) or 'none'}.")
+            raise DataError(f"Expected the topic {topic} in {path}, found {listed(have) or 'none'}.")
     messages = _messages(files, wrench, topics)
     if len(messages.logged) < 2:
         raise DataError(f"Expected messages of {wrench} in {path}, found {len(messages.logged)}.")
@@ -174,44 +166,100 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
 
 
 def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], name: str, asked: Asked) -> Dataset:
-    axes = [AXES.index(ALIASES.get(channel, channel)) for channel in channels]
-    values, places = np.array(messages.wrench), {signal: axis_of(signal) for signal in trigger.signals}
-    active = trigger.active({n: messages.held(n) if axis is None else values[:, axis] for n, axis in places.items()})
-    rate = asked.rate_hz or float(f"{1.0 / usual_step(messages.times):.4g}")
+    active = trigger.active({signal: messages.signal(signal) for signal in trigger.signals})
+    values, times = np.array(messages.wrench)[:, [axis_of(channel) for channel in channels]], messages.times()
+    rate = asked.rate_hz or float(f"{1.0 / _usual_step(times):.4g}")
     samples = asked.samples or round(2.0 * rate)  # two seconds
-    cuts = list(cut_stream(messages.times, values[:, axes], active, samples, trigger.quiet_s, asked.rate_hz))
+    cuts = list(_cut_stream(times, values, active, samples, trigger.quiet_s, asked.rate_hz))
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]
-    labels: Labels
+    faults = [Fault(source, 0, cut.fault) for source, cut in zip(names, cuts, strict=True) if cut.fault]
+    traces = [None if cut.fault else cut.trace for cut in cuts]
     if asked.labels is not None:
-        labels, faults = listed(asked.labels, asked.part, names)
+        told = labels.listed(asked.labels, asked.part, names)
     elif asked.label is not None:
-        labels, faults = Told(asked.label, messages, cuts, names), []
+        told = _told(asked.label, messages, cuts, names)
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
     found = Collected(name, channels, faults)
-    found.faults.extend(Fault(source, 0, cut.fault) for source, cut in zip(names, cuts, strict=True) if cut.fault)
-    traces = [None if cut.fault else cut.trace for cut in cuts]
-    collect(zip(names, traces, repeat(None if asked.rate_hz else rate), strict=False), labels, found)
+    labels.collect(zip(names, traces, repeat(None if asked.rate_hz else rate), strict=False), told, found)
     return as_dataset(found, asked)
 
 
-class Told:
+def _told(topic: str, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:
     """Labels from a topic: of each insertion the value that was told next, if it was before another one began."""
+    words: dict[str, Any] = {}
+    begins = [messages.logged[cut.first] for cut in cuts]
+    for logged, word in messages.others[topic]:
+        place = int(np.searchsorted(begins, logged, side="right")) - 1
+        if place >= 0:
+            words.setdefault(names[place], word)
 
-    def __init__(self, topic: str, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> None:
-        self.topic, self.words = topic, dict[str, Any]()
-        begins = [messages.logged[cut.first] for cut in cuts]
-        for logged, word in messages.others[topic]:
-            place = int(np.searchsorted(begins, logged, side="right")) - 1
-            if place >= 0:
-                self.words.setdefault(names[place], word)
+    def find(name: str) -> labels.Known:
+        if name not in words:
+            raise UnreadableError(f"Expected a message of {topic} before the next insertion begins, found none")
+        return labels.label_of(words[name]), None
 
-    def label(self, name: str) -> tuple[int, str | None]:
-        if name not in self.words:
-            raise UnreadableError(f"Expected a message of {self.topic} before the next insertion begins, found none")
-        return label_of(self.words[name]), None
+    return labels.Labels(find, f"give the topic that tells them, {topic} does not, or a file of labels")
 
-    def advice(self) -> str:
-        return f"give the topic that tells them, {self.topic} does not, or a file of labels"
+
+@dataclass(frozen=True, slots=True)
+class Insertion:
+    """One, cut out of a stream. trace : (C, T) float32.  first : its first message.  fault : why it is no trace, if any."""
+
+    trace: NDArray[np.float32]
+    first: int
+    fault: str
+
+
+def _usual_step(times: Times) -> float:
+    """Seconds between two messages, as it is for most of a stream, be it in bursts."""
+    span, single = min(SPAN, len(times) - 1), float(np.median(np.diff(times)))
+    many = float(np.median((times[span:] - times[:-span]) / span))
+    return single if abs(single - many) < ODD * many else many
+
+
+def _slots(times: Times, step: float) -> NDArray[np.int64]:
+    """(n,) the place of each message, in steps: a message that came late keeps its own, one that is lost leaves one.
+
+    After a lost message all others are later by a step, for good; after a late one they are not. So the least lateness of
+    the messages that follow tells lost from late.
+    """
+    n = len(times)
+    late = times - times[0] - step * np.arange(n)
+    ahead = np.concatenate([late, np.full(AHEAD - 1, np.inf)])
+    least = np.lib.stride_tricks.sliding_window_view(ahead, AHEAD).min(axis=1)
+    lost = np.maximum(np.rint(np.diff(least, prepend=least[:1]) / step), 0)
+    return np.asarray(np.arange(n) + np.cumsum(lost), dtype=np.int64)
+
+
+def _cut_stream(
+    times: Times, values: NDArray[np.float64], active: Active, samples: int, quiet_s: float, rate_hz: float | None
+) -> Iterator[Insertion]:
+    """Every insertion of a stream, in turn. times, active : (n,).  values : (n, C).
+
+    rate_hz : stated; then the times only say when an insertion was, and no message counts as lost.
+    """
+    step = 1.0 / rate_hz if rate_hz else _usual_step(times)
+    at = np.arange(len(times)) if rate_hz else _slots(times, step)
+    finder, free = StartFinder(1.0, quiet_s / step), 0.0
+    for i, (slot, on) in enumerate(zip(at.tolist(), active.tolist(), strict=True)):
+        start = finder.feed(float(slot), on)
+        if start is None or start.time < free:
+            continue
+        free = start.time + samples
+        stop = int(np.searchsorted(at, free))
+        placed = place(at[i:stop].tolist(), values[i:stop], start.time, samples, 1.0)
+        back = np.flatnonzero(np.diff(times[i:stop]) <= 0)
+        fault = ""
+        if not start.seen:
+            fault = "Expected the message that it begins with, that one fell into a gap"
+        elif len(back) and not rate_hz:
+            fault = f"Expected later times from message to message, sample {int(back[0]) + 1} is not later"
+        elif placed.missing:
+            fault = (
+                f"Expected a message each {step:.3g} s, {placed.missing} of {samples} are missing, the first at sample "
+                f"{placed.gaps[0][0]}"
+            )
+        yield Insertion(placed.trace, i, fault)

@@ -1,20 +1,28 @@
-"""A data set in memory: labelled traces of one form, what is known of them, and what could not be read."""
+"""A data set in memory: labelled traces of one form, what is known of them, and what could not be read.
+
+Recordings of whatever length become one block of traces honestly: what cannot be fitted is a fault, not made up.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
 from ..records import FITS, TraceSpec
+from ..traces import fits, fitted
 
 if TYPE_CHECKING:
     import pandas as pd
+
+NEAR = 0.03  # of the others' rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,18 +111,6 @@ class Dataset:
         fit = "cut" if samples < have and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
 
-    def pick(self, channels: tuple[str, ...]) -> Dataset:
-        """The channels of these names, in this order; one alone gives (n, T)."""
-        missing = [name for name in channels if name not in self.channels]
-        if missing:
-            have = ", ".join(self.channels) or "none that has a name"
-            raise DataError(f"Expected the channel {missing[0]} in {self.name}, it has {have}.")
-        if self.X.ndim == 2:
-            return self
-        places = [self.channels.index(name) for name in channels]
-        X = np.ascontiguousarray(self.X[:, places[0]] if len(places) == 1 else self.X[:, places])
-        return replace(self, X=X, channels=channels)
-
 
 def _real(X: ArrayLike) -> NDArray[np.float32]:
     try:
@@ -191,14 +187,137 @@ class Asked:
         if len(set(self.channels)) != len(self.channels):
             raise DataError(f"Expected each channel once, got {', '.join(self.channels)}.")
 
-    def refuse(self, what: str, *names: str, why: str = "it has its labels") -> None:
-        """DataError for options that say nothing to what is read."""
-        idle = [name for name in names if getattr(self, name) is not None]
-        if idle:
-            raise DataError(f"Expected no {' or '.join(idle)} for {what}: {why}; leave it out.")
-
 
 def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
     """`"FZ_Base,FX_Base"`, or a list of names, one by one."""
     listed = channel.split(",") if isinstance(channel, str) else channel or ()
     return tuple(name.strip() for name in listed if name.strip())
+
+
+class Recorded(NamedTuple):
+    """One recording as it was read. trace : (C, T) float32.  rate_hz : by its own timestamps, where it has any."""
+
+    trace: NDArray[np.float32]
+    label: int
+    source: str
+    part: str | None = None
+    rate_hz: float | None = None
+
+
+@dataclass
+class Collected:
+    """Recordings, in order, and what could not be read."""
+
+    name: str
+    channels: tuple[str, ...]
+    faults: list[Fault] = field(default_factory=list)
+    read: list[Recorded] = field(default_factory=list)
+
+    def leave_out(self, why: Mapping[int, str]) -> None:
+        """Make faults of those at these places; DataError where nothing is left."""
+        self.faults.extend(Fault(self.read[i].source, 0, what) for i, what in why.items())
+        self.read = [each for i, each in enumerate(self.read) if i not in why]
+        if not self.read and not self.faults:
+            raise DataError(f"Expected at least one trace in {self.name}, got none.")
+        if not self.read:
+            few = f"found none of {len(self.faults)}: {'; '.join(map(str, self.faults[:3]))}"
+            raise DataError(f"Expected recordings that can be read in {self.name}, {few}.")
+
+
+def as_dataset(found: Collected, asked: Asked) -> Dataset:
+    """One data set of all that can be fitted; DataError where nothing can.
+
+    A recording at another rate than the others is another trace of the same insertion: it is a fault.
+    """
+    known = {i: each.rate_hz for i, each in enumerate(found.read) if each.rate_hz is not None}
+    usual = max(known.values(), key=lambda one: sum(abs(rate - one) <= NEAR * one for rate in known.values()), default=0.0)
+    off = {i: rate for i, rate in known.items() if abs(rate - usual) > NEAR * usual}
+    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {r:g} Hz" for i, r in off.items()})
+    lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
+    fit, samples = form_of(lengths, asked.fit, asked.samples)
+    stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
+    unfit = [i for i, have in enumerate(lengths.tolist()) if not fits(have, samples, FITS.index(fit))]
+    found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
+    block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
+    rates = np.array([np.nan if each.rate_hz is None else each.rate_hz for each in found.read])
+    rate = asked.rate_hz or (float(np.nanmedian(rates)) if known else 500.0)
+    # A recording without a part's number is of a part of its own.
+    parts = [each.source if each.part is None else each.part for each in found.read]
+    return make_dataset(
+        block[:, 0] if block.shape[1] == 1 else block,
+        [each.label for each in found.read],
+        name=found.name,
+        rate_hz=float(f"{rate * stretch:.4g}"),
+        fit=fit,
+        part=np.array(parts) if any(each.part is not None for each in found.read) else None,
+        faults=tuple(found.faults),
+        channels=found.channels,
+        unit=_unit_of(found.channels),
+        source=np.array([each.source for each in found.read]),
+        lengths=np.delete(lengths, unfit),
+        rates=rates if known else None,
+    )
+
+
+def _unit_of(channels: Sequence[str]) -> str:
+    """For people: newtons, newton metres by the names that UR cells give torques, or both."""
+    units = {"N·m" if re.match(r"(mu?|t)[xyz](_|$)", name.lower()) else "N" for name in channels} or {"N"}
+    return units.pop() if len(units) == 1 else "mixed units"
+
+
+def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) -> tuple[str, int]:
+    """The fit and the samples that lengths (n,) are brought to, where they were not both asked for.
+
+    Of one length: strict. With `samples` that all have: cut. Else pad to the median: what was measured stays as it was, at
+    its own time, and a live trace that is a little shorter is taken too. Cut goes to the shortest that is not half of the
+    others.
+    """
+    low, high, median = int(lengths.min()), int(lengths.max()), int(np.median(lengths))
+    if fit is None:
+        alike = low == high and samples in (None, low)
+        fit = "strict" if alike else "cut" if samples is not None and samples <= low else "pad"
+    if fit == "strict" and low != high:
+        choose = "choose fit='pad', 'cut' or 'resample'"
+        raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
+    if fit == "strict" and samples not in (None, low):
+        raise DataError(f"Expected {low} samples, as recorded, with fit='strict', got {samples}; choose fit='cut'.")
+    if samples is None:
+        samples = int(lengths[2 * lengths >= median].min()) if fit == "cut" else median
+    return fit, samples
+
+
+def refit(data: Dataset, asked: Asked) -> Dataset:
+    """A data set whose traces have one length already, as it was asked for: its channels by name, its length, its rate."""
+    missing = [name for name in asked.channels if name not in data.channels]
+    if missing:
+        have = ", ".join(data.channels) or "none that has a name"
+        raise DataError(f"Expected the channel {missing[0]} in {data.name}, it has {have}.")
+    if asked.rate_hz is not None:
+        data = replace(data, rate_hz=asked.rate_hz)
+    if asked.channels and data.X.ndim == 3:
+        places = [data.channels.index(name) for name in asked.channels]
+        X = np.ascontiguousarray(data.X[:, places[0]] if len(places) == 1 else data.X[:, places])
+        data = replace(data, X=X, channels=asked.channels)
+    if asked.fit is None or asked.fit == data.fit == "strict":
+        return data if asked.samples is None else data.cut(asked.samples)
+    have = data.X.shape[-1]
+    fit, samples = form_of(np.array([have], dtype=np.int64), asked.fit, asked.samples)
+    if not fits(have, samples, FITS.index(fit)):
+        raise DataError(f"Expected {_wanted(samples, fit)}, {data.name} has {have}.")
+    stretch = samples / have if fit == "resample" else 1.0
+    return replace(data, X=_fitted(data.X, samples, fit), fit=fit, rate_hz=data.rate_hz * stretch)
+
+
+def _fitted(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float32]:
+    """(..., T) -> (..., samples), by what fits live traces too."""
+    if x.shape[-1] == samples:
+        return x
+    values: NDArray[np.float32] = fitted(torch.from_numpy(np.array(x, order="C")), samples, FITS.index(fit)).numpy()
+    return values
+
+
+def _wanted(samples: int, fit: str) -> str:
+    """How long a recording must be."""
+    if fit == "cut":
+        return f"at least {samples} samples"
+    return f"{(samples + 1) // 2} to {2 * samples} samples, to {fit} them to {samples}"

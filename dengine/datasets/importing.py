@@ -12,9 +12,9 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,9 +39,7 @@ def form_in(store: str | os.PathLike[str] | Store, source: Any) -> dict[str, Any
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
     """
-    if not isinstance(source, str | os.PathLike):
-        return {}
-    if not (Path(source).is_dir() or Path(source).suffix.lower() in TABLES):
+    if not isinstance(source, str | os.PathLike) or not (Path(source).is_dir() or Path(source).suffix.lower() in TABLES):
         return {}
     try:
         with opening(store, must_exist=True) as opened:
@@ -107,12 +105,12 @@ def import_labelled(
         agreed = engine.agree_on(data.spec)
         must_agree(data, agreed)
         gate, traces = TraceGate(agreed), as_traces(data.X, agreed)
-        arrivals = _arrivals(traces, data)
+        own, decisions = _verified(traces, data)
         for start in range(0, len(data), CHUNK):
             part = slice(start, start + CHUNK)
-            counts += _import_chunk(engine.store, gate, traces[part], data.y[part], arrivals[part])
+            counts += _import_chunk(engine.store, gate, traces[part], data.y[part], own[part], decisions[part])
             if on_traces is not None:
-                on_traces(len(arrivals[part]))
+                on_traces(len(decisions[part]))
     finally:
         if not isinstance(store, Store):
             engine.close()
@@ -137,41 +135,34 @@ def train_until_done(
     return reports
 
 
-class _Arrival(NamedTuple):
-    id: str
-    part: str | None
-    hash: int  # that it goes by
-
-
-def _arrivals(traces: NDArray[np.float32], data: Dataset) -> list[_Arrival]:
-    """The ids, part's numbers and hashes of traces (n, C, T), in the order of their file."""
-    times, arrivals = Counter[int](), []
+def _verified(traces: NDArray[np.float32], data: Dataset) -> tuple[NDArray[np.int64], list[Decision]]:
+    """The hashes (n,) that traces (n, C, T) go by, and the decisions that verified them, in the order of their file."""
+    times, own, decisions = Counter[int](), [], []
     parts = [None] * len(data) if data.part is None else data.part.tolist()
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
         id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
         times[hash_] += 1
-        arrivals.append(_Arrival(id_, part, own_hash(hash_, part)))
-    return arrivals
+        own.append(own_hash(hash_, part))
+        nothing = (0.0, 1.0, 0, 0, None, 0)
+        decisions.append(Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part))
+    return np.array(own, dtype=np.int64), decisions
 
 
 def _import_chunk(
-    store: Store, gate: TraceGate, traces: NDArray[np.float32], labels: NDArray[np.int8], arrivals: list[_Arrival]
+    store: Store,
+    gate: TraceGate,
+    traces: NDArray[np.float32],
+    labels: NDArray[np.int8],
+    own: NDArray[np.int64],
+    decisions: list[Decision],
 ) -> tuple[int, int, int]:
     """Numbers of traces imported, quarantined and known."""
-    new = [i for i, each in enumerate(arrivals) if store.get_decision(each.id) is None]
-    faults = {i: gate(torch.from_numpy(traces[i]))[0] for i in new}
-    good = [i for i in new if not faults[i]]
+    faults = {i: gate(torch.from_numpy(traces[i]))[0] for i, d in enumerate(decisions) if store.get_decision(d.id) is None}
+    good = [i for i, fault in faults.items() if not fault]
     if good:
-        decisions = [_verified(arrivals[i], Reason.NO_MODEL) for i in good]
-        own = np.array([arrivals[i].hash for i in good], dtype=np.int64)
-        store.put_labelled(decisions, traces[good], own, labels[good], Source.VERIFICATION)
-    bad = [i for i in new if faults[i]]
-    for i in bad:  # kept, but never given to training
-        each = arrivals[i]
-        store.put_decision(_verified(each, REASONS[faults[i]]), traces[i], each.hash, quarantined=True)
-        store.put_label(each.id, bool(labels[i]), Source.VERIFICATION, 0, None)
-    return len(good), len(bad), len(arrivals) - len(new)
-
-
-def _verified(each: _Arrival, reason: Reason) -> Decision:
-    return Decision(each.id, Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, reason, False, 1.0, each.part)
+        store.put_labelled([decisions[i] for i in good], traces[good], own[good], labels[good], Source.VERIFICATION)
+    for i in sorted(faults.keys() - good):  # kept, but never given to training
+        decision = replace(decisions[i], reason=REASONS[faults[i]])
+        store.put_decision(decision, traces[i], int(own[i]), quarantined=True)
+        store.put_label(decision.id, bool(labels[i]), Source.VERIFICATION, 0, None)
+    return len(good), len(faults) - len(good), len(decisions) - len(faults)

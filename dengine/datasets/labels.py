@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .dataset import Fault, UnreadableError
-from .lengths import Collected, Recorded
+from .dataset import Collected, Fault, Recorded, UnreadableError
 from .text import read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
@@ -29,6 +29,20 @@ IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
 LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
 FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion")
 
+Known = tuple[int, str | None]  # a recording's label, and its part's number
+
+
+class Labels(NamedTuple):
+    """Where the labels of recordings come from.
+
+    find : of a recording's name, its path as seen from the folder; UnreadableError where it has none.
+    advice : what to do where most have none.  faults : of the file that lists them.
+    """
+
+    find: Callable[[str], Known]
+    advice: str
+    faults: Sequence[Fault] = ()
+
 
 def label_of(word: Any) -> int:
     """1 or 0; UnreadableError for a word that is neither."""
@@ -39,31 +53,27 @@ def label_of(word: Any) -> int:
     return int((found[2] in GOOD) != bool(found[1]))
 
 
-class Named:
+def named(pattern: str | None = None) -> Labels:
     """A label in the name: at the end of the file's, or as its folder's; or what a pattern's group finds in the path.
 
     DataError for a pattern that is no regular expression with one group.
     """
+    try:
+        expression = None if pattern is None else re.compile(pattern)
+    except re.error as error:
+        raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
+    if expression is not None and expression.groups != 1:
+        raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
 
-    def __init__(self, pattern: str | None = None) -> None:
-        try:
-            self.pattern = None if pattern is None else re.compile(pattern)
-        except re.error as error:
-            raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
-        if self.pattern is not None and self.pattern.groups != 1:
-            raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
-
-    def label(self, name: str) -> tuple[int, str | None]:
-        """Of the file with this path, seen from the folder; and its part's number, which a name does not tell."""
-        if self.pattern is None:
+    def find(name: str) -> Known:
+        if expression is None:
             return _usual(PurePosixPath(name)), None
-        match = self.pattern.search(name)
+        match = expression.search(name)
         if match is None or match[1] is None:
-            raise UnreadableError(f"Expected a label where the pattern {self.pattern.pattern} finds it, found none")
+            raise UnreadableError(f"Expected a label where the pattern {pattern} finds it, found none")
         return label_of(match[1]), None
 
-    def advice(self) -> str:
-        return "give the pattern of it in the path (label='_(OK|NOK)'), or a file of labels"
+    return Labels(find, "give the pattern of it in the path (label='_(OK|NOK)'), or a file of labels")
 
 
 def _usual(path: PurePosixPath) -> int:
@@ -81,56 +91,63 @@ def _usual(path: PurePosixPath) -> int:
     return by_name
 
 
-class Listed:
-    """Labels, and parts' numbers, from a file. rows : line, file, word and part of each.  names : of all recordings."""
+class _Row(NamedTuple):
+    """Of a file of labels. words : of the path that it names, see `_words`."""
 
-    def __init__(self, source: str, rows: Iterable[tuple[int, str, str, str | None]], names: Sequence[str]) -> None:
-        self.source, self.rows, self.used = source, list(rows), set[int]()
-        self._rows: dict[str, list[tuple[int, str, str, str | None]]] = {}
-        self._names: dict[str, list[str]] = {}
-        for row in self.rows:
-            self._rows.setdefault(_words(row[1])[-1], []).append(row)
-        for name in names:
-            self._names.setdefault(_words(name)[-1], []).append(name)
-
-    def label(self, name: str) -> tuple[int, str | None]:
-        """Of the file with this path, listed by its path, its end, or longer by a folder; without suffix, in any case."""
-        rows = [row for row in self._rows.get(_words(name)[-1], ()) if _alike(row[1], name)]
-        if not rows:
-            raise UnreadableError(f"Expected a row of {self.source} that names it, found none")
-        self.used.update(line for line, *_ in rows)
-        line, file, word, part = max(rows, key=lambda row: (_words(row[1]) == _words(name), len(_words(row[1]))))
-        others = [other for other in self._names[_words(name)[-1]] if other != name and _alike(file, other)]
-        if others and _words(file) != _words(name):
-            raise UnreadableError(f"Expected its folder in {self.source}, line {line}, which names {others[0]} too")
-        try:
-            return label_of(word), part
-        except UnreadableError as error:
-            raise UnreadableError(f"{error.what} in {self.source}, line {line}") from error
-
-    def advice(self) -> str:
-        files = ", ".join(file for _, file, *_ in self.rows[:3])
-        return f"{self.source} names {files or 'no files'}: call its columns file and label, and the files as they are"
+    line: int
+    words: tuple[str, ...]
+    file: str
+    label: str
+    part: str | None
 
 
-def _words(path: str) -> list[str]:
-    """A path's folders and file, in lower case, without suffix, as Windows or another system writes it."""
-    words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
-    return [*words[:-1], words[-1].removesuffix(".csv")]
-
-
-def _alike(one: str, other: str) -> bool:
-    """Whether one of two paths is the end of the other."""
-    pairs = zip(reversed(_words(one)), reversed(_words(other)), strict=False)
-    return all(a == b for a, b in pairs)
-
-
-def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> tuple[Listed, list[Fault]]:
+def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> Labels:
     """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one.
 
-    names : of all recordings.  A file without a header, which names a .csv in its first line, has them in this order.
+    A recording is listed by its path, its end, or longer by a folder; without suffix, in any case.
+    part : the column of parts' numbers.  names : of all recordings.
+    A file without a header, which names a .csv in its first line, has files, labels in this order.
     """
     source = Path(path).name
+    rows, faults = _rows(path, part)
+    by_file, by_name = defaultdict[str, list[_Row]](list), defaultdict[str, list[str]](list)
+    for row in rows:
+        by_file[row.words[0]].append(row)
+    for each in names:
+        by_name[_words(each)[0]].append(each)
+
+    def find(name: str) -> Known:
+        words = _words(name)
+        found = [row for row in by_file[words[0]] if _alike(row.words, words)]
+        if not found:
+            raise UnreadableError(f"Expected a row of {source} that names it, found none")
+        row = max(found, key=lambda row: (row.words == words, len(row.words)))
+        others = [other for other in by_name[words[0]] if other != name and _alike(row.words, _words(other))]
+        if others and row.words != words:
+            raise UnreadableError(f"Expected its folder in {source}, line {row.line}, which names {others[0]} too")
+        try:
+            return label_of(row.label), row.part
+        except UnreadableError as error:
+            raise UnreadableError(f"{error.what} in {source}, line {row.line}") from error
+
+    lost = [row for row in rows if not any(_alike(row.words, _words(name)) for name in by_name[row.words[0]])]
+    faults += [Fault(source, row.line, f"Expected the name of a recording, found no file {row.file}") for row in lost]
+    few = ", ".join(row.file for row in rows[:3]) or "no files"
+    return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
+
+
+def _words(path: str) -> tuple[str, ...]:
+    """A path's file and folders, from its end, in lower case, without suffix, as Windows or another system writes it."""
+    words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
+    return words.pop().removesuffix(".csv"), *reversed(words)
+
+
+def _alike(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether one of two paths, as `_words`, is the end of the other."""
+    return all(a == b for a, b in zip(one, other, strict=False))
+
+
+def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
     try:
         table = read_table(Path(path))
         cells = table.frame(as_text=True).to_numpy().tolist()
@@ -142,21 +159,25 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> tup
     of_file, of_label = _columns(header, path)
     if part != "part" and part not in header:
         raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
-    of_part = header.index(part) if part in header else None
-    rows: dict[str, tuple[int, str, str, str | None]] = {}
-    for number, row in zip(lines, cells, strict=True):
-        words = [str(word).strip() for word in row]
-        key = "/".join(_words(words[of_file]))
-        if key in rows:
-            table.faults.append(Fault(source, number, f"Expected each file once, {words[of_file]} came before"))
+    rows: dict[tuple[str, ...], _Row] = {}
+    for line, row in zip(lines, cells, strict=True):
+        said = [str(word).strip() for word in row]
+        words = _words(said[of_file])
+        if words in rows:
+            what = f"Expected each file once, {said[of_file]} came before"
+            table.faults.append(Fault(Path(path).name, line, what))
         else:
-            rows[key] = number, words[of_file], words[of_label], None if of_part is None else words[of_part] or None
-    return Listed(source, rows.values(), names), table.faults
+            number = said[header.index(part)] if part in header else ""
+            rows[words] = _Row(line, words, said[of_file], said[of_label], number or None)
+    return list(rows.values()), table.faults
 
 
 def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:
     """Where the files and where the labels are; of two columns, the first and the second, or the one that is left."""
-    of_file, of_label = _place(header, FILE_COLUMNS), _place(header, LABEL_COLUMNS)
+    lower = [name.lower() for name in header]
+    of_file, of_label = (
+        next((lower.index(name) for name in known if name in lower), None) for known in (FILE_COLUMNS, LABEL_COLUMNS)
+    )
     if len(header) == 2:
         of_file = of_file if of_file is not None else 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
@@ -166,26 +187,14 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
     return of_file, of_label
 
 
-def _place(header: Sequence[str], known: Sequence[str]) -> int | None:
-    lower = [name.lower() for name in header]
-    return next((lower.index(name) for name in known if name in lower), None)
-
-
-class Labels(Protocol):
-    """Where the labels of recordings come from."""
-
-    def label(self, name: str) -> tuple[int, str | None]: ...  # and the part's number; UnreadableError where there is none
-
-    def advice(self) -> str: ...  # what to do where most recordings have no label
-
-
 def collect(read: Iterable[tuple[str, NDArray[np.float32] | None, float | None]], labels: Labels, found: Collected) -> None:
     """Add recordings with their labels: of each its name, (C, T) and rate; a trace of None is a fault already."""
     total = unlabelled = 0
+    found.faults.extend(labels.faults)
     for name, trace, rate in read:
         total += 1
         try:
-            label, part = labels.label(name)
+            label, part = labels.find(name)
         except UnreadableError as error:
             unlabelled += 1
             if trace is not None:  # one reason a file is enough
@@ -196,9 +205,5 @@ def collect(read: Iterable[tuple[str, NDArray[np.float32] | None, float | None]]
     if unlabelled > total / 2:
         raise DataError(
             f"Expected a label for each recording, {unlabelled} of {total} have none, {found.faults[-1].source} for one; "
-            f"{labels.advice()}."
+            f"{labels.advice}."
         )
-    if isinstance(labels, Listed):
-        lost = [(line, file) for line, file, *_ in labels.rows if line not in labels.used]
-        said = "Expected the name of a recording, found no file"
-        found.faults.extend(Fault(labels.source, line, f"{said} {file}") for line, file in lost)

@@ -52,16 +52,6 @@ def _words(line: str, delimiter: str) -> list[str]:
         raise UnreadableError(f"Expected separated values, got a line of {len(line)} characters: {error}") from error
 
 
-def read_header(path: Path) -> list[str]:
-    """The names in a file's first line; none where it has no such line."""
-    with path.open("rb") as file:
-        line = file.readline(2**20).decode("utf-8-sig", errors="replace")
-    try:
-        return header_of(line.rstrip("\r\n"))[0]
-    except UnreadableError:  # said when the whole file is read
-        return []
-
-
 @dataclass(slots=True)
 class Table:
     """The rows of a CSV file as text. lines : where each stands in the file.  widest : columns, empty ones at the end too.

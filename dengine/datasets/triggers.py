@@ -1,128 +1,71 @@
-"""When an insertion begins, told from signals: live ones of a controller, and those of a file, by the same strategies.
+"""When an insertion begins, told from signals, live ones or of a file; and where each of its samples goes.
 
-A trigger looks at signals by name and says at which samples it is on; the insertion begins where it goes on. A signal is a
-channel (`FZ_Base`), a field of the controller (`output_int_register_25`, `actual_TCP_speed[0]`), or a topic of a file.
+A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`, `actual_TCP_speed[0]`), or a topic
+of a file. What a timestamp leaves out is a NaN at its place, so that whoever decides finds it: nothing is filled in.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingError
+from ..errors import SettingError, shortened
 
 Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
 Active = NDArray[np.bool_]
-MOST_BITS = 18  # of a UR controller's digital outputs: 8 standard, 8 configurable, 2 of the tool
+Gaps = tuple[tuple[int, int], ...]
+NEAR = 1.5  # steps: to the next sample, when none is missing
 
 
-@runtime_checkable
-class Trigger(Protocol):
-    """When an insertion begins."""
-
-    @property
-    def signals(self) -> tuple[str, ...]: ...  # the names of those that it looks at
-
-    @property
-    def quiet_s(self) -> float: ...  # seconds that it must have been off before it counts as going on
-
-    def active(self, signals: Signals) -> Active: ...  # (n,) whether it is on; a NaN in a signal is off
-
-
-@dataclass(frozen=True, slots=True)
-class BitTrigger:
-    """A digital output, or one bit of a register of bits, is on. bit : counted from 0."""
-
-    bit: int
-    signal: str = "actual_digital_output_bits"
-    quiet_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.bit < 32:
-            raise SettingError(f"Expected a bit from 0 to 31, got {self.bit}; digital outputs are 0 to {MOST_BITS - 1}.")
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return (self.signal,)
-
-    def active(self, signals: Signals) -> Active:
-        word = np.nan_to_num(signals[self.signal]).astype(np.uint64)
-        return np.asarray((word >> np.uint64(self.bit)) & np.uint64(1), dtype=np.bool_)
-
-
-@dataclass(frozen=True, slots=True)
-class RegisterTrigger:
-    """A register, or a topic of numbers or truths, holds a value; None: any but zero."""
-
-    signal: str = "output_int_register_25"
-    value: float | None = None
-    quiet_s: float = 0.0
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return (self.signal,)
-
-    def active(self, signals: Signals) -> Active:
-        held = np.nan_to_num(signals[self.signal])
-        return np.asarray(held != 0 if self.value is None else held == self.value)
-
-
-@dataclass(frozen=True, slots=True)
-class ContactTrigger:
-    """The force is at or beyond a threshold, either way. newtons : above what the sensor shows in free motion.
-
-    quiet_s : without contact before the next insertion can begin: a force that plays around the threshold is one contact.
-    """
-
-    newtons: float
-    signal: str = "FZ_Base"
-    quiet_s: float = 0.2
-
-    def __post_init__(self) -> None:
-        if not 0 < self.newtons < float("inf"):
-            raise SettingError(f"Expected a contact threshold above 0 N, got {self.newtons}.")
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return (self.signal,)
-
-    def active(self, signals: Signals) -> Active:
-        return np.asarray(np.abs(np.nan_to_num(signals[self.signal])) >= self.newtons)
-
-
-@dataclass(frozen=True, slots=True)
-class MotionTrigger:
-    """The tool moves faster than this, in metres a second: the start of a move out of a standstill."""
-
-    speed: float = 0.002
-    signal: str = "actual_TCP_speed"
-    quiet_s: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not 0 < self.speed < float("inf"):
-            raise SettingError(f"Expected a speed above 0 m/s, got {self.speed}.")
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        return tuple(f"{self.signal}[{i}]" for i in range(3))
-
-    def active(self, signals: Signals) -> Active:
-        each = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
-        return np.asarray(np.linalg.norm(each, axis=0) > self.speed)
-
-
-KINDS: dict[str, tuple[type, str, Callable[[str], float], str]] = {  # class, field of the number, its type and pattern
-    "bit": (BitTrigger, "bit", int, r"\d+"),
-    "register": (RegisterTrigger, "value", float, r"-?\d+|"),
-    "contact": (ContactTrigger, "newtons", float, r"\d+(\.\d+)?"),
-    "motion": (MotionTrigger, "speed", float, r"\d+(\.\d+)?|"),
+SIZE = r"(?=.*[1-9])\d+(\.\d+)?"  # a number above zero
+# Pattern of the number; the number, signal and quiet_s of one that says nothing else; whether it is on, of signals (1, n).
+KINDS: dict[str, tuple[str, float | None, str, float, Callable[[Any, Any], Any]]] = {
+    "bit": (
+        r"[012]?\d|3[01]",
+        *(None, "actual_digital_output_bits", 0.0),
+        lambda held, bit: held[0].astype(np.uint64) >> np.uint64(bit) & np.uint64(1) != 0,
+    ),
+    "register": (
+        r"(-?\d+)?",
+        *(None, "output_int_register_25", 0.0),
+        lambda held, value: held[0] != 0 if value is None else held[0] == value,
+    ),
+    "contact": (SIZE, None, "FZ_Base", 0.2, lambda held, newtons: np.abs(held[0]) >= newtons),
+    "motion": (f"({SIZE})?", 0.002, "actual_TCP_speed", 0.1, lambda v, speed: np.linalg.norm(v, axis=0) > speed),
 }
 EXAMPLES = "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base, motion=0.002"
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """When an insertion begins: where what it looks at goes on. `as_trigger` makes one.
+
+    kind, number : bit: of a word of bits, this one is set, counted from 0.  register: the signal holds this value; None:
+        any but zero.  contact: the force is this many newtons or more above what the sensor shows in free motion.
+        motion: the tool moves faster than this, in metres a second; the signal is a vector.
+    quiet_s : seconds that it must have been off before it counts as going on: a force that plays around the threshold is
+        one contact.
+    """
+
+    kind: str
+    number: float | None
+    signal: str
+    quiet_s: float
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """The names of the signals that it looks at."""
+        return tuple(f"{self.signal}[{i}]" for i in range(3)) if self.kind == "motion" else (self.signal,)
+
+    def active(self, signals: Signals) -> Active:
+        """(n,) whether it is on; a NaN in a signal is off."""
+        held = np.stack([np.nan_to_num(signals[name]) for name in self.signals])
+        return np.asarray(KINDS[self.kind][-1](held, self.number))
 
 
 def as_trigger(asked: Any) -> Trigger:
@@ -132,12 +75,78 @@ def as_trigger(asked: Any) -> Trigger:
     """
     if isinstance(asked, Trigger):
         return asked
-    if not isinstance(asked, str):
-        raise SettingError(f"Expected a trigger or its text, as {EXAMPLES}; got {type(asked).__name__}.")
-    found = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", asked.strip())
+    found = re.fullmatch(r"(\w+)(?:=([^@]*))?(?:@(.+))?", asked.strip()) if isinstance(asked, str) else None
     kind, number, signal = found.groups(default="") if found else ("", "", "")
-    if kind not in KINDS or not re.fullmatch(KINDS[kind][3], number):
-        raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {asked!r}.")
-    make, name, cast, _ = KINDS[kind]
-    trigger: Trigger = make(**({name: cast(number)} if number else {}), **({"signal": signal} if signal else {}))
-    return trigger
+    if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
+        raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(asked)}.")
+    _, usual, usually, quiet_s, _ = KINDS[kind]
+    return Trigger(kind, float(number) if number else usual, signal or usually, quiet_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A window of a stream. trace : (C, T) float32, NaN where no sample came.  missing, repeated : samples.
+
+    gaps : (first, length) of each stretch without samples.
+    """
+
+    trace: NDArray[np.float32]
+    missing: int
+    repeated: int
+    gaps: Gaps
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where an insertion begins. time : seconds.  seen : its first sample came; False: at `time`, or later in a gap."""
+
+    time: float
+    seen: bool = True
+
+
+class StartFinder:
+    """Finds where a trigger goes on, sample by sample. step : seconds from one to the next.  quiet_s : off before that."""
+
+    def __init__(self, step: float, quiet_s: float = 0.0) -> None:
+        self.step, self.quiet_s = step, quiet_s
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: what is on at the first sample began before it, and is no start."""
+        self._off_since: float | None = None
+        self._last_off = 0.0
+
+    def feed(self, time: float, active: bool) -> Start | None:
+        """Where an insertion begins, if this sample shows it.
+
+        Where samples are missing just before this one, it may have begun in any of them: then no sample's place in its
+        trace is known.
+        """
+        if not active:
+            self._off_since = time if self._off_since is None else self._off_since
+            self._last_off = time
+            return None
+        began, self._off_since = self._off_since, None
+        if began is None or time - began < self.quiet_s - self.step / 2:
+            return None
+        seen = time - self._last_off < NEAR * self.step
+        return Start(time) if seen else Start(self._last_off + self.step, seen=False)
+
+
+def place(times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float) -> Placed:
+    """The samples from `start` on, each where its time puts it. times : (n,) seconds, increasing.  values : (n, C)."""
+    trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
+    at = np.rint((np.asarray(times, dtype=np.float64) - start) / step).astype(np.int64)
+    inside = (at >= 0) & (at < samples)
+    places, first = np.unique(at[inside], return_index=True)
+    with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
+        trace[:, places] = values[inside][first].T
+    there = np.zeros(samples, dtype=np.bool_)
+    there[places] = True
+    return Placed(trace, samples - len(places), int(inside.sum()) - len(places), gaps_of(there))
+
+
+def gaps_of(there: NDArray[np.bool_]) -> Gaps:
+    """(first, length) of each stretch that is not there."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], there, [True]]).astype(np.int8)))
+    return tuple((int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True))

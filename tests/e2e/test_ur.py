@@ -19,7 +19,7 @@ from dengine.cells.ur.cell import ANSWER, ORDER, PHASE, Answer, Verb, after, wor
 from dengine.cells.ur.protocol import TYPES, Kind, Package, Packages, Recipe, column_of
 from dengine.cells.ur.stream import Lateness, RtdeClient, RtdeStream
 from dengine.cli import main
-from dengine.datasets.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger
+from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError
 
 SAMPLES = 80
@@ -198,11 +198,11 @@ def contact() -> np.ndarray:
 @pytest.mark.parametrize(
     ("trigger", "columns"),
     [
-        (ContactTrigger(5.0, quiet_s=0.1), {}),
-        (BitTrigger(3), {"actual_digital_output_bits": 8 * (contact() > 0)}),
-        (RegisterTrigger("output_int_register_30", 2), {"output_int_register_30": 2 * (contact() > 0)}),
+        (Trigger("contact", 5.0, "FZ_Base", quiet_s=0.1), {}),
+        ("bit=3", {"actual_digital_output_bits": 8 * (contact() > 0)}),
+        ("register=2@output_int_register_30", {"output_int_register_30": 2 * (contact() > 0)}),
         ("register@output_bit_register_64", {"output_bit_register_64": contact() > 0}),
-        (MotionTrigger(0.01), {"actual_TCP_speed[2]": -0.02 * (contact() > 0)}),
+        ("motion=0.01", {"actual_TCP_speed[2]": -0.02 * (contact() > 0)}),
     ],
     ids=["contact", "digital output", "register", "bit register", "motion"],
 )

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from dengine import load_dataset
 from dengine.cli import main
-from dengine.datasets.triggers import ContactTrigger
+from dengine.datasets.triggers import Trigger
 from dengine.errors import DataError
 
 writing = pytest.importorskip("mcap_ros2.writer", reason='mcap is not installed: pip install "dengine[mcap]"')
@@ -115,7 +115,7 @@ def test_a_recording_is_cut_into_its_insertions_with_their_labels(bag: Bag, tmp_
 
 @pytest.mark.parametrize("signal", ["FZ", "FX_Base"])
 def test_it_is_cut_by_the_same_triggers_as_a_live_one(bag: Bag, tmp_path: Path, signal: str) -> None:
-    asked = {**ASKED, "trigger": ContactTrigger(5.0, signal, quiet_s=0.05)}
+    asked = {**ASKED, "trigger": Trigger("contact", 5.0, signal, quiet_s=0.05)}
     np.testing.assert_array_equal(load_dataset(bag.write(tmp_path / "a.mcap"), **asked).X, bag.traces[:, 2].astype("f4"))
     with pytest.raises(DataError, match="it never does"):  # 0.08 s of rest are less than the 0.2 s of its text
         load_dataset(tmp_path / "a.mcap", **{**ASKED, "trigger": f"contact=5@{signal}"})
@@ -173,7 +173,7 @@ def test_labels_are_listed_by_number_too_with_the_parts(bag: Bag, tmp_path: Path
     data = load_dataset(path, labels=table, **asked)
     np.testing.assert_array_equal(data.y, bag.good[:-1])
     assert data.part.tolist() == [f"P{i // 2}" for i in range(1, 8)]
-    assert [fault.source for fault in data.faults] == ["cell/8", "labels.csv"]
+    assert [fault.source for fault in data.faults] == ["labels.csv", "cell/8"]
 
 
 def test_an_insertion_that_nobody_labelled_is_a_fault_and_most_of_them_an_error(bag: Bag, tmp_path: Path) -> None:

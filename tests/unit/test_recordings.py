@@ -12,7 +12,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, load_dataset
 from dengine.datasets.importing import import_labelled
-from dengine.datasets.labels import Named
+from dengine.datasets.labels import named
 from dengine.errors import DataError, TraceError
 
 
@@ -189,11 +189,11 @@ def test_a_label_is_read_from_a_name_or_its_folder_as_people_write_them(label: i
     for name in names.split(", "):
         if label is None:
             with pytest.raises(DataError, match="Expected a label"):
-                Named().label(name)
+                named().find(name)
         else:
-            assert Named().label(name) == (label, None), name
+            assert named().find(name) == (label, None), name
     with pytest.raises(DataError, match="its name and its folder good contradict"):
-        Named().label("good/x_NOK.csv")
+        named().find("good/x_NOK.csv")
 
 
 def test_labels_come_from_folders_a_pattern_or_a_file(small: Dataset, tmp_path: Path) -> None:
@@ -221,8 +221,8 @@ def test_a_labels_file_that_does_not_fit_is_named_line_by_line(small: Dataset, t
     data = load_dataset(tmp_path / "cell", labels=tmp_path / "labels.csv")
     assert (data.source.tolist(), data.y.tolist()) == ([f"{i}.csv" for i in (0, 1, 4, 5, 6)], [1, 0, 1, 1, 0])
     said = [(f.source, f.line) for f in data.faults]
-    assert said == [("labels.csv", 5), ("labels.csv", 8), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0), ("labels.csv", 6)]
-    assert "in labels.csv, line 4" in data.faults[2].what
+    assert said == [("labels.csv", 5), ("labels.csv", 8), ("labels.csv", 6), ("2.csv", 0), ("3.csv", 0), ("7.csv", 0)]
+    assert "in labels.csv, line 4" in data.faults[3].what
 
 
 @pytest.fixture(scope="module")

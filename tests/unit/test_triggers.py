@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dengine.datasets.cutting import Start, StartFinder, gaps_of, place
-from dengine.datasets.triggers import BitTrigger, ContactTrigger, MotionTrigger, RegisterTrigger, Trigger, as_trigger
+from dengine.datasets.triggers import Start, StartFinder, Trigger, as_trigger, gaps_of, place
 from dengine.errors import SettingError
 
 STEP = 0.002
@@ -16,33 +15,29 @@ BITS = "actual_digital_output_bits"
 @pytest.mark.parametrize(
     ("trigger", "signals", "on"),
     [
-        (BitTrigger(2), {BITS: [0, 4, 3, 7]}, [0, 1, 0, 1]),
-        (BitTrigger(17), {BITS: [0, 2**17, np.nan]}, [0, 1, 0]),
-        (RegisterTrigger("r"), {"r": [0, 3, -1, np.nan]}, [0, 1, 1, 0]),
-        (RegisterTrigger("r", 3), {"r": [0, 3, -1]}, [0, 1, 0]),
-        (ContactTrigger(5.0), {"FZ_Base": [4.9, 5.0, -5.0, np.nan]}, [0, 1, 1, 0]),
-        (MotionTrigger(0.1), {f"actual_TCP_speed[{i}]": [0.0, 0.06, 0.08] for i in range(3)}, [0, 1, 1]),
+        ("bit=2", {BITS: [0, 4, 3, 7]}, [0, 1, 0, 1]),
+        ("bit=17", {BITS: [0, 2**17, np.nan]}, [0, 1, 0]),
+        ("register@r", {"r": [0, 3, -1, np.nan]}, [0, 1, 1, 0]),
+        ("register=3@r", {"r": [0, 3, -1]}, [0, 1, 0]),
+        ("contact=5", {"FZ_Base": [4.9, 5.0, -5.0, np.nan]}, [0, 1, 1, 0]),
+        ("motion=0.1", {f"actual_TCP_speed[{i}]": [0.0, 0.06, 0.08] for i in range(3)}, [0, 1, 1]),
     ],
-    ids=lambda each: type(each).__name__ if isinstance(each, Trigger) else None,
 )
-def test_a_trigger_is_on_where_its_signals_say_so(trigger: Trigger, signals: dict, on: list) -> None:
-    assert set(trigger.signals) == set(signals)
-    seen = trigger.active({name: np.array(values, dtype=float) for name, values in signals.items()})
-    assert seen.tolist() == [bool(each) for each in on]
+def test_a_trigger_is_on_where_its_signals_say_so(trigger: str, signals: dict, on: list) -> None:
+    found = as_trigger(trigger)
+    assert set(found.signals) == set(signals)
+    seen = found.active({name: np.array(values, dtype=float) for name, values in signals.items()})
+    assert seen.astype(int).tolist() == on
 
 
 @pytest.mark.parametrize(
     ("text", "trigger"),
     [
-        ("bit=0", BitTrigger(0)),
-        ("bit=3@output_bit_registers0_to_31", BitTrigger(3, "output_bit_registers0_to_31")),
-        ("register", RegisterTrigger()),
-        ("register@/phase", RegisterTrigger("/phase")),
-        ("register=2@output_int_register_30", RegisterTrigger("output_int_register_30", 2.0)),
-        ("contact=5", ContactTrigger(5.0)),
-        ("contact=7.5@FX_Base", ContactTrigger(7.5, "FX_Base")),
-        ("motion", MotionTrigger()),
-        ("motion=0.01", MotionTrigger(0.01)),
+        ("bit=3@output_bit_registers0_to_31", Trigger("bit", 3, "output_bit_registers0_to_31", 0.0)),
+        ("register", Trigger("register", None, "output_int_register_25", 0.0)),
+        ("register@/phase", Trigger("register", None, "/phase", 0.0)),
+        ("contact=7.5@FX_Base", Trigger("contact", 7.5, "FX_Base", 0.2)),
+        ("motion", Trigger("motion", 0.002, "actual_TCP_speed", 0.1)),
     ],
 )
 def test_a_trigger_is_named_in_a_few_words(text: str, trigger: Trigger) -> None:
@@ -51,10 +46,10 @@ def test_a_trigger_is_named_in_a_few_words(text: str, trigger: Trigger) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "contact", "bit", "bit=-1", "bit=40", "contact=0", "nothing=3", "contact=x", "motion=0", 5]
+    "text", ["", "contact", "bit", "bit=-1", "bit=40", "contact=0", "contact=0.0", "nothing=3", "contact=x", "motion=0", 5]
 )
 def test_what_is_no_trigger_is_refused_with_examples(text: object) -> None:
-    with pytest.raises(SettingError, match="Expected a"):
+    with pytest.raises(SettingError, match="Expected a trigger, as bit=0"):
         as_trigger(text)
 
 

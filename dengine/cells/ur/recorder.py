@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.cutting import Gaps, Start, StartFinder, place
-from ...datasets.triggers import Trigger, as_trigger
+from ...datasets.triggers import Gaps, Start, StartFinder, Trigger, as_trigger, place
 from ...errors import CellError, SettingError
 from ...records import TraceSpec
 from .protocol import PORT, column_of
