@@ -29,7 +29,7 @@ from rich.table import Table
 
 from dengine import Policy, Recipe
 from dengine.cells.simulation.conditions import CellParameters, first_change
-from dengine.experiments.figures import LIMIT, RECIPES, SMALL, draw_verified, plain, save
+from dengine.experiments.figures import LIMIT, RECIPES, SMALL, draw_verified, finish, save
 from dengine.experiments.replay import Replay, replay
 from dengine.experiments.tables import write_csv
 
@@ -158,7 +158,7 @@ def picture(runs: Sequence[Run]) -> Figure:
         top.set_title(scenario, pad=18)
         bottom.set(xlabel="cycle", ylim=(0, None))
     for axes in grid.flat:
-        plain(axes)
+        finish(axes, legend=0)
     for axes, name in zip(grid[:, 0], (f"verified, last {WINDOW} [%]", "bad parts accepted so far"), strict=True):
         axes.set_ylabel(name)
     labels: dict[str, object] = {}

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO
 from itertools import cycle, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,34 +36,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
+Look = dict[str, Any]
 
 BLUE, RED, GREEN, PINK, SKY, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00"
 GREY, BLACK = "#6E6E6E", "#000000"
 GOOD, BAD, VERIFIED = BLUE, RED, GREY  # of parts, and of the decisions that call them so
 RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first those that mean nothing else
-LIMIT: dict[str, Any] = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound, or a moment, that is given
+LIMIT: Look = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound, or a moment, that is given
 SMALL = 9  # points: legends and notes
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
 KINDS = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 CLEAR = 0.1  # band widths below which leaving the band is not marked
 FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
-
-
-class Mark(NamedTuple):
-    """How one kind of part is drawn on a map."""
-
-    name: str
-    colour: str
-    marker: str
-    size: int
-
-
-ACTION_MARKS = {  # drawn in this order, so that the few certain ones lie on top
-    Action.VERIFY: Mark("verify", VERIFIED, "o", 9),
-    Action.ACCEPT: Mark("accept", GOOD, "o", 26),
-    Action.REJECT: Mark("reject", BAD, "X", 30),
+ACTION_MARKS: dict[Any, tuple[str, Look]] = {  # drawn in this order, so that the few certain ones lie on top
+    Action.VERIFY: ("verify", {"color": VERIFIED, "marker": "o", "s": 9}),
+    Action.ACCEPT: ("accept", {"color": GOOD, "marker": "o", "s": 26}),
+    Action.REJECT: ("reject", {"color": BAD, "marker": "X", "s": 30}),
 }
-TRUTH_MARKS = {True: Mark("good part", GOOD, "o", 22), False: Mark("bad part", BAD, "X", 26)}
+TRUTH_MARKS: dict[Any, tuple[str, Look]] = {
+    good: (f"{name} part", {"color": colour, "marker": marker, "s": 24}) for good, name, colour, _, marker in KINDS
+}
 
 
 def sliding_sum(values: NDArray[Any], window: int) -> Floats:
@@ -79,26 +71,36 @@ def sliding_mean(values: NDArray[Any], window: int) -> Floats:
     return sliding_sum(values, window) / sliding_sum(np.ones(values.shape[-1]), window)
 
 
-def blank(width: float, height: float) -> Figure:
+def fitting(window: int, replays: Sequence[Replay]) -> int:
+    """The window, or a third of the longest replay where that is less."""
+    return min(window, max(1, max(map(len, replays)) // 3))
+
+
+def numbers(n: int) -> NDArray[np.int64]:
+    """(n,) of cycles, counted from 1."""
+    return np.arange(1, n + 1)
+
+
+def blank(width: float, height: float, title: str = "") -> Figure:
     """An empty figure, inches."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.suptitle(title)
+    return figure
 
 
-def panels(rows: int, size: tuple[float, float], heights: Sequence[float] | None = None) -> tuple[Figure, list[Axes]]:
-    """A figure of panels one below the other, with one axis of cycles."""
-    figure = blank(*size)
-    axes = list(figure.subplots(rows, 1, sharex=True, height_ratios=heights))
-    for each in axes:
-        plain(each)
-    return figure, axes
+def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
+    """A light grid and no box; the legend above, in so many columns: inside, it would lie on one curve or another.
 
-
-def plain(axes: Axes) -> None:
-    """A light grid, and no box."""
+    legend : 0 for none.  settings : as `Axes.set` takes them.
+    """
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
+    axes.set(**settings)
+    if legend:
+        look: Look = {"ncols": legend, "frameon": False, "fontsize": SMALL, "borderaxespad": 0.2}
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), **look)
 
 
 def note(axes: Axes, text: str, colour: str = BLACK) -> None:
@@ -106,30 +108,11 @@ def note(axes: Axes, text: str, colour: str = BLACK) -> None:
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour)
 
 
-def whole_numbers(axes: Axes) -> None:
-    """Ticks of counts."""
-    axes.locator_params(axis="y", nbins=6, integer=True)
-
-
-def legend_above(axes: Axes, columns: int = 3) -> None:
-    """The legend above the axes: inside, it would lie on one curve or another."""
-    look: dict[str, Any] = {"ncols": columns, "frameon": False, "fontsize": SMALL, "borderaxespad": 0.2}
-    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), **look)
-
-
-def draw_errors(axes: Axes, false_positive: NDArray[np.bool_], false_negative: NDArray[np.bool_]) -> None:
-    """Wrong decisions so far, (n,) each: bad parts accepted, good parts rejected."""
-    x = np.arange(1, len(false_positive) + 1)
-    axes.step(x, np.cumsum(false_positive), "-", where="post", color=BAD, label="bad part accepted (FP)")
-    axes.step(x, np.cumsum(false_negative), "--", where="post", color=GOOD, label="good part rejected (FN)")
-    whole_numbers(axes)
-
-
 def draw_verified(
     axes: Axes, verified: NDArray[np.bool_], window: int, colour: str = VERIFIED, label: str = "verified"
 ) -> None:
     """Share of the parts that were checked, (n,), over the last `window` cycles."""
-    axes.plot(np.arange(1, len(verified) + 1), 100 * sliding_mean(verified, window), color=colour, label=label)
+    axes.plot(numbers(len(verified)), 100 * sliding_mean(verified, window), color=colour, label=label)
     axes.set(ylim=(0, 104))
 
 
@@ -156,49 +139,45 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     recipe fixes its radius. Units are equal on both axes, unless the first is a probability: then the second is for the
     eye, and the ball is cut off above and below.
     """
-    figure = blank(10.0, 5.4)
+    figure, recipe = blank(10.0, 5.4, title), replay.recipe
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known = np.isfinite(z).all(axis=1)
+    known, probability = np.isfinite(z).all(axis=1), is_probability(recipe)
+    first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
+    if probability:
+        first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
     truth, action = (left, "what the parts were", replay.truth), (right, "what was decided", replay.action)
     for (axes, name, kinds), marks in ((truth, TRUTH_MARKS), (action, ACTION_MARKS)):
-        for kind, mark in marks.items():
+        for kind, (word, look) in marks.items():
             points = z[known & (kinds[-last:] == kind)]
-            look: dict[str, Any] = {"color": mark.colour, "marker": mark.marker, "s": mark.size}
-            axes.scatter(*points.T, label=f"{mark.name} ({len(points)})", alpha=0.7, linewidths=0, **look)
+            axes.scatter(*points.T, label=f"{word} ({len(points)})", alpha=0.7, linewidths=0, **look)
         if not known.any():
             note(axes, "no trace was embedded yet")
-        plain(axes)
-        legend_above(axes)
+        finish(axes, xlabel=first)
         axes.set_title(name, pad=24)
-    first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
-    if is_probability(replay.recipe):
-        first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
+    left.set(ylabel=second)
+    if probability:
         left.set(xlim=(-0.06, 1.06), ylim=_around(z[:, 1]))
     else:
         span = max(np.ptp(_around(z[:, i])) for i in (0, 1))
         left.set(xlim=_around(z[:, 0], span), ylim=_around(z[:, 1], span))
         for axes in (left, right):
             axes.set_aspect("equal")
-    left.set(xlabel=first, ylabel=second)
-    right.set(xlabel=first)
-    if known.any() and replay.recipe.fraction is None:  # one that grows with the references has no radius of its own
-        _draw_balls(figure, z[known][-1], replay.recipe)
-    figure.suptitle(title)
+    if known.any() and recipe.fraction is None:  # one that grows with the references has no radius of its own
+        cut = ", cut off above and below" if probability else ""
+        _draw_balls(figure, z[known][-1], recipe.radius, f"the ball around the newest part, radius {recipe.radius:g}{cut}")
     return figure
 
 
-def _draw_balls(figure: Figure, centre: Floats, recipe: Recipe) -> None:
+def _draw_balls(figure: Figure, centre: Floats, radius: float, label: str) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
     x, y = centre
     for axes in figure.axes:
-        axes.add_patch(Circle((x, y), recipe.radius, fill=False, edgecolor=BLACK, linewidth=1.4))
+        axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
         axes.plot([x], [y], "+", color=BLACK, markersize=9)
-    label = f"the ball around the newest part, radius {recipe.radius:g}"
-    label += ", cut off above and below" if is_probability(recipe) else ""
     ring = Line2D([], [], color=BLACK, marker="o", markersize=11, fillstyle="none", linestyle="none", label=label)
     figure.legend(handles=[ring], loc="outside lower center", frameon=False, fontsize=SMALL)
 
@@ -244,14 +223,13 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
     The tolerance 100 - LB is a share of the accepted parts, so the errors are drawn as shares of what was decided alike.
     """
     wide = max(2, min(len(by_recipe), 4))  # recipes side by side in the legends: a column each, and one for the bound
-    figure, (top, bottom) = panels(2, (3.6 + 2.7 * wide, 7.4), heights=(4, 3))
+    figure = blank(3.6 + 2.7 * wide, 7.4, title)
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, 3))
     all_replays = [r for replays in by_recipe.values() for r in replays]
-    window = min(window, max(1, max(map(len, all_replays)) // 3))
-    bounds = sorted({r.recipe.policy.lower_bound for r in all_replays})
+    window, bounds = fitting(window, all_replays), sorted({r.recipe.policy.lower_bound for r in all_replays})
     for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
         lead = f"{name}: " if len(by_recipe) > 1 else ""
         lines = _draw_certain(top, replays, window, colour, colour, lead)
-        x = np.arange(1, len(lines["certain"]) + 1)
         # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
         counts = [each.stretch() for each in replays]
         for wrong, decided, kind, style in (
@@ -259,17 +237,15 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
             ("false_negative", "rejected", "good", "--"),
         ):
             label = f"{lead}{sum(n[wrong] for n in counts)} {kind} of {sum(n[decided] for n in counts)} {decided}"
-            bottom.plot(x, lines[wrong], style, color=colour, label=label)
+            bottom.plot(numbers(len(lines[wrong])), lines[wrong], style, color=colour, label=label)
     for bound in bounds:
         top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
         bottom.axhline(100 * (1 - bound), label=f"tolerance 100 - LB = {100 * (1 - bound):g} %", **LIMIT)
-    top.set(ylim=(0, 102), ylabel="share [%]")
+    finish(top, wide + 1, ylim=(0, 102), ylabel="share [%]")
     # Above the tolerance at least half as much again: whether the errors keep to it is what the panel is there for.
-    bottom.set(ylim=(0, max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))), ylabel="wrong [% of accepted, rejected]")
+    highest = max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))
+    finish(bottom, wide + 1, ylim=(0, highest), ylabel="wrong [% of accepted, rejected]")
     bottom.set(xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)")
-    figure.suptitle(title)
-    for axes in (top, bottom):
-        legend_above(axes, columns=wide + 1)
     return figure
 
 
@@ -278,7 +254,7 @@ def _draw_certain(
 ) -> dict[str, Floats]:
     """The certain share with its spread, and the precision, in these colours; returns all of `window_curves`."""
     lines = window_curves(replays, window, FEWEST)
-    x = np.arange(1, len(lines["certain"]) + 1)
+    x = numbers(len(lines["certain"]))
     axes.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
     axes.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
     axes.plot(x, lines["precision"], color=precision, linestyle="--", label=f"{lead}precision, of accepted")
@@ -287,28 +263,28 @@ def _draw_certain(
 
 def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     """A live run: verified share, errors so far and, with a clock, parts an hour."""
-    window = min(window, max(1, len(log) // 3))
-    figure, axes = panels(2 if log.clock_s is None else 3, (9.0, 6.0 if log.clock_s is None else 8.5))
+    window, x, timed = fitting(window, [log]), numbers(len(log)), log.clock_s is not None
+    figure = blank(9.0, 8.5 if timed else 6.0, title)
+    axes = figure.subplots(3 if timed else 2, 1, sharex=True)
     draw_verified(axes[0], log.verified, window)
-    axes[0].set(ylabel=f"verified, last {window} [%]")
-    draw_errors(axes[1], log.false_positive, log.false_negative)
-    axes[1].set(ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * max(log.false_positive.sum(), log.false_negative.sum())))
-    legend_above(axes[1])
+    finish(axes[0], legend=0, ylabel=f"verified, last {window} [%]")
+    wrong = np.cumsum([log.false_positive, log.false_negative], axis=1)
+    axes[1].step(x, wrong[0], "-", where="post", color=BAD, label="bad part accepted (FP)")
+    axes[1].step(x, wrong[1], "--", where="post", color=GOOD, label="good part rejected (FN)")
+    axes[1].locator_params(axis="y", nbins=6, integer=True)
+    finish(axes[1], ylabel="errors so far [parts]", ylim=(0, 1 + 1.1 * wrong.max(initial=0)))
     if log.clock_s is not None:
-        x, took = np.arange(1, len(log) + 1), np.diff(log.clock_s, prepend=0.0)
+        took, settled = np.diff(log.clock_s, prepend=0.0), x >= window  # a rate over few cycles is mostly luck
         rate = 3600 * sliding_sum(log.finished, window) / sliding_sum(took, window)
-        settled = x >= window  # a rate over few cycles is mostly luck
         axes[2].plot(x[settled], rate[settled], color=GREEN, label="this run")
         if log.verified.any():
             # The same parts, each at the time that a verified one took: every good one goes on, and nothing stops.
             always = 3600 * sliding_mean(log.truth == 1.0, window) / float(np.median(took[log.verified]))
             axes[2].plot(x[settled], always[settled], color=VERIFIED, linestyle=":", label="had every part been verified")
-        axes[2].set(ylabel=f"good parts/h, last {window}")
-        legend_above(axes[2])
+        finish(axes[2], ylabel=f"good parts/h, last {window}")
     if not len(log):
         note(axes[0], "no cycle was finished")
     axes[-1].set(xlabel="cycle")
-    figure.suptitle(title)
     return figure
 
 
@@ -323,16 +299,15 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
     for r in replays:
         cells.setdefault((r.recipe.policy.alpha, r.recipe.policy.lower_bound), []).append(r)
     alphas, bounds = sorted({alpha for alpha, _ in cells}, reverse=True), sorted({bound for _, bound in cells})
-    figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas))
-    heights = [3, 1.6] * len(alphas)
+    figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas), title)
+    heights, window = [3, 1.6] * len(alphas), fitting(window, replays)
     axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
-    window = min(window, max(1, len(replays[0]) // 3))
     for (i, alpha), (j, bound) in product(enumerate(alphas), enumerate(bounds)):
         axes[2 * i, j].set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
         if (alpha, bound) in cells:
             _draw_cell(axes[2 * i, j], axes[2 * i + 1, j], cells[alpha, bound], bound, window)
     for each in axes.flat:
-        plain(each)
+        finish(each, legend=0)
     for i, row in enumerate(axes):
         row[0].set(ylabel="wrong [%]" if i % 2 else "share [%]", ylim=(0, None) if i % 2 else (0, 102))
     for each in axes[-1]:
@@ -340,7 +315,6 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
     drawn = next(pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines)
     handles = [line for each in drawn for line in each.lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
-    figure.suptitle(title)
     return figure
 
 
@@ -348,10 +322,9 @@ def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float,
     _draw_certain(top, replays, window, GREEN, GOOD)
     top.axhline(100 * bound, label="LB", **LIMIT)
     for name, colour, style in (("false_positive", BAD, "-"), ("false_negative", GOOD, "-.")):
-        wrong = np.stack([getattr(r, name) for r in replays]).mean(axis=0)
+        wrong = 100 * sliding_mean(np.mean([getattr(r, name) for r in replays], axis=0), window)
         label = f"{name.replace('_', ' ')}s, of all cycles"
-        x = np.arange(1, len(wrong) + 1)
-        bottom.plot(x, 100 * sliding_mean(wrong, window), style, color=colour, linewidth=1.2, label=label)
+        bottom.plot(numbers(len(wrong)), wrong, style, color=colour, linewidth=1.2, label=label)
     bottom.axhline(100 * (1 - bound), label="100 - LB", **LIMIT)
 
 
@@ -360,7 +333,11 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
 
     Below: shares of parts that were decided without a check. unit : of the costs.
     """
-    figure, (top, bottom) = panels(2, (9.0, 7.2), heights=(3, 2))
+    prices = {"check": curve.costs.check, "escape": curve.costs.escape, "false reject": curve.costs.false_reject}
+    what = ", ".join(f"{name} {price:g} {unit}" for name, price in prices.items())
+    how = f"{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the ends of their 95 % intervals"
+    figure = blank(9.0, 7.2, title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     bounds = sorted({row.policy.lower_bound for row in curve.rows})
     alphas = sorted({row.policy.alpha for row in curve.rows}, reverse=True)
     top.axhline(curve.baseline, label="verify everything", **LIMIT)
@@ -369,28 +346,22 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
         # The alphas' whiskers side by side.
         x = np.array([bounds.index(row.policy.lower_bound) for row in rows]) + 0.08 * (i - (len(alphas) - 1) / 2)
         cost, lower, upper = np.array([(row.cost, row.lower, row.upper) for row in rows]).T
-        look: dict[str, Any] = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
+        look: Look = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
         look["label"] = f"alpha {alpha:g}"
         # A replay's mean lies within what its errors' intervals allow, but for rounding.
-        ends = np.maximum([cost - lower, upper - cost], 0.0)
-        top.errorbar(x, cost, yerr=ends, capsize=3, elinewidth=1.0, **look)
+        top.errorbar(x, cost, yerr=np.maximum([cost - lower, upper - cost], 0.0), capsize=3, elinewidth=1.0, **look)
         bottom.plot(x, [100 * row.certain for row in rows], **look)
         for at, row in zip(x, rows, strict=True):
             if row.policy == curve.policy:
-                ring: dict[str, Any] = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+                ring: Look = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
                 top.scatter(at, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
-    means = [row.cost for row in curve.rows]
-    top.set(ylim=(min(0.0, *means), 1.25 * max(curve.baseline, *means)), ylabel=f"cost a part [{unit}]")
+    means, wide = [row.cost for row in curve.rows], len(alphas) + 2
+    lowest, highest = min(0.0, *means), 1.25 * max(curve.baseline, *means)
+    finish(top, wide, ylim=(lowest, highest), ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
-    bottom.set(ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
+    finish(bottom, wide, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
     bottom.set_xticks(range(len(bounds)), [f"{100 * bound:g}" for bound in bounds])
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
-    for axes in (top, bottom):
-        legend_above(axes, columns=len(alphas) + 2)
-    prices = {"check": curve.costs.check, "escape": curve.costs.escape, "false reject": curve.costs.false_reject}
-    what = ", ".join(f"{name} {price:g} {unit}" for name, price in prices.items())
-    how = f"{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the ends of their 95 % intervals"
-    figure.suptitle(title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
     return figure
 
 
@@ -402,17 +373,16 @@ def explained_picture(found: Explanation) -> Figure:
         widest[each.channel] = max(widest[each.channel], each.widths)
     channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())  # those that leave the band farthest
     heights = [1.5 + 2.3 * len(channels), 2.6] if found.neighbours or found.bound else [1.5 + 2.3 * len(channels)]
-    figure = blank(10.0, sum(heights))
     version = f"version {made.model_version}" if made.model_version else "no model yet"
+    figure = blank(10.0, sum(heights))
     words = f"{made.id}: {made.action.value}, {made.reason.value} ({version}); label: {past.label}"
     figure.suptitle(words, fontweight="bold")
     rows = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     above = rows[0].subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, channel in zip(above, channels, strict=True):
+    for i, (axes, channel) in enumerate(zip(above, channels, strict=True)):
         _draw_trace(axes, found, channel)
         name = spec.columns[channel] if spec.columns else "trace" if spec.channels == 1 else f"channel {channel + 1}"
-        axes.set(ylabel=f"{name} [{spec.unit}]")
-    legend_above(above[0], columns=3)
+        finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.unit}]")
     above[-1].set(xlabel="time [s]")
     if len(rows) > 1:
         left, right = rows[1].subplots(1, 2, width_ratios=(1.15, 1.0))
@@ -422,7 +392,6 @@ def explained_picture(found: Explanation) -> Figure:
 
 
 def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
-    plain(axes)
     x, band = np.arange(found.trace.shape[1]) / found.spec.rate_hz, found.envelope
     if band is not None:
         label = f"95 % of {band.n:,} successes"
@@ -442,11 +411,10 @@ def _draw_trace(axes: Axes, found: Explanation, channel: int) -> None:
 
 def _draw_distances(axes: Axes, found: Explanation) -> None:
     """Nearest references by distance, a row a fold: those of one fold live in one space."""
-    plain(axes)
     near = found.neighbours
     if not near or found.radius is None:
         note(axes, "no neighbours", GREY)
-        axes.set(xticks=[], yticks=[])
+        finish(axes, legend=0, xticks=[], yticks=[])
         return
     spaces = sorted({each.space for each in near})
     for success, name, colour, _, marker in KINDS:
@@ -461,17 +429,16 @@ def _draw_distances(axes: Axes, found: Explanation) -> None:
     else:
         axes.plot([], [], " ", label=f"all inside the ball, radius {found.radius:.3g}")
     axes.set(yticks=range(len(spaces)), yticklabels=[f"fold {space}" for space in spaces])
-    axes.set(ylim=(-0.7, len(spaces) - 0.3), xlim=(0.0, 1.08 * max(end, 1e-9)))
-    axes.set(xlabel=f"distance of the nearest references of version {found.neighbours_version} [scaled]")
-    legend_above(axes, columns=3)
+    name = f"distance of the nearest references of version {found.neighbours_version} [scaled]"
+    finish(axes, ylim=(-0.7, len(spaces) - 0.3), xlim=(0.0, 1.08 * max(end, 1e-9)), xlabel=name)
 
 
 def _draw_bound(axes: Axes, bound: Bound | None) -> None:
     """The interval of the success rate, and what it was held against."""
-    plain(axes)
     axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel="success rate in the ball")
     if bound is None:
         note(axes, "no bound was asked for", GREY)
+        finish(axes, legend=0)
         return
     n = bound.n_success + bound.n_failure
     if n:
@@ -483,70 +450,67 @@ def _draw_bound(axes: Axes, bound: Bound | None) -> None:
     text, middle = f"{bound.lower:.3f} to {bound.upper:.3f}", 0.5 * (bound.lower + bound.upper)
     side, x = ("left", bound.lower) if middle < 0.2 else ("right", bound.upper) if middle > 0.8 else ("center", middle)
     axes.annotate(text, (x, 0.0), xytext=(0, 9), textcoords="offset points", ha=side, fontsize=SMALL)
-    legend_above(axes, columns=2)
+    finish(axes, legend=2)
 
 
 def status_picture(course: Course, title: str = "") -> Figure:
     """Above, the verified and the novel share of each stretch; below, bad accepted parts so far and what is tolerated."""
-    figure, (top, bottom) = panels(2, (10.0, 6.4))
+    figure = blank(10.0, 6.4, title)
+    top, bottom = figure.subplots(2, 1, sharex=True)
     n, verified, novel, accepted, bad = (
         np.array([getattr(each, name) for each in course.stretches], dtype=np.float64)
         for name in ("n", "verified", "novel", "accepted", "bad")
     )
     ends = np.cumsum(n)
-    for share, colour, line, name in ((verified, VERIFIED, "-", "verified"), (novel, PINK, "--", "novel")):
-        if share is verified or share.any():
-            top.plot(ends - n / 2, 100 * share / np.maximum(n, 1), line, color=colour, label=name)
+    top.plot(ends - n / 2, 100 * verified / np.maximum(n, 1), color=VERIFIED, label="verified")
+    if novel.any():
+        top.plot(ends - n / 2, 100 * novel / np.maximum(n, 1), "--", color=PINK, label="novel")
     x, accepted, bad = (np.concatenate([[0.0], each]) for each in (ends, np.cumsum(accepted), np.cumsum(bad)))
     total, tolerated = f"{bad[-1]:.0f} bad of {accepted[-1]:,.0f}" if len(n) else "none", course.tolerance * accepted
     bottom.plot(x, bad, color=BAD, label=f"known bad ({total} accepted)")
     bottom.plot(x, tolerated, ":", color=BLACK, label=f"tolerated, {100 * course.tolerance:g} % of the accepted")
-    whole_numbers(bottom)
-    bottom.set(ylim=(0, max(1.0, 1.1 * tolerated[-1], 1.1 * bad[-1])), ylabel="bad accepted parts so far")
-    every = f", {course.stretches[0].n} a point" if len(n) and n[0] > 1 else ""
-    bottom.set(xlabel=f"cycle{every}")
-    top.set(ylim=(0, 104), ylabel="share of the parts [%]")
     if len(n):
         bottom.set(xlim=(0, ends[-1] * 1.01))
         _mark_events(top, bottom, course, ends)
     else:
         note(top, "no decision yet")
-    for axes in (top, bottom):
-        legend_above(axes, columns=4)
-    figure.suptitle(title)
+    finish(top, 4, ylim=(0, 104), ylabel="share of the parts [%]")
+    bottom.locator_params(axis="y", nbins=6, integer=True)
+    highest, every = max(1.0, 1.1 * tolerated[-1], 1.1 * bad[-1]), f", {n[0]:.0f} a point" if len(n) and n[0] > 1 else ""
+    finish(bottom, 4, ylim=(0, highest), ylabel="bad accepted parts so far", xlabel=f"cycle{every}")
     return figure
 
 
-def _cycles(course: Course, ends: Floats, times: list[float]) -> Floats:
-    """At which cycle something happened, to within a stretch."""
-    return np.interp(times, [each.last for each in course.stretches], ends)
-
-
 def _mark_events(top: Axes, bottom: Axes, course: Course, ends: Floats) -> None:
+    def cycles(times: list[float]) -> list[float]:
+        """At which cycle something happened, to within a stretch."""
+        return [float(at) for at in np.interp(times, [each.last for each in course.stretches], ends)]
+
     for kept, marker, colour, name in ((True, "^", GREEN, "retrained"), (False, "x", BAD, "retrain dropped")):
-        at = _cycles(course, ends, [each.time for each in course.retrains if each.report.accepted is kept])
-        if len(at):
-            look: dict[str, Any] = {"marker": marker, "color": colour, "label": f"{name} ({len(at)})"}
+        if at := cycles([each.time for each in course.retrains if each.report.accepted is kept]):
+            look: Look = {"marker": marker, "color": colour, "label": f"{name} ({len(at)})"}
             top.scatter(at, np.full(len(at), 2.5), s=26, zorder=3, clip_on=False, **look)
+    begun = [event.kind != SAFE_MODE_ENDED for event in course.modes]
+    safe = list(_safe_modes(begun, cycles([each.time for each in course.modes]), float(ends[-1])))
     for axes in (top, bottom):
-        for i, (begin, end) in enumerate(_safe_modes(course, ends)):
+        for i, (begin, end) in enumerate(safe):
             axes.axvspan(begin, end, color=ORANGE, alpha=0.25, linewidth=0, label="safe mode" if i == 0 else None)
         if course.last < ends[-1]:
             label = f"the last {course.last:,}"
             axes.axvspan(ends[-1] - course.last, ends[-1], color=SKY, alpha=0.15, linewidth=0, label=label, zorder=0)
 
 
-def _safe_modes(course: Course, ends: Floats) -> Iterator[tuple[float, float]]:
+def _safe_modes(begun: Sequence[bool], cycles: Sequence[float], last: float) -> Iterator[tuple[float, float]]:
     """From which cycle to which everything was verified; a safe mode that lasts ends with the newest cycle."""
-    began: float | None = None
-    for event, at in zip(course.modes, _cycles(course, ends, [each.time for each in course.modes]), strict=True):
-        if event.kind != SAFE_MODE_ENDED:
-            began = float(at) if began is None else began
-        elif began is not None:
-            yield began, float(at)
-            began = None
-    if began is not None:
-        yield began, float(ends[-1])
+    since: float | None = None
+    for begins, at in zip(begun, cycles, strict=True):
+        if begins:
+            since = at if since is None else since
+        elif since is not None:
+            yield since, at
+            since = None
+    if since is not None:
+        yield since, last
 
 
 def data_picture(data: Dataset, title: str = "") -> Figure:
@@ -554,49 +518,36 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
     Below: the share of good parts and each trace's mean, as recorded. Traces that are not finite are not drawn.
     """
-    X = as_traces(data.X)
+    X, y = as_traces(data.X), data.y
     shown = np.isfinite(X).all(axis=(1, 2))
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     names = data.channels or tuple(f"channel {i + 1}" if X.shape[1] > 1 else "trace" for i in range(X.shape[1]))
     time_s, unit = np.arange(X.shape[2]) / data.rate_hz, f" [{data.unit}]" if X.shape[1] == 1 else ""
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
-    tops = above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]
-    for i, axes in enumerate(tops):
-        plain(axes)
+    for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for label, name, colour, line, _ in KINDS:
-            some = X[shown & (data.y == label), i]  # (n, T)
+            some = X[shown & (y == label), i]  # (n, T)
             if len(some):
                 low, median, high = np.quantile(some, (0.1, 0.5, 0.9), axis=0)
                 axes.fill_between(time_s, low, high, color=colour, alpha=0.18, linewidth=0)
                 axes.plot(time_s, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
-        axes.set(xlabel="time [s]", ylabel=f"{names[i]}{unit}")
-    if shown.any():
-        legend_above(tops[0])
+        finish(axes, legend=3 if shown.any() and not i else 0, xlabel="time [s]", ylabel=f"{names[i]}{unit}")
     share, level = below.subplots(2, 1, sharex=True)
-    _draw_share(share, data.y)
-    _draw_levels(level, np.flatnonzero(shown) + 1, levels(X[shown, :1])[:, 0], data.y[shown])
-    level.set(xlabel="recording, in the order in which they were made", ylabel=f"mean {names[0]}{unit}")
-    return figure
-
-
-def _draw_share(axes: Axes, y: NDArray[np.int8]) -> None:
-    plain(axes)
     window = max(1, len(y) // 10)
-    x, good = np.arange(1, len(y) + 1), 100 * sliding_mean(y, window)
-    full = x >= window  # a share of the first few jumps
-    axes.plot(x[full], good[full], color=VERIFIED, label=f"good, of the last {window}")
-    axes.axhline(100 * y.mean(), label="good, of all", **LIMIT)
-    axes.set(ylim=(0, 104), ylabel="share [%]")
-    legend_above(axes)
-
-
-def _draw_levels(axes: Axes, x: NDArray[Any], level: Floats, y: NDArray[np.int8]) -> None:
-    plain(axes)
+    full = numbers(len(y)) >= window  # a share of the first few jumps
+    share.plot(
+        numbers(len(y))[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}"
+    )
+    share.axhline(100 * y.mean(), label="good, of all", **LIMIT)
+    finish(share, ylim=(0, 104), ylabel="share [%]")
+    x, means = np.flatnonzero(shown) + 1, levels(X[shown, :1])[:, 0]
     for label, name, colour, _, _ in KINDS:
-        axes.scatter(x[y == label], level[y == label], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
-    window = max(1, len(level) // 10)
-    if len(level) >= window:
-        middle = np.median(np.lib.stride_tricks.sliding_window_view(level, window), axis=1)
-        axes.plot(x[window - 1 :], middle, color=BLACK, linewidth=1.2, label=f"median of the last {window}")
-    legend_above(axes)
+        some = y[shown] == label
+        level.scatter(x[some], means[some], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
+    window = max(1, len(means) // 10)
+    if len(means) >= window:
+        middle = np.median(np.lib.stride_tricks.sliding_window_view(means, window), axis=1)
+        level.plot(x[window - 1 :], middle, color=BLACK, linewidth=1.2, label=f"median of the last {window}")
+    finish(level, xlabel="recording, in the order in which they were made", ylabel=f"mean {names[0]}{unit}")
+    return figure

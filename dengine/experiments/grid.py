@@ -36,6 +36,7 @@ from ..records import RetrainReport
 from ..reducers import reducer_class
 from .replay import Contender, Replay, replay
 from .rivals import require
+from .tables import frame_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,8 +44,6 @@ if TYPE_CHECKING:
 Folder = str | os.PathLike[str]
 OnDone = Callable[[Replay], None] | None
 TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
-# What of a replay is no array, beside its recipe.
-ABOUT = ("name", "dataset", "seed", "confirm", "seconds")
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
 DAMAGED = (  # what reading a damaged file ends in, by where the damage is
     OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError
@@ -63,12 +62,11 @@ class Task:
 
     @property
     def description(self) -> str:
-        """All that its decisions depend on beside the data."""
+        """All that its decisions depend on beside the data and the code; SettingError for a reducer that can't be told."""
         who, reducer = self.contender, self.contender.recipe.reducer
         own = {"seed": self.seed, "cycles": self.cycles, "shuffle": self.shuffle, "confirm": self.confirm}
         handed_in = "" if isinstance(reducer, str) else f"\n{described(reducer)}\n{_digest_of_reducer(reducer)}"
-        rival = f"{who.rival} {sorted(who.params.items())}"
-        return f"{who.recipe.to_toml()}{handed_in}\n{rival}\n{json.dumps(own)}"
+        return f"{who.recipe.to_toml()}{handed_in}\n{who.rival} {sorted(who.params.items())}\n{json.dumps(own)}"
 
 
 class KeptReplays:
@@ -81,15 +79,12 @@ class KeptReplays:
         for array in (data.X, data.y, data.part):
             digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
         self._of_data = digest.hexdigest()
-        self._own: dict[Any, str] = {}  # read once: a file that changes while a grid is played is not what was imported
 
     def path(self, task: Task) -> Path:
         """Where the replay of a task is kept: its name changes with the text of the files that a reducer stands in."""
         own = task.contender.recipe.reducer
-        parts: list[Any] = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
-        self._own |= {part: _source_of(part) for part in parts if part not in self._own}
-        source = "".join(self._own[part] for part in parts)
-        said = f"{self._of_data}\n{_digest_of_source()}\n{source}\n{task.description}"
+        source = map(_source_of, [reducer_class(own)] if isinstance(own, str) else _parts_of(own))
+        said = "\n".join([self._of_data, _digest_of_source(), *source, task.description])
         return self.folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
 
     def get(self, task: Task) -> Replay | None:
@@ -107,9 +102,10 @@ class KeptReplays:
 
     def put(self, task: Task, replay: Replay) -> None:
         """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
-        values = {f.name: getattr(replay, f.name) for f in fields(replay)}
-        about = {name: values[name] for name in ABOUT} | {"retrains": [asdict(each) for each in replay.retrains]}
+        values = {each.name: getattr(replay, each.name) for each in fields(replay)}
         arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        about = {name: value for name, value in values.items() if name not in arrays and name != "recipe"}
+        about["retrains"] = [asdict(each) for each in replay.retrains]
         partial = self.folder / f".{uuid4().hex}.partial"
         try:
             with partial.open("xb") as file:
@@ -129,6 +125,7 @@ def _digest_of_source() -> str:
     return digest.hexdigest()
 
 
+@cache  # a file that changes while a grid is played is not what was imported
 def _source_of(part: Any) -> str:
     try:
         return Path(getsourcefile(part) or "").read_text(encoding="utf-8")
@@ -159,28 +156,22 @@ def _digest_of_reducer(reducer: Any) -> str:
 def contenders(asked: Sequence[Any]) -> list[Contender]:
     """Each as it was asked for; equal names are followed by the settings in which they differ, but those in `TOLD_APART`.
 
-    Transformers whose settings read alike, as two functions of one name, are numbered. SettingError where two are equal.
+    SettingError where two are equal; of transformers also where their settings read alike.
     """
     loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
-    named = [_told_apart(one, [other for other in loaded if other.name == one.name and other is not one]) for one in loaded]
-    held: dict[str, list[int]] = {}  # the transformers behind each name
-    for one in named:
-        if not isinstance(one.recipe.reducer, str) and id(one.recipe.reducer) not in held.setdefault(one.name, []):
-            held[one.name].append(id(one.recipe.reducer))
-    return [
-        replace(one, name=f"{one.name} {1 + held[one.name].index(id(one.recipe.reducer))}")
-        if len(held.get(one.name, ())) > 1 and not isinstance(one.recipe.reducer, str)
-        else one
-        for one in named
-    ]
+    return [_told_apart(one, [other for other in loaded if other.name == one.name and other is not one]) for one in loaded]
 
 
 def _told_apart(one: Contender, others: Sequence[Contender]) -> Contender:
     """Named by the settings in which it differs from others of its name."""
-    if one in others:
-        raise SettingError(f"Expected each to be asked for once, got {one.name} twice with the same settings.")
     own, theirs = _flat(one), [_flat(other) for other in others]
+    policies = [each.recipe.policy for each in (one, *others)]
     differing = [key for key in own if any(other.get(key) != own[key] for other in theirs)]
+    if any(other == own and policy == policies[0] for other, policy in zip(theirs, policies[1:], strict=True)):
+        raise SettingError(
+            f"Expected each to be asked for once, got {one.name} twice with the same settings; tell them apart by "
+            "Contender(name, recipe)."
+        )
     return replace(one, name=" ".join([one.name, *(f"{key}={own[key]}" for key in differing)]))
 
 
@@ -237,24 +228,6 @@ def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay
     return i, replay(data, task.contender, task.seed, task.cycles, **options)
 
 
-def run_replays(
-    dataset: Any,
-    recipes: Sequence[Any],
-    seeds: Iterable[int],
-    cycles: int | None = None,
-    *,
-    shuffle: bool = True,
-    confirm: bool = False,
-    n_jobs: int = 1,
-    keep: Folder | None = None,
-    on_done: OnDone = None,
-) -> list[Replay]:
-    """Every recipe under every seed, in parallel; a list in that order. The rest as in `replay` and `iterate_replays`."""
-    pairs = itertools.product([Contender.load(r) for r in recipes], seeds)
-    tasks = [Task(who, seed, cycles, shuffle, confirm) for who, seed in pairs]
-    return play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done)
-
-
 def run_grid(
     dataset: Any,
     recipes: Sequence[Any],
@@ -278,13 +251,9 @@ def run_grid(
     confirms : whether accepted good parts are confirmed; False is the paper's feedback, stops alone.
     Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
     """
-    import pandas as pd
-
-    tasks = grid_tasks(
-        recipes, alphas, lower_bounds, intervals, range(first_seed, first_seed + repeats), guarantees, confirms, cycles
-    )
-    replays = play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done)
-    return pd.DataFrame([one.summary() for one in replays])
+    seeds = range(first_seed, first_seed + repeats)
+    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, seeds, guarantees, confirms, cycles)
+    return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done))
 
 
 def grid_tasks(

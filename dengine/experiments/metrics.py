@@ -1,4 +1,4 @@
-"""What a replay's decisions were worth: rates of what was decided, errors of many replays with an interval, costs.
+"""What a replay's decisions were worth: errors of many replays with an interval, and costs.
 
 >>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, the share of bad ones
 """
@@ -8,37 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..decision.intervals import wilson_interval
 from ..errors import SettingError, shortened
 from ..records import is_number
 
-SIDES = ("accepted", "rejected")
+SIDES = {"accepted": "false_positive", "rejected": "false_negative"}  # and which of them are wrong
 VERIFY_SECONDS = 5.0  # what a height check costs a cycle, in the paper's cell
 CYCLE_SECONDS = 47.5  # the paper: an insertion takes 45 to 50 s; a good part that was rejected takes one more
 STOP_SECONDS = 120.0  # a system stop, operator included: of the simulated cell, the paper gives none
-
-
-def decided_rates(accepted: NDArray[np.bool_], rejected: NDArray[np.bool_], truth: NDArray[np.bool_]) -> dict[str, float]:
-    """precision, npv, accuracy of the parts that were decided without a check; NaN where there are none.
-
-    accepted, rejected, truth : (n,) of every cycle. precision is the share of the accepted parts that were good, npv the
-    share of the rejected ones that were bad. Computed by torchmetrics.
-    """
-    import torch
-    from torchmetrics.functional.classification import binary_accuracy, binary_negative_predictive_value, binary_precision
-
-    certain = accepted | rejected
-    predicted, target = (torch.from_numpy(np.ascontiguousarray(a[certain])).int() for a in (accepted, truth))
-    of = {"precision": accepted, "npv": rejected, "accuracy": certain}
-    metrics = {"precision": binary_precision, "npv": binary_negative_predictive_value, "accuracy": binary_accuracy}
-    return {
-        name: float(metric(predicted.double(), target)) if of[name].any() else math.nan for name, metric in metrics.items()
-    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,22 +37,7 @@ class ErrorRate:
     upper: float
 
 
-class Decided(Protocol):
-    """What is asked of a replay of n cycles: (n,) index of its traces in the data set, and masks of its decisions."""
-
-    @property
-    def index(self) -> NDArray[np.int64]: ...
-    @property
-    def accepted(self) -> NDArray[np.bool_]: ...
-    @property
-    def rejected(self) -> NDArray[np.bool_]: ...
-    @property
-    def false_positive(self) -> NDArray[np.bool_]: ...
-    @property
-    def false_negative(self) -> NDArray[np.bool_]: ...
-
-
-def pooled_error(replays: Sequence[Decided], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
+def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
     """Share of wrong ones among all parts that were accepted (or rejected), with an interval that is honest of shuffles.
 
     Thirty shuffles of one set play the same traces thirty times, so they are no thirty samples of the world. A trace is
@@ -79,29 +45,23 @@ def pooled_error(replays: Sequence[Decided], side: str = "accepted", alpha: floa
     the interval is Wilson's at the number of independent decisions that has this variance, at most the number of
     different traces where no decision was wrong. It speaks of other parts of the same kind, not of another cell.
 
-    side : "accepted" or "rejected"; SettingError for another.
+    replays : of one data set, each a `Replay`.  side : "accepted" or "rejected"; SettingError for another.
     """
     if side not in SIDES:
         raise SettingError(f"Expected side {' or '.join(SIDES)}, got {side!r}.")
     size = 1 + max((int(r.index.max()) for r in replays if len(r.index)), default=0)
-    decided, wrong = np.zeros(size), np.zeros(size)
-    for one in replays:
-        mask, bad = (one.accepted, one.false_positive) if side == "accepted" else (one.rejected, one.false_negative)
-        decided += np.bincount(one.index[mask], minlength=size)
-        wrong += np.bincount(one.index[bad], minlength=size)
+    decided, wrong = (  # (size,) of each trace
+        np.sum([np.zeros(size), *(np.bincount(r.index[getattr(r, name)], minlength=size) for r in replays)], axis=0)
+        for name in (side, SIDES[side])
+    )
     total, errors, traces = int(decided.sum()), int(wrong.sum()), int((decided > 0).sum())
     if not total:
         return ErrorRate(0, 0, 0, math.nan, 0.0, 1.0)
     rate = errors / total
-    lower, upper = wilson_interval(*_independent(decided, wrong, rate, traces), alpha)
-    return ErrorRate(total, errors, traces, rate, float(lower), float(upper))
-
-
-def _independent(decided: Any, wrong: Any, rate: float, traces: int) -> tuple[float, float]:
-    """(wrong, right) of so many independent decisions as vary like these do between traces."""
-    variance = traces / max(traces - 1, 1) * float(((wrong - rate * decided) ** 2).sum()) / float(decided.sum()) ** 2
+    variance = traces / max(traces - 1, 1) * float(((wrong - rate * decided) ** 2).sum()) / total**2
     n = rate * (1.0 - rate) / variance if variance > 0.0 and 0.0 < rate < 1.0 else float(traces)
-    return n * rate, n * (1.0 - rate)
+    lower, upper = wilson_interval(n * rate, n * (1.0 - rate), alpha)
+    return ErrorRate(total, errors, traces, rate, float(lower), float(upper))
 
 
 @dataclass(frozen=True, slots=True)

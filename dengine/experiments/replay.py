@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from ..cells.base import Cell
 from ..cells.replay import ReplayCell
-from ..datasets import Dataset, load_dataset
+from ..datasets import load_dataset
 from ..engine.engine import DataEngine
 from ..errors import SettingError
 from ..recipe import RECIPES, Recipe
 from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
-from .metrics import Costs, decided_rates
+from .metrics import Costs
 from .rivals import RIVALS, make_rival
 
 if TYPE_CHECKING:
@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-COLUMNS = (  # of a run as a frame
-    "action", "reason", "truth", "lower", "upper", "n_success", "n_failure", "stopped", "safe_mode", "version"
-)  # fmt: skip
+COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode")
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Contender:
         return DataEngine(recipe=self.recipe, model=rival, seed=seed, replaying=True)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Replay:
     """One run of a cell, a replay or a live one, of n finished cycles, which may be none.
 
@@ -119,6 +117,11 @@ class Replay:
     def __len__(self) -> int:
         return len(self.action)
 
+    def __repr__(self) -> str:
+        counts, where = self.stretch(), f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
+        told = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
+        return f"<Replay of {self.name or 'a run'}{where}: {len(self)} cycles, {told}>"
+
     @property
     def verified(self) -> Bools:
         """(n,) the part was checked."""
@@ -160,13 +163,13 @@ class Replay:
         return bool(np.isfinite(self.position).any())
 
     def to_frame(self) -> pd.DataFrame:
-        """A row a cycle, numbered from 1: what was decided, why, on what evidence, and what was true."""
+        """A row a cycle, numbered from 1, and a column each field of (n,); the position's are embedding_1, embedding_2 …"""
         import pandas as pd
 
-        columns = {name: getattr(self, name) for name in COLUMNS} | {"decide_us": 1e6 * self.decide_seconds}
+        known = {each.name: getattr(self, each.name) for each in fields(self)}
+        columns = {name: value for name, value in known.items() if isinstance(value, np.ndarray) and value.ndim == 1}
         columns |= {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
-        clock = {} if self.clock_s is None else {"clock_s": self.clock_s}
-        return pd.DataFrame(columns | clock, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
+        return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
     def stretches(self, n: int) -> list[dict[str, Any]]:
         """The run cut into at most n stretches of about equal length, each as in `stretch`."""
@@ -176,9 +179,7 @@ class Replay:
     def stretch(self, part: slice = slice(None)) -> dict[str, Any]:
         """Counts over some of the cycles; parts an hour where there is a clock."""
         begin, end, _ = part.indices(len(self))
-        names = ("verified", "accepted", "rejected", "false_positive", "false_negative", "stopped", "novel", "safe_mode")
-        counts = {name: int(getattr(self, name)[part].sum()) for name in names}
-        counts["stops"] = counts.pop("stopped")
+        counts = {name: int(getattr(self, name)[part].sum()) for name in COUNTED} | {"stops": int(self.stopped[part].sum())}
         share, rate = float("nan"), None
         if end > begin:
             share = counts["verified"] / (end - begin)
@@ -189,13 +190,12 @@ class Replay:
 
     def summary(self) -> dict[str, Any]:
         """One row of a table: counts over the whole stream; NaN where there is nothing to take a share or a time of."""
-        counts, policy = self.stretch(), self.recipe.policy
-        certain = counts["accepted"] + counts["rejected"]
-        wrong = {name: counts[name] for name in ("false_positive", "false_negative")}
-        retrain_s = np.array([each.seconds for each in self.retrains])
+        counts, policy, nan = self.stretch(), self.recipe.policy, float("nan")
+        accepted, rejected, *wrong = (counts[name] for name in COUNTED[1:5])
+        certain, retrain_s = accepted + rejected, np.array([each.seconds for each in self.retrains])
 
         def quantile(values: Floats, q: float) -> float:
-            return float(np.quantile(values, q)) if len(values) else float("nan")
+            return float(np.quantile(values, q)) if len(values) else nan
 
         return {
             "recipe": self.name,
@@ -204,20 +204,18 @@ class Replay:
             "seed": self.seed,
             "cycles": len(self),
             "certain": certain,
-            "first_certain": float(np.argmin(self.verified) + 1) if certain else float("nan"),  # counted from 1
-            "accepted": counts["accepted"],
-            "rejected": counts["rejected"],
-            **wrong,
-            **decided_rates(self.accepted, self.rejected, self.truth),
-            "novel": counts["novel"],
-            "safe_mode": counts["safe_mode"],
+            "first_certain": float(np.argmin(self.verified) + 1) if certain else nan,  # counted from 1
+            **{name: counts[name] for name in COUNTED[1:]},
+            "precision": 1.0 - wrong[0] / accepted if accepted else nan,
+            "npv": 1.0 - wrong[1] / rejected if rejected else nan,
+            "accuracy": 1.0 - sum(wrong) / certain if certain else nan,
             "retrains": len(self.retrains),
             "retrain_p50_s": quantile(retrain_s, 0.5),
             "retrain_max_s": quantile(retrain_s, 1.0),
             "decide_p50_us": 1e6 * quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * quantile(self.decide_seconds, 0.99),
             "saved_s": Costs().saved(certain),
-            "net_s": Costs().saved(certain, **wrong),
+            "net_s": Costs().saved(certain, *wrong),
             "seconds": self.seconds,
         }
 
@@ -305,38 +303,28 @@ def replay(
     """Play a data set through a fresh engine in memory: one shuffled pass, or its first `cycles`.
 
     dataset : anything `load_dataset` takes.
-    recipe : anything `Recipe.load` takes, the name of a rival method (`experiments.rivals.RIVALS`), or a `Contender`.
+    recipe : anything `Recipe.load` takes, the name of a rival method (`experiments.rivals.RIVALS`), a `Contender`, or a
+        fresh engine, by which a model of your own comes in.
     seed : of the shuffle and of the engine; the same seed gives the same decisions.
     shuffle : False plays the stream as it was recorded, drift and all.
     confirm : whether accepted good parts are confirmed by the cell; by default only stops are seen. With
         `Policy(stops="all")` the engine takes the silence after them for as much.
     on_cycle : called with the number of cycles done, for a progress bar.
     """
-    data, contender = load_dataset(dataset), Contender.load(recipe)
+    data, who = load_dataset(dataset), None if isinstance(recipe, DataEngine) else Contender.load(recipe)
     n = len(data) if cycles is None else cycles
     if not 1 <= n <= len(data):
         raise SettingError(f"Expected 1 to {len(data)} cycles from {data.name}, got {n}.")
-    order = np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data))
-    return collect(contender.engine(seed), ReplayCell(data, order[:n], confirm), data, seed, on_cycle, contender.name)
-
-
-def collect(
-    engine: DataEngine,
-    cell: ReplayCell,
-    data: Dataset,
-    seed: int,
-    on_cycle: Callable[[int], None] | None = None,
-    name: str | None = None,
-) -> Replay:
-    """Drive any engine over a replay cell and gather its cycles; a model of your own comes in through the engine."""
+    order = (np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data)))[:n]
+    engine: DataEngine = recipe if who is None else who.engine(seed)
     begin = time.perf_counter()
-    log = watch(engine, cell, len(cell.order), on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
+    log = watch(engine, ReplayCell(data, order, confirm), n, on_cycle and (lambda cycle: on_cycle(cycle.index + 1)))
     return replace(
         log,
         truth=log.truth.astype(np.bool_),
-        index=cell.order,
-        confirm=cell.confirm,
-        name=name or log.name,
+        index=order,
+        confirm=confirm,
+        name=log.name if who is None else who.name,
         dataset=data.name,
         seed=seed,
         seconds=time.perf_counter() - begin,

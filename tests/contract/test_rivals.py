@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from dengine import Action, DataEngine, Policy, Recipe, ReplayCell, load_dataset, wilson_interval
+from dengine import Action, DataEngine, Policy, Recipe, Replay, replay, wilson_interval
 from dengine.errors import SettingError
-from dengine.experiments.replay import Replay, collect
 from dengine.experiments.rivals import RIVALS, Rival, make_rival
 from dengine.experiments.rivals.base import Components, segment_means
 from dengine.experiments.rivals.bounded import (
@@ -289,11 +288,9 @@ def test_components_keep_their_proportions_or_are_whitened(traces: Any) -> None:
 # -------------------------------------------------------------------------------------------------------- in the loop
 
 
-def short_replay(rival: Rival, cycles: int = 150) -> Replay:
-    data = load_dataset("insertion")
-    order = np.random.default_rng(0).permutation(len(data))[:cycles]
+def short_replay(rival: Rival) -> Replay:
     engine = DataEngine.from_recipe(Recipe.load("conv"), model=rival, seed=0, replaying=True)
-    return collect(engine, ReplayCell(data, order), data, seed=0)
+    return replay("insertion", engine, cycles=150)
 
 
 @every_rival

@@ -10,8 +10,7 @@ import pytest
 from sklearn.base import clone
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, ReplayCell, WilsonRadiusClassifier, replay
-from dengine.experiments.replay import collect
+from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, WilsonRadiusClassifier, replay
 from dengine.recipe import RECIPES
 from dengine.reducers.base import as_points
 from dengine.reducers.cross_fitting import LabelFree
@@ -64,8 +63,7 @@ def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:
     reducer = LinearDiscriminantAnalysis() if honest else SeesEverything(LinearDiscriminantAnalysis())
     model = ModelPrediction(reducer, WilsonRadiusClassifier(0.3, POLICY.alpha, POLICY.lower_bound), folds=2)
     engine = DataEngine(recipe=Recipe("pca", policy=POLICY), model=model, seed=seed, replaying=True)
-    order = np.random.default_rng(seed).permutation(len(data))
-    return collect(engine, ReplayCell(data, order), data, seed)
+    return replay(data, engine, seed)
 
 
 def test_the_same_labels_counted_where_they_were_fitted_are_caught(make_data, proof_repeats: int) -> None:

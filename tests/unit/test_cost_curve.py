@@ -17,6 +17,7 @@ from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_
 from dengine.experiments.figures import cost_picture
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Replay, replay
+from tests.support.replays import replay_of
 
 COSTS = Costs(check=5, escape=100, false_reject=20)
 STRICT, LAX = Policy(0.05, 0.95), Policy(0.5, 0.8)
@@ -25,17 +26,12 @@ HOW = {"recipe": "pca", "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats"
 
 def played(policy: Policy, seed: int, verified: int, accepted: int, bad: int, rejected: int = 0, good: int = 0) -> Replay:
     """A replay with so many decisions of each kind, in that order, of which so many are wrong."""
-    action = np.array(["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected)
+    action = ["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected
     truth = np.ones(len(action), dtype=bool)
     truth[verified : verified + bad] = False
     truth[verified + accepted + good :] = False
-    n, never = len(action), np.zeros(len(action), dtype=bool)
-    return Replay(
-        action=action, truth=truth, index=np.random.default_rng(seed).permutation(n), name="pca", dataset="by hand",
-        recipe=Recipe("pca", policy=policy), seed=seed, lower=np.zeros(n), upper=np.ones(n), n_success=np.zeros(n, int),
-        n_failure=np.zeros(n, int), position=np.zeros((n, 2)), decide_seconds=np.zeros(n), stopped=never,
-        reason=np.full(n, "certain"), version=np.zeros(n, int), safe_mode=never,
-    )  # fmt: skip
+    index = np.random.default_rng(seed).permutation(len(action))
+    return replay_of(action, truth, index=index, recipe=Recipe("pca", policy=policy), seed=seed)
 
 
 def curve(lax: Sequence[tuple[int, int]], strict: Sequence[tuple[int, int]] = ((100, 0),) * 4) -> CostCurve:

@@ -18,40 +18,18 @@ from dengine.cells.simulation.conditions import first_change
 from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
 from dengine.experiments.replay import Replay, RunRecorder
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line
+from tests.support.replays import replay_of as by_hand
 
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
-def evidence(n: int, seed: int = 0) -> dict[str, Any]:
-    """What a picture of decisions does not look at, and where the parts lie."""
-    zeros = np.zeros(n, dtype=np.int64)
-    position = np.random.default_rng(seed).normal(size=(n, 2))
-    took = np.full(n, 1e-4)
-    never = np.zeros(n, dtype=bool)
-    return {"lower": np.zeros(n), "upper": np.ones(n), "n_success": zeros, "n_failure": zeros} | {
-        "position": position,
-        "decide_seconds": took,
-        "reason": np.full(n, "uncertain"),
-        "version": zeros,
-        "safe_mode": never,
-    }
+RETRAINS = tuple(RetrainReport(i, seconds, 50, 0, True, "") for i, seconds in enumerate((0.1, 0.3)))
 
 
-def replay_of(
-    action: list[str], truth: list[int], seed: int = 0, recipe: Recipe = RECIPE, name: str | None = None
-) -> Replay:
-    return Replay(
-        name=recipe.name if name is None else name,
-        recipe=recipe,
-        dataset="by hand",
-        index=np.arange(len(action)),
-        seed=seed,
-        action=np.array(action),
-        truth=np.array(truth, dtype=bool),
-        stopped=(np.array(action) == "accept") & ~np.array(truth, dtype=bool),
-        retrains=tuple(RetrainReport(i, seconds, 50, 0, True, "") for i, seconds in enumerate((0.1, 0.3))),
-        **evidence(len(action), seed),
-    )
+def replay_of(action: list[str], truth: list[int], recipe: Recipe = RECIPE, **known: Any) -> Replay:
+    good = np.array(truth, dtype=bool)
+    stopped = (np.array(action) == "accept") & ~good
+    return by_hand(action, good, recipe=recipe, name=recipe.name, stopped=stopped, retrains=RETRAINS, **known)
 
 
 MANY_RIGHT = replay_of(["accept"] * 300, [1] * 290 + [0] * 10)
@@ -174,9 +152,9 @@ def test_a_ball_that_grows_has_no_radius_to_draw() -> None:
 
 
 def log_of(clock_s: np.ndarray | None) -> Replay:
-    action = np.array(["verify"] * 60 + ["accept"] * 30 + ["reject"] * 10)
-    truth = np.array([1.0] * 59 + [0.0] + [1.0] * 29 + [0.0] + [0.0] * 9 + [1.0])
-    return Replay(action=action, truth=truth, stopped=np.arange(100) == 89, clock_s=clock_s, **evidence(100))
+    truth = [1.0] * 59 + [0.0] + [1.0] * 29 + [0.0] + [0.0] * 9 + [1.0]
+    action = ["verify"] * 60 + ["accept"] * 30 + ["reject"] * 10
+    return by_hand(action, truth, stopped=np.arange(100) == 89, clock_s=clock_s)
 
 
 def test_a_run_is_summed_up_by_stretches_that_add_up() -> None:
@@ -196,8 +174,7 @@ def test_a_cell_without_a_clock_has_no_rate_and_one_panel_less() -> None:
 
 
 def test_a_run_that_verified_every_part_lies_on_its_own_baseline() -> None:
-    clock_s, never = 52.0 * np.arange(1, 51), np.zeros(50, dtype=bool)
-    log = Replay(action=np.array(["verify"] * 50), truth=np.ones(50), stopped=never, clock_s=clock_s, **evidence(50))
+    log = by_hand(["verify"] * 50, np.ones(50), clock_s=52.0 * np.arange(1, 51))
     run, baseline = run_picture(log).axes[2].lines
     np.testing.assert_allclose(run.get_ydata(), baseline.get_ydata())
 

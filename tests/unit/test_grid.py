@@ -5,8 +5,8 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
-from importlib import import_module
+from dataclasses import replace
+from importlib import import_module, reload
 from pathlib import Path
 
 import joblib
@@ -17,26 +17,18 @@ from sklearn.decomposition import PCA
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from dengine import Dataset, Policy, Recipe, Replay, replay, run_grid
+from dengine import Dataset, Policy, Recipe, replay, run_grid
 from dengine.cli import main
 from dengine.errors import SettingError
 from dengine.experiments.grid import KeptReplays, Task, contenders, grid_tasks, iterate_replays
 from dengine.experiments.replay import Contender
 from dengine.experiments.rivals import RIVALS
 from dengine.recipe import RECIPES
+from tests.support.replays import same
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
-TIMES = ("decide_seconds", "retrains", "seconds")
 TIMED = ["retrain_p50_s", "retrain_max_s", "decide_p50_us", "decide_p99_us", "seconds"]
 GRID = {"alphas": (0.1, 0.5), "lower_bounds": (0.9,), "intervals": ("wilson", "binomial"), "repeats": 2, "cycles": 70}
-
-
-def same(one: Replay, other: Replay) -> None:
-    for f in fields(Replay):
-        if f.name not in TIMES:
-            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
-    for a, b in zip(one.retrains, other.retrains, strict=True):
-        assert replace(a, seconds=0.0) == replace(b, seconds=0.0)
 
 
 def decisions_of(frame):
@@ -83,12 +75,17 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
     module = tmp_path / f"own_reducer_of_test_grid_{within}.py"
     module.write_text(source, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
-    own = make_pipeline(StandardScaler(), import_module(module.stem).Own()) if within else f"{module.stem}:Own"
-    task, kept = Task(Contender.load(own), seed=1), KeptReplays(tmp_path / "kept", data)
-    before = kept.path(task)
+    loaded, kept = import_module(module.stem), KeptReplays(tmp_path / "kept", data)
+
+    def path() -> Path:
+        own = make_pipeline(StandardScaler(), loaded.Own()) if within else f"{module.stem}:Own"
+        return kept.path(Task(Contender.load(own), seed=1))
+
+    before = path()
     module.write_text(source + "    # changed\n", encoding="utf-8")
-    assert kept.path(task) == before  # what is being played is what was imported, not what the file says by now
-    assert KeptReplays(tmp_path / "kept", data).path(task) != before
+    assert path() == before  # what is being played is what was imported, not what the file says by now
+    reload(loaded)
+    assert path() != before
 
 
 def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
@@ -231,11 +228,12 @@ def test_two_recipes_are_named_by_the_settings_in_which_they_differ_and_have_no_
     assert set(RIVALS) & set(RECIPES) == set()
 
 
-def test_transformers_are_named_by_their_settings_and_numbered_where_these_read_alike() -> None:
+def test_transformers_are_named_by_their_settings_and_refused_where_these_read_alike() -> None:
     assert names([PCA(1), PCA(2)]) == ["PCA n_components=1", "PCA n_components=2"]
     absolute, root = (make_pipeline(FunctionTransformer(f), PCA(2)) for f in (np.abs, np.sqrt))
     assert len(set(names([absolute, root]))) == 2
-    assert len(set(names([PCA(2), PCA(2)]))) == 2
+    with pytest.raises(SettingError, match=r"PCA twice .*by Contender\(name, recipe\)"):
+        names([PCA(2), PCA(2)])
     one = Recipe(absolute)
     assert names([one, one.with_policy(stops="all")]) == ["Pipeline", "Pipeline"]
 

@@ -5,71 +5,53 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, precision_score
 
-from dengine import Recipe, wilson_interval
+from dengine import wilson_interval
 from dengine.errors import SettingError
-from dengine.experiments.metrics import Costs, decided_rates, pooled_error
-from dengine.experiments.replay import Replay
+from dengine.experiments.metrics import Costs, pooled_error
+from tests.support.replays import replay_of
 
 
-def played(action: np.ndarray, truth: np.ndarray, index: np.ndarray) -> Replay:
-    n = len(action)
-    return Replay(
-        action=action, truth=truth, index=index, name="a", recipe=Recipe("pca"), dataset="by hand", seed=0,
-        lower=np.zeros(n), upper=np.ones(n), n_success=np.zeros(n, int), n_failure=np.zeros(n, int),
-        position=np.zeros((n, 2)), decide_seconds=np.zeros(n), stopped=np.zeros(n, bool), reason=np.full(n, "certain"),
-        version=np.zeros(n, int), safe_mode=np.zeros(n, bool),
-    )  # fmt: skip
-
-
-@settings(deadline=None)  # torchmetrics is imported by the first
 @given(st.lists(st.tuples(st.sampled_from(["accept", "reject", "verify"]), st.booleans()), min_size=1, max_size=60))
 def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> None:
     action, truth = np.array([a for a, _ in cycles]), np.array([t for _, t in cycles])
-    accepted, rejected = action == "accept", action == "reject"
-    rates, certain = decided_rates(accepted, rejected, truth), accepted | rejected
-    if not certain.any():
-        assert all(math.isnan(rate) for rate in rates.values())
-        return
-    assert rates["accuracy"] == pytest.approx(accuracy_score(truth[certain], accepted[certain]))
+    accepted, certain = action == "accept", action != "verify"
+    found, expected = replay_of(action, truth).summary(), dict.fromkeys(("accuracy", "precision", "npv"), math.nan)
+    if certain.any():
+        expected["accuracy"] = accuracy_score(truth[certain], accepted[certain])
     if accepted.any():
-        assert rates["precision"] == pytest.approx(precision_score(truth[certain], accepted[certain]))
-    else:
-        assert math.isnan(rates["precision"])
-    if rejected.any():
-        assert rates["npv"] == pytest.approx(precision_score(~truth[certain], rejected[certain]))
-    else:
-        assert math.isnan(rates["npv"])
+        expected["precision"] = precision_score(truth[certain], accepted[certain])
+    if (action == "reject").any():
+        expected["npv"] = precision_score(~truth[certain], ~accepted[certain])
+    assert {name: found[name] for name in expected} == pytest.approx(expected, nan_ok=True)
+
+
+TWENTY = replay_of(["accept"] * 400, np.arange(400) % 20 != 0)
 
 
 def test_one_replay_of_different_traces_has_nearly_wilsons_interval() -> None:
-    truth = np.arange(400) % 20 != 0
-    error = pooled_error([played(np.full(400, "accept"), truth, np.arange(400))])
+    error = pooled_error([TWENTY])
     assert (error.decided, error.wrong, error.traces, error.rate) == (400, 20, 400, 0.05)
     assert (error.lower, error.upper) == pytest.approx(wilson_interval(20, 380), abs=1e-3)
 
 
 def test_shuffles_of_the_same_traces_make_the_interval_no_narrower() -> None:
-    truth = np.arange(400) % 20 != 0
-    one = played(np.full(400, "accept"), truth, np.arange(400))
-    once, often = pooled_error([one]), pooled_error([one] * 30)
+    once, often = pooled_error([TWENTY]), pooled_error([TWENTY] * 30)
     assert (often.rate, often.decided) == (once.rate, 30 * 400)
     assert (often.lower, often.upper) == pytest.approx((once.lower, once.upper), abs=1e-9)
 
 
 def test_no_error_leaves_what_as_many_different_traces_leave() -> None:
-    one = played(np.full(50, "accept"), np.ones(50, bool), np.arange(50))
-    error = pooled_error([one] * 30)
+    error = pooled_error([replay_of(["accept"] * 50, [True] * 50)] * 30)
     assert (error.rate, error.lower) == (0.0, 0.0)
     assert error.upper == pytest.approx(wilson_interval(0, 50)[1])
 
 
 def test_rejects_are_a_side_of_their_own() -> None:
-    truth = np.array([True, False, False, False])
-    one = played(np.array(["reject", "reject", "reject", "accept"]), truth, np.arange(4))
+    one = replay_of(["reject", "reject", "reject", "accept"], [True, False, False, False])
     assert pooled_error([one], "rejected").rate == pytest.approx(1 / 3)
     assert pooled_error([one]).rate == 1.0
     with pytest.raises(SettingError, match="accepted or rejected, got 'reject'"):
@@ -82,7 +64,7 @@ def test_the_interval_covers_the_true_share_of_other_parts() -> None:
     for _ in range(300):
         truth = rng.random(200) >= share
         orders = [rng.permutation(200) for _ in range(5)]
-        replays = [played(np.where(rng.random(200) < 0.75, "accept", "verify"), truth[o], o) for o in orders]
+        replays = [replay_of(np.where(rng.random(200) < 0.75, "accept", "verify"), truth[o], index=o) for o in orders]
         error = pooled_error(replays)
         covered += error.lower <= share <= error.upper
     assert 0.95 - 3 * math.sqrt(0.05 * 0.95 / 300) <= covered / 300

@@ -1,7 +1,7 @@
 """Recorded streams through the same loop: exact under a seed, and counted right."""
 
 from contextlib import suppress
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,25 +10,15 @@ from sklearn.decomposition import PCA
 from dengine import DataEngine, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay, run_grid
 from dengine.errors import SettingError
 from dengine.experiments.replay import Contender, RunRecorder, watch
+from tests.support.replays import same
 
 RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
-TIMES = ("decide_seconds", "retrains", "seconds")
-
-
-def same(one: Replay, other: Replay) -> None:
-    for f in fields(Replay):
-        if f.name not in TIMES:
-            np.testing.assert_array_equal(getattr(one, f.name), getattr(other, f.name), err_msg=f.name)
-    for a, b in zip(one.retrains, other.retrains, strict=True):
-        assert replace(a, seconds=0.0) == replace(b, seconds=0.0)
+KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
 
 
 @pytest.fixture(scope="module")
 def played(data: Dataset) -> Replay:
     return replay(data, RECIPE, seed=1)
-
-
-KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
 
 
 @pytest.mark.parametrize("recipe", [RECIPE, RECIPE.with_policy(audit_rate=0.3), KNOWN], ids=["plain", "audited", "known"])
@@ -39,8 +29,7 @@ def test_a_seed_repeats_exactly(data: Dataset, recipe: Recipe) -> None:
 
 
 def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data: Dataset, played: Replay) -> None:
-    hurried = replay(data, replace(RECIPE, budget=1e-9), seed=1)
-    same(replace(hurried, recipe=RECIPE), played)
+    same(replay(data, replace(RECIPE, budget=1e-9), seed=1), played, "recipe")
 
 
 def test_a_stream_is_played_as_recorded_or_in_its_seeds_order(data: Dataset, played: Replay) -> None:
@@ -51,8 +40,10 @@ def test_a_stream_is_played_as_recorded_or_in_its_seeds_order(data: Dataset, pla
         np.testing.assert_array_equal(replay(data, RECIPE, seed, shuffle=False).truth, data.y.astype(bool))
 
 
-def test_fewer_cycles_are_the_beginning_of_the_same_pass(data: Dataset, played: Replay) -> None:
-    short = replay(data, RECIPE, seed=1, cycles=90)
+def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data: Dataset, played: Replay) -> None:
+    seen: list[int] = []
+    short = replay(data, RECIPE, seed=1, cycles=90, on_cycle=seen.append)
+    assert seen == list(range(1, 91))
     np.testing.assert_array_equal(short.action, played.action[:90])
     np.testing.assert_array_equal(short.lower, played.lower[:90])
     for cycles in (0, 201):
@@ -67,16 +58,17 @@ def test_actions_follow_from_the_recorded_bounds(played: Replay) -> None:
     np.testing.assert_allclose((played.lower, played.upper), (lower, upper), atol=1e-12)
 
 
-def test_the_summary_counts_what_happened(played: Replay) -> None:
+def test_the_summary_counts_what_happened_and_the_repr_says_it_in_a_line(played: Replay) -> None:
     row, pairs = played.summary(), list(zip(played.action, played.truth, strict=True))
     assert row["accepted"] == sum(a == "accept" for a, _ in pairs) > 50
     assert row["rejected"] == sum(a == "reject" for a, _ in pairs)
     assert row["certain"] == row["accepted"] + row["rejected"]
     assert row["false_positive"] == sum(a == "accept" and not y for a, y in pairs)
     assert row["false_negative"] == sum(a == "reject" and bool(y) for a, y in pairs)
-    assert row["precision"] == pytest.approx(1 - row["false_positive"] / row["accepted"])
     assert row["saved_s"] == 5.0 * row["certain"]
     assert (row["cycles"], row["seed"], row["retrains"]) == (200, 1, len(played.retrains))
+    assert f"200 cycles, {played.verified.sum()} verified, {row['accepted']} accepted" in repr(played)
+    assert len(repr(played)) < 160
 
 
 def test_what_was_never_decided_has_no_precision(data: Dataset) -> None:
@@ -85,22 +77,13 @@ def test_what_was_never_decided_has_no_precision(data: Dataset) -> None:
     assert np.isnan([row["precision"], row["npv"], row["retrain_max_s"]]).all()
 
 
-def test_confirmed_parts_are_learned_from(data: Dataset, played: Replay) -> None:
-    told = replay(data, RECIPE, seed=1, confirm=True)
-    assert told.n_success[-1] + told.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
-
-
-def test_progress_is_told_cycle_by_cycle(data: Dataset) -> None:
-    seen: list[int] = []
-    replay(data, RECIPE, cycles=20, on_cycle=seen.append)
-    assert seen == list(range(1, 21))
-
-
-def test_silence_counts_as_a_success_where_all_bad_parts_stop_the_system(data: Dataset, played: Replay) -> None:
-    local = replay(data, RECIPE.with_policy(stops="all"), seed=1)
+def test_parts_that_are_confirmed_or_not_stopped_where_all_bad_ones_are_are_learned_from(
+    data: Dataset, played: Replay
+) -> None:
     first = int(np.flatnonzero(played.accepted)[0])
-    np.testing.assert_array_equal(local.action[: first + 1], played.action[: first + 1])
-    assert local.n_success[-1] + local.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
+    for told in (replay(data, RECIPE, seed=1, confirm=True), replay(data, RECIPE.with_policy(stops="all"), seed=1)):
+        np.testing.assert_array_equal(told.action[: first + 1], played.action[: first + 1])
+        assert told.n_success[-1] + told.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
 
 
 def test_a_long_stretch_of_accepted_parts_retrains_as_any_other(make_data) -> None:
@@ -114,16 +97,12 @@ def test_a_long_stretch_of_accepted_parts_retrains_as_any_other(make_data) -> No
     assert sum(report.accepted for report in told.retrains) >= 320 // KNOWN.retrain_every - 1
 
 
-@pytest.fixture(scope="module")
-def changed(make_data) -> Replay:
+def test_novel_parts_and_the_safe_mode_are_in_the_record(make_data) -> None:
     """After 300 parts the force doubles and a wave comes upon it: the parts are others, their labels as before."""
     before, after = make_data(300, noise=0.2), make_data(300, seed=1, noise=0.2)
     X = 2.0 * after.X + 5.0 * np.sin(np.arange(after.X.shape[1])).astype(np.float32)
     stream = Dataset(np.concatenate([before.X, X]), np.concatenate([before.y, after.y]), "changed")
-    return replay(stream, KNOWN, shuffle=False)
-
-
-def test_novel_parts_and_the_safe_mode_are_in_the_record(changed: Replay) -> None:
+    changed = replay(stream, KNOWN, shuffle=False)
     assert changed.novel[:300].mean() < 0.05
     assert changed.novel[300:320].all()
     assert (changed.action[changed.novel] == "verify").all()
@@ -165,12 +144,11 @@ def order(data: Dataset) -> np.ndarray:
     return np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
 
 
-def test_a_live_run_and_a_replay_of_the_same_parts_keep_the_same_record(data: Dataset, played: Replay, order) -> None:
+def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: Dataset, played: Replay, order) -> None:
     log = watch(engine(), ReplayCell(data, order), 200)
-    for f in fields(Replay):
-        if f.name not in (*TIMES, "index", "dataset", "seed"):
-            np.testing.assert_array_equal(getattr(log, f.name), getattr(played, f.name), err_msg=f.name)
+    same(log, played, "index", "dataset", "seed")
     assert played.stretches(4) == log.stretches(4)
+    same(replay(data, engine(), seed=1), played)
 
 
 def test_what_a_cell_does_not_tell_stays_unknown(data: Dataset, played: Replay, order) -> None:
@@ -224,15 +202,11 @@ def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Datase
 
 def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:
     table = run_grid(data, [RECIPE], (0.1, 0.5), (0.8, 0.9), ("wilson", "binomial"), repeats=2, n_jobs=1, cycles=80)
-    keys = ["recipe", "interval", "alpha", "lower_bound", "seed"]
-    assert len(table) == 16
-    assert len(table.drop_duplicates(keys)) == 16
+    assert len(table) == len(table.drop_duplicates(["recipe", "interval", "alpha", "lower_bound", "seed"])) == 16
     assert set(table["seed"]) == {0, 1}
     row = table.query("interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9 and seed == 1").iloc[0]
     alone = replay(data, RECIPE, seed=1, cycles=80).summary()
-    assert {k: row[k] for k in ("certain", "accepted", "rejected")} == {
-        k: alone[k] for k in ("certain", "accepted", "rejected")
-    }
+    assert [row[name] for name in ("certain", "accepted")] == [alone[name] for name in ("certain", "accepted")]
 
 
 # ------------------------------------------------------------------------------------------------------ the cell
@@ -240,23 +214,16 @@ def test_a_grid_is_a_row_for_every_combination_and_seed(data: Dataset) -> None:
 
 def test_a_replay_cell_plays_its_order_and_says_when_all_is_played(data: Dataset) -> None:
     cell = ReplayCell(data, np.array([5, 3]))
-    np.testing.assert_array_equal(cell.insert(), data.X[5])
-    assert cell.verify() == bool(data.y[5])
-    np.testing.assert_array_equal(cell.insert(), data.X[3])
+    for i in (5, 3):
+        np.testing.assert_array_equal(cell.insert(), data.X[i])
+        assert cell.verify() == bool(data.y[i])
     with pytest.raises(IndexError, match="has 2 cycles, and all were played"):
         cell.insert()
 
 
-@pytest.mark.parametrize(
-    ("label", "confirm", "outcome"),
-    [
-        (0, False, Outcome.STOPPED),
-        (0, True, Outcome.STOPPED),
-        (1, False, Outcome.UNKNOWN),
-        (1, True, Outcome.CONFIRMED),
-    ],
-)
-def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(label, confirm, outcome, data) -> None:
-    cell = ReplayCell(data, np.flatnonzero(data.y == label), confirm)
-    cell.insert()
-    assert cell.proceed() is outcome
+@pytest.mark.parametrize("confirm", [False, True])
+def test_after_an_accept_a_failure_stops_and_a_success_is_silent_unless_confirmed(data: Dataset, confirm: bool) -> None:
+    for label, outcome in ((0, Outcome.STOPPED), (1, Outcome.CONFIRMED if confirm else Outcome.UNKNOWN)):
+        cell = ReplayCell(data, np.flatnonzero(data.y == label), confirm)
+        cell.insert()
+        assert cell.proceed() is outcome

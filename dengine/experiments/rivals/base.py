@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...decision.policy import Policy
 from ...errors import SettingError
-from ...records import ACTIONS, Action
+from ...records import ACTIONS, Action, is_number, is_whole
+from ...traces import as_traces
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -34,11 +35,6 @@ class Judgement:
     def without_counts(cls, action: NDArray[Any], lower: Floats, upper: Floats) -> Judgement:
         """Of a method that counts nothing."""
         return cls(action, lower, upper, *np.zeros((2, len(lower)), dtype=np.int64))
-
-    @classmethod
-    def same(cls, n: int, action: Action) -> Judgement:
-        """One action for n traces, without any evidence."""
-        return cls.without_counts(np.array([action] * n, dtype=object), np.zeros(n), np.ones(n))
 
 
 class Rival(ABC):
@@ -100,7 +96,7 @@ class Rival(ABC):
         traces = as_traces(X)
         key = traces.tobytes()
         if self._last is None or self._last[0] != key:
-            self._last = key, self._judge(traces) if self.ready else Judgement.same(len(traces), Action.VERIFY)
+            self._last = key, self._judge(traces) if self.ready else same_action(len(traces), Action.VERIFY)
         return self._last[1]
 
     @abstractmethod
@@ -137,17 +133,14 @@ def actions_of(accept: Labels, reject: Labels) -> NDArray[Any]:
     return np.array([ACTIONS[i] for i in position], dtype=object)
 
 
-def as_traces(X: ArrayLike) -> Traces:
-    """X as contiguous float32 (n, C, T); SettingError for another shape."""
-    traces = np.ascontiguousarray(X, dtype=np.float32)
-    if traces.ndim != 3:
-        raise SettingError(f"Expected traces of shape (n, C, T), got {traces.shape}; X[:, None, :] makes one channel.")
-    return traces
+def same_action(n: int, action: Action) -> Judgement:
+    """One action for n traces, without any evidence."""
+    return Judgement.without_counts(np.array([action] * n, dtype=object), np.zeros(n), np.ones(n))
 
 
 def positive(name: str, value: Any, *, below: float = np.inf) -> Any:
     """The value, where it is a number above 0 and below a limit; SettingError else."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < below:
+    if not (is_number(value) and 0 < value < below):
         limit = "" if below == np.inf else f" and below {below:g}"
         raise SettingError(f"Expected {name} to be a number above 0{limit}, got {value!r}.")
     return value
@@ -155,9 +148,9 @@ def positive(name: str, value: Any, *, below: float = np.inf) -> Any:
 
 def whole(name: str, value: Any, least: int = 1) -> int:
     """The value, where it is an integer of at least `least`; SettingError else."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+    if not is_whole(value, least, 2**31):
         raise SettingError(f"Expected {name} to be an integer of at least {least}, got {value!r}.")
-    return value
+    return int(value)
 
 
 class Components:
@@ -172,12 +165,10 @@ class Components:
         self.n_components, self.whiten = n_components, whiten
         self._pca = PcaReducer(n_components=n_components, random_state=seed)
 
-    def can_fit(self, X: Traces) -> bool:
-        """Whether traces (n, C, T) are enough."""
-        return len(X) > self.n_components and X[0].size >= self.n_components
-
-    def fit(self, X: Traces) -> Floats:
-        """Find the components of traces (n, C, T); returns these traces as (n, d)."""
+    def fit(self, X: Traces) -> Floats | None:
+        """Find the components of traces (n, C, T); returns these traces as (n, d), None where they are too few."""
+        if len(X) <= self.n_components or X[0].size < self.n_components:
+            return None
         placed = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
         deviation = placed.std(axis=0)
         scale = deviation if self.whiten else np.full_like(deviation, deviation[0])
@@ -197,29 +188,16 @@ def segment_means(X: Traces, segments: int) -> Floats:
     return np.asarray((sums / np.diff(np.append(starts, samples))).reshape(n, channels * len(starts)))
 
 
+@dataclass
 class References:
-    """Labelled points (n, d) to which one more can be added at little cost: the room doubles when it is used up."""
+    """Labelled points (n, d), to which more can be added."""
 
-    def __init__(self, points: Floats, good: Labels) -> None:
-        self._points, self._good, self._size = points.copy(), good.copy(), len(good)
-
-    @property
-    def points(self) -> Floats:
-        """(n, d)."""
-        return self._points[: self._size]
-
-    @property
-    def good(self) -> Labels:
-        """(n,)."""
-        return self._good[: self._size]
+    points: Floats
+    good: Labels
 
     def add(self, point: Floats, good: bool) -> None:
         """One more point (1, d)."""
-        if self._size == len(self._good):
-            self._points = np.concatenate([self._points, np.empty_like(self._points)])
-            self._good = np.concatenate([self._good, np.empty_like(self._good)])
-        self._points[self._size], self._good[self._size] = point[0], good
-        self._size += 1
+        self.points, self.good = np.concatenate([self.points, point]), np.append(self.good, good)
 
 
 def squared_distances(Z: Floats, points: Floats) -> Floats:

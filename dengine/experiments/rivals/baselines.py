@@ -19,6 +19,7 @@ from .base import (
     ThresholdRival,
     Traces,
     actions_of,
+    same_action,
     segment_means,
     squared_distances,
     whole,
@@ -39,7 +40,7 @@ class Constant(Rival):
         return True
 
     def _judge(self, X: Traces) -> Judgement:
-        return Judgement.same(len(X), self.action)
+        return same_action(len(X), self.action)
 
 
 class AlwaysVerify(Constant):

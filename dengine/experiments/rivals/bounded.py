@@ -62,9 +62,8 @@ class WilsonKernelDensity(Rival):
         self._components = Components(DIMENSIONS, whiten=True, seed=seed)
 
     def _learn(self, X: Traces, good: Labels) -> bool:
-        if not self._components.can_fit(X):
+        if (Z := self._components.fit(X)) is None:
             return False
-        Z = self._components.fit(X)
         self._references = References(Z, good)
         self.bandwidth_ = self.bandwidth or chosen_bandwidth(Z[-MOST_CHOOSING:], good[-MOST_CHOOSING:], self.policy.alpha)
         return True
@@ -142,27 +141,22 @@ class GaussianProcess(Rival):
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
         newest, labels = X[-MOST_TRAINED:], good[-MOST_TRAINED:]
-        if not self._components.can_fit(newest) or len(np.unique(labels)) < 2:
+        if len(np.unique(labels)) < 2 or (Z := self._components.fit(newest)) is None:
             return False
         kernel = ConstantKernel(1.0, (0.1, self.amplitude**2)) * RBF(0.5, (0.01, 10.0))
         classifier = GaussianProcessClassifier(kernel, random_state=self.seed)
         with warnings.catch_warnings():  # it warns of an optimum at a limit, and the limit is meant
             warnings.filterwarnings("ignore", message="The optimal value found")
-            self._classifier = classifier.fit(self._components.fit(newest), labels)
+            self._classifier = classifier.fit(Z, labels)
         return True
 
     def _judge(self, X: Traces) -> Judgement:
+        from scipy.special import expit
+
         mean, variance = self._classifier.latent_mean_and_variance(self._components.transform(X))
-        lower, upper = credible_interval(mean, variance, self.policy.alpha)
+        half = normal_quantile(self.policy.alpha) * np.sqrt(np.maximum(variance, 0.0))
+        lower, upper = np.asarray(expit(mean - half)), np.asarray(expit(mean + half))
         return Judgement.without_counts(self.policy.actions(lower, upper), lower, upper)
-
-
-def credible_interval(mean: Floats, variance: Floats, alpha: float) -> tuple[Floats, Floats]:
-    """(lower, upper), each (n,), of a probability whose logit is normal with this mean and variance."""
-    from scipy.special import expit
-
-    half = normal_quantile(alpha) * np.sqrt(np.maximum(variance, 0.0))
-    return np.asarray(expit(mean - half)), np.asarray(expit(mean + half))
 
 
 def risk_bound(n_wrong: int, n: int, delta: float) -> float:
@@ -216,7 +210,8 @@ class HeldOutRival(ThresholdRival):
         self.holdout, self._classifier = positive("holdout", holdout, below=1.0), classifier
 
     def _learn(self, X: Traces, good: Labels) -> bool:
-        train, rest = held_out(len(X), self.holdout, self.seed)
+        order, size = np.random.default_rng(self.seed).permutation(len(X)), round(self.holdout * len(X))
+        train, rest = np.sort(order[size:]), np.sort(order[:size])  # at random, and blind to labels
         if X.shape[-1] < self.shortest or len(np.unique(good[train])) < 2 or not len(rest):
             return False
         self._classifier.fit(self._features(X[train]), good[train])
@@ -235,13 +230,6 @@ class HeldOutRival(ThresholdRival):
     @abstractmethod
     def _threshold(self, p: Floats, right: Labels) -> float:
         """From which p (m,) on a side is decided, with `right` (m,); infinity where nothing can be vouched for."""
-
-
-def held_out(n: int, share: float, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Positions of n traces to train on, and to hold out: a share of them, at random and blind to labels."""
-    order = np.random.default_rng(seed).permutation(n)
-    size = round(share * n)
-    return np.sort(order[size:]), np.sort(order[:size])
 
 
 class RocketSelective(HeldOutRival):
@@ -321,7 +309,7 @@ class ControlledRisk(HeldOutRival):
 
     def _threshold(self, p: Floats, right: Labels) -> float:
         controller = self._controller(
-            predict_function=_both_classes,
+            predict_function=lambda p: np.stack([1.0 - p, p], axis=1),  # computed before; in a classifier's form
             risk="precision",
             target_level=float(self.policy.lower_bound),
             confidence_level=1.0 - self.policy.alpha,
@@ -333,8 +321,3 @@ class ControlledRisk(HeldOutRival):
             controller.calibrate(p, right.astype(int))
         best: Any = controller.best_predict_param
         return np.inf if best is None else float(best)
-
-
-def _both_classes(p: Floats) -> Floats:
-    """(m,) -> (m, 2): probabilities that were computed before, in the form of a classifier's."""
-    return np.stack([1.0 - p, p], axis=1)
