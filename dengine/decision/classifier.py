@@ -95,14 +95,14 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return np.asarray(self.classes_[rates.argmax(axis=1)])
 
     def policy(self) -> Policy:
-        """The user's numbers among the settings; SettingError where one is out of range."""
+        """The user's numbers among the settings; SettingError where one of all is out of range."""
+        Neighbourhood(self.radius, self.fraction, self.reject_fraction)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
     def around(self, index: RadiusIndex, rule: DecisionRule | None = None) -> RadiusNeighbours:
         """What decides over the points of `index`, by these settings; `rule` in place of the policy's own."""
-        near = Neighbourhood(self.radius, self.fraction, self.reject_fraction)
         rule = rule or self.policy().rule()
-        return RadiusNeighbours(index.ring, rule, near.radius, near.fraction or 0.0, near.reject_fraction or 0.0)
+        return RadiusNeighbours(index.ring, rule, self.radius, self.fraction or 0.0, self.reject_fraction or 0.0)
 
     def _start(self, dim: int) -> None:
         self.index_ = RadiusIndex(dim, self.capacity)

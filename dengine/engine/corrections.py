@@ -165,7 +165,7 @@ class Corrections:
         data = {"old": asdict(old), "new": asdict(policy)}
         event = Change(kind, text, data, author, settings=settings.to_store())
         self._versions.set_policy(policy if anew else None, settings.evidence, event)
-        self._settings.now = settings
+        self._settings.change(settings)
         self._feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import uuid
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ class DecisionMaker:
         self._settings = settings
         if settings.now.trace is not None:
             self.agree_on(settings.now.trace)
-        self._run, self._count = uuid.uuid4().hex[:12], 0
+        self._run, self._count = uuid.uuid4().hex[:12], count(1)
 
     def agree_on(self, trace: TraceSpec) -> None:
         """Set the contract that the gate checks."""
@@ -54,19 +55,18 @@ class DecisionMaker:
         unasked: Reason | None = None,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """(C, T) of a part with this number -> what goes into the store.
+        """(C, T) of a part with this number -> what goes into the store; in any thread.
 
-        unasked : why the part is verified whatever the model says; None: it is asked.
+        unasked : why the part is verified whatever the model says; None: it is asked, where there is one.
         """
         fault, content = self._gate(torch.from_numpy(x))
         hash_ = own_hash(content, part)
         reason = REASONS[fault] if fault else unasked
         said = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
-        certain, rate = said.action is not Action.VERIFY, self._settings.now.recipe.policy.audited_share
+        certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
         audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
-        self._count += 1
         decision = Decision(
-            id=decision_id or f"{self._run}-{self._count}",
+            id=decision_id or f"{self._run}-{next(self._count)}",
             action=Action.VERIFY if audit else said.action,
             predicted=said.action,
             lower=said.lower,
@@ -82,20 +82,12 @@ class DecisionMaker:
         )
         return StoredDecision(decision, x, hash_, bool(fault))
 
-    def unasked(
-        self, x: NDArray[np.float32], part: str | None, version: int, reason: Reason, decision_id: str
-    ) -> StoredDecision:
-        """(C, T) that is verified whatever the model says, for this reason or for what is wrong with it; in any thread."""
-        fault, content = self._gate(torch.from_numpy(x))
-        decision = unasked(decision_id, part, version, REASONS[fault] if fault else reason)
-        return StoredDecision(decision, x, own_hash(content, part), bool(fault))
-
-    def lost_accept(self, x: NDArray[np.float32], part: str | None, decision_id: str, version: int) -> StoredDecision:
+    def lost_accept(self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str) -> StoredDecision:
         """The decision behind a system stop whose own row was lost: an accept without a check, on no known evidence."""
-        fault, content = self._gate(torch.from_numpy(x))
-        rate = self._settings.now.recipe.policy.audited_share
-        decision = unasked(decision_id, part, version, Reason.CERTAIN, Action.ACCEPT, rate)
-        return StoredDecision(decision, x, own_hash(content, part), bool(fault))
+        item, accept = self.decide(x, part, None, version, None, decision_id), Action.ACCEPT
+        rate = self._settings.audited_share
+        made = replace(item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate)
+        return replace(item, decision=made)
 
 
 def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
@@ -129,16 +121,10 @@ def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) ->
     return known.decision
 
 
-def unasked(
-    decision_id: str,
-    part: str | None,
-    version: int,
-    reason: Reason,
-    action: Action = Action.VERIFY,
-    propensity: float = 1.0,
-) -> Decision:
+def unasked(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
     """A decision on which no model was asked."""
-    return Decision(decision_id, action, action, 0.0, 1.0, 0, 0, None, version, reason, False, propensity, part)
+    verify = Action.VERIFY
+    return Decision(decision_id, verify, verify, 0.0, 1.0, 0, 0, None, version, reason, False, 1.0, part)
 
 
 def as_part(part: Any) -> str | None:

@@ -267,7 +267,7 @@ class DataEngine:
                 return unasked(id_, number, self.version, Reason.LATE)
             reason = Reason.NO_STORE if self._outbox.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
-            known = self._record(self._maker.unasked(x, number, self.version, reason, id_))
+            known = self._record(self._maker.decide(x, number, None, self.version, reason, id_))
         self._outbox.secure()
         return decided_before(known, trace, self.trace)
 
@@ -294,7 +294,7 @@ class DataEngine:
             except StoreError:  # the cell's own first trace stands
                 log.exception("the product's contract of traces cannot be had")
             self._maker.agree_on(trace)
-            self._settings.now = replace(self._settings.now, trace=trace, inferred=inferred)
+            self._settings.change(replace(self._settings.now, trace=trace, inferred=inferred))
             self._settings.save()
         return self.trace or trace
 
@@ -331,7 +331,7 @@ class DataEngine:
                 f"Expected the id of a decision of this cell, got {decision_id!r}, which is unknown; "
                 "a system stop whose decision was lost can be reported with its trace."
             )
-        item = self._maker.lost_accept(self._as_trace(trace), as_part(part), decision_id, self.version)
+        item = self._maker.lost_accept(self._as_trace(trace), as_part(part), self.version, decision_id)
         return self._put(item)
 
     def retrain(self) -> RetrainReport:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.base import EngineModel, Told
+from ..model.base import EngineModel
 from ..store.base import Store
 from ..store.records import Correction, Evidence, ModelVersion, without_rule
 from .settings import EvidenceWindow
@@ -75,7 +75,7 @@ def refit(model: EngineModel, store: Store, trained_on: TrainedOn) -> bool:
     forgotten = sum(said.get(seq, True) is None for seq in trained_on.seq.tolist())  # not among them, and not damaged
     if kept.sum() + forgotten < len(trained_on.seq):
         return False
-    model.train(data.traces[kept], data.labels[kept], hashes=data.hashes[kept], numbers=data.seq[kept])
+    model.train(data.traces[kept], data.labels[kept], data.hashes[kept], numbers=data.seq[kept])
     return True
 
 
@@ -139,5 +139,6 @@ def tell_all(model: EngineModel, known: Evidence, evidence: EvidenceWindow) -> N
 def _tell(model: EngineModel, known: Evidence) -> None:
     if not model.remembers:
         return
-    for row in zip(known.lower, known.upper, known.success, known.novel, known.silent, strict=True):
-        model.tell_safely(Told(float(row[0]), float(row[1]), bool(row[2]), bool(row[3]), int(row[4])))
+    columns = (known.lower, known.upper, known.success, known.novel, known.silent)
+    for row in zip(*(column.tolist() for column in columns), strict=True):
+        model.tell_safely(*row)

@@ -180,13 +180,18 @@ def flat(recipe: Recipe) -> dict[str, Any]:
 class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
-    now : they themselves.  waiting : whether the store lacks them, and `save` is to be called again.
+    now : they themselves.  audited_share : of certain decisions that are verified all the same.
+    waiting : whether the store lacks them, and `save` is to be called again.
     """
 
     def __init__(self, settings: EngineSettings, outbox: Outbox) -> None:
-        self.now = settings
+        self.change(settings)
         self.waiting = False
         self._outbox = outbox
+
+    def change(self, settings: EngineSettings) -> None:
+        """Go on under others."""
+        self.now, self.audited_share = settings, settings.recipe.policy.audited_share
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""

@@ -237,7 +237,7 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
     try:
         if not len(data.seq):
             raise SettingError("there is no labelled trace yet; report one first")
-        report = successor.train(data.traces, data.labels, hashes=data.hashes, stop=stop, numbers=data.seq).report
+        report = successor.train(data.traces, data.labels, data.hashes, stop, data.seq).report
         n_steps, defect = report.n_steps, successor.defect()
         model = None if defect else successor
         reason = f"dropped: {defect}" if defect else "; ".join(filter(None, ("accepted", report.note)))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..errors import StoreError
-from ..model.base import EngineModel, Told
+from ..model.base import EngineModel
 from ..records import Reason, RetrainReport
 from ..reducers.base import State
 from ..store.base import Store
@@ -189,9 +189,9 @@ class ModelVersions:
 
     def learn(self, known: StoredDecision, success: bool, point: Point | None, silent: int) -> None:
         """Take in what became of a part: tell the rule, and make the trace a reference."""
-        novel = known.decision.reason is Reason.NOVEL
-        if known.decision.model_version >= self.evidence.since:
-            self.newest.tell_safely(Told(known.decision.lower, known.decision.upper, success, novel, silent))
+        made = known.decision
+        if made.model_version >= self.evidence.since:
+            self.newest.tell_safely(made.lower, made.upper, success, made.reason is Reason.NOVEL, silent)
         if point is not None:
             number = self._waiting[known.decision.id] = next(self._provisional)
             self.newest.add_safely(point, int(success), known.content_hash, number)

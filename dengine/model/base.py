@@ -42,21 +42,6 @@ class Prediction:
 NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, Reason.NO_MODEL)
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
-    """What became of a part.
-
-    lower, upper : the bound that it was decided by, before its label was known.  success : its label.
-    novel : whether it was like nothing learned from.  silent : accepted parts of unknown outcome since the last label.
-    """
-
-    lower: float
-    upper: float
-    success: bool
-    novel: bool = False
-    silent: int = 0
-
-
 @runtime_checkable
 class Model(Protocol):
     """What a rival method must give, and no more. X is (n, C, T) float32, y (n,) of 1 = success and 0 = failure."""
@@ -100,14 +85,13 @@ class EngineModel(ABC):
     @abstractmethod
     def train(
         self,
-        X: ArrayLike,
-        y: ArrayLike,
-        *,
-        hashes: Ints | None = None,
+        X: NDArray[np.float32],
+        y: NDArray[Any],
+        hashes: Ints,
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Self:
-        """Learn from traces (n, C, T), labels, content hashes and labels' numbers (n,), from where a training ended."""
+        """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
 
     def look_ahead(self, X: NDArray[np.float32]) -> int:
         """Begin with a training on traces (n, C, T) as far as no label is read; see `Reducer.look_ahead`."""
@@ -151,8 +135,14 @@ class EngineModel(ABC):
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
         """Be ready to answer at once, in the place of `previous`."""
 
-    def tell(self, told: Told) -> None:  # noqa: B027  # a default: nothing to learn
-        """What became of a part."""
+    def tell(  # noqa: B027  # a default: nothing to learn
+        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int
+    ) -> None:
+        """Learn what became of a part.
+
+        lower, upper : the bound that it was decided by, before its label was known.  success : its label.
+        novel : whether it was like nothing learned from.  unobserved : accepted parts of no known outcome since the last.
+        """
 
     def forget(self) -> None:  # noqa: B027  # a default: nothing was learned
         """Be as if nothing had been told."""
@@ -193,10 +183,10 @@ class EngineModel(ABC):
         """`look_ahead`, or nothing where it fails."""
         _guarded(lambda: self.look_ahead(X), 0, "the traces of the store could not be looked at ahead of a retrain")
 
-    def tell_safely(self, told: Told) -> None:
+    def tell_safely(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
         try:
-            self.tell(told)
+            self.tell(lower, upper, success, novel, unobserved)
         except Exception:
             self.untold = True
             log.exception("the rule cannot be told of a part; every part is verified until the engine is opened again")

@@ -29,7 +29,7 @@ from ..reducers import make_reducer, reducer_of
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, part, space_scale
 from ..reducers.cross_fitting import as_reducer
 from ..traces import as_traces
-from .base import Embedding, EngineModel, Exportable, Prediction, Told
+from .base import Embedding, EngineModel, Exportable, Prediction
 from .compiled import CompiledPredictor, compile_predictor
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -104,36 +104,34 @@ class ModelPrediction(EngineModel):
         return replace(own, note="; ".join(filter(None, (own.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer afresh, and make every trace a reference; arguments and errors as in `train`."""
+        """Train the reducer afresh, and make every trace a reference.
+
+        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
+        their content. Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
+        """
+        X, y = as_traces(X), as_labels(y)
         self.spaces = as_reducer(clone(self.reducer), self.folds)
-        return self.train(X, y, hashes=hashes)
+        return self.train(X, y, content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64))
 
     def train(
         self,
-        X: ArrayLike,
-        y: ArrayLike,
-        *,
-        hashes: Ints | None = None,
+        X: NDArray[np.float32],
+        y: NDArray[Any],
+        hashes: Ints,
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Self:
-        """Train the reducer, warm where it can be, and make every trace a reference.
-
-        X : (n, T) or (n, C, T); y : (n,) 1 = success, 0 = failure; hashes : (n,) `folds.own_hash` of each, or None: of
-        their content.  numbers : (n,) of the labels.
-        Raises SettingError where the reducer cannot be trained on this (one class only, too few traces).
-        """
-        X, y = as_traces(X), as_labels(y)
-        parts = content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64)
-        folds = fold_of(parts, self.n_spaces)
+        """Train the reducer, warm where it can be, and make every trace a reference."""
+        y = y.astype(np.int64)
+        folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop)
         self.trace_shape = X.shape[1:]
         own_unit = self.spaces.own_unit
         self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
-        self.index.add(points / self.scale[folds, None], y, folds, parts, numbers)
+        self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.weigh()
-        self._note = repeats_note(X, parts)
+        self._note = repeats_note(X, hashes)
         self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
         self._compiled = None  # built by `prepare`, or when it is asked
         return self
@@ -187,11 +185,10 @@ class ModelPrediction(EngineModel):
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
-    def tell(self, told: Told) -> None:
-        """Tell the rule what became of a part."""
+    def tell(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
         before = dict(self.rule.state_dict())
-        self.rule.observe(told.silent, told.novel)
-        self.rule.tell(told.lower, told.upper, told.success)
+        self.rule.observe(unobserved, novel)
+        self.rule.tell(lower, upper, success)
         for name, now in self.rule.state_dict().items():
             if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
                 before[name].copy_(now)
@@ -250,8 +247,8 @@ class ModelPrediction(EngineModel):
 
     def successor(self) -> ModelPrediction:
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
-        new = ModelPrediction(self.reducer, self.classifier, self.folds, self.rule, self.novelty)
-        new.spaces = copy.deepcopy(self.spaces)
+        new = copy.copy(self)
+        new.spaces, new._compiled, new._note = copy.deepcopy(self.spaces), None, ""
         return new
 
     def defect(self) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import copy
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..errors import SettingError, shortened
 from ..records import Action, Reason
@@ -32,7 +32,7 @@ class RivalAdapter(EngineModel):
         self.model = self.user_model = model
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
-    def train(self, X: ArrayLike, y: ArrayLike, **_: object) -> Self:
+    def train(self, X: NDArray[np.float32], y: NDArray[Any], *_: object, **__: object) -> Self:
         self.model.fit(X, y)
         return self
 

@@ -24,7 +24,8 @@ import torch
 from numpy.typing import NDArray
 
 from dengine import DataEngine, Dataset, ModelPrediction, Recipe, ReplayCell
-from dengine.folds import content_fold
+from dengine.folds import content_fold, content_hash
+from dengine.traces import as_traces
 
 FEWEST = 10  # neighbours: with fewer, z is far from normal
 RETRAINS = (100, 200, 400)  # labelled traces at each
@@ -72,7 +73,8 @@ def count_noise(recipe: Recipe, noise: Noise, seed: int) -> NDArray[np.float64]:
     queries = noise.X[-QUERIES:][~noise.easy[-QUERIES:]]
     found = []
     for n in RETRAINS:
-        model = model.successor().train(noise.X[:n], noise.y[:n])
+        X = as_traces(noise.X[:n])
+        model = model.successor().train(X, noise.y[:n], content_hash(X))
         n_success, n_failure = model.count(queries)
         found.append(squared_deviations(n_success, n_success + n_failure - _easy(model, noise.easy[:n], queries), noise.p))
     return np.concatenate(found)

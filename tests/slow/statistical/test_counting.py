@@ -18,7 +18,6 @@ from dengine import load_dataset
 from dengine.engine.versions import ModelVersions
 from dengine.folds import content_fold
 from dengine.model import neighbours as prediction
-from dengine.model.base import Told
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 from dengine.records import Reason
@@ -146,7 +145,7 @@ def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
         if self.answering is not None:
             now = self.answering.predict_one(known.trace)
             lower, upper = now.lower, now.upper
-        self.newest.tell_safely(Told(lower, upper, success, known.decision.reason is Reason.NOVEL, silent))
+        self.newest.tell_safely(lower, upper, success, known.decision.reason is Reason.NOVEL, silent)
         self.new_labels += 1
 
     patch.setattr(ModelVersions, "learn", learn)
