@@ -3,7 +3,8 @@
     python tests/golden/default.py tests/golden/default    # makes them anew; only where a change of decisions is meant
 
 Novelty is on, as nobody who names no recipe turns it off. Everything here goes through names that `dengine` itself
-exports, so that the same lines run before and after. Only decisions are kept, no store and no exported file: their forms may change, what they answer may not.
+exports, so that the same lines run before and after. Only decisions are kept, no store and no exported file: their forms
+may change, what they answer may not.
 """
 
 from __future__ import annotations
