@@ -309,7 +309,7 @@ def kill(times: int, folder: Path, seed: int, deadline: float | None, console: C
         if deadline is not None:
             running["crowd"] = begin(f"crowd({server.port})")
         running["client"] = begin(asking)
-        with progress("kills", 2 * times, not sys.stderr.isatty()) as advance:
+        with progress("kills", 2 * times) as advance:
             for victim in victims:
                 wait_for_more(file)
                 time.sleep(rng.uniform(0.0, LONGEST))

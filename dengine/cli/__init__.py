@@ -15,18 +15,16 @@ import click
 
 from .. import __version__
 from ..errors import DengineError, without_password
-from .correct import correct, forget, policy, retrain, rollback
-from .data import data, simulate
+from .data import data, simulate, train
 from .export import export
 from .history import explain, history
-from .options import example
+from .options import ends_in
 from .output import end_interrupted
 from .replay import compare, costs, replay
 from .run import run
 from .serve import serve
 from .status import status
-from .store import import_labels, verify
-from .train import train
+from .store import correct, forget, import_labels, policy, retrain, rollback, verify
 
 
 class Verbs(click.Group):
@@ -59,7 +57,7 @@ def _find_own_modules() -> None:
 @click.group(
     cls=Verbs,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=example("dengine replay --data insertion --reducer conv --repeats 3"),
+    epilog=ends_in("dengine replay --data insertion --reducer conv --repeats 3"),
 )
 @click.version_option(__version__, prog_name="dengine", message="%(prog)s %(version)s")
 def main() -> None:

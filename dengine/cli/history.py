@@ -5,28 +5,27 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..errors import percent
 from . import options
-from .options import Known, Naming
-from .output import duration, facts, show, when, write_json
+from .options import Known, verb
+from .output import Out, duration, facts, tell, when
 
 if TYPE_CHECKING:
-    from ..history.explain import Envelope, Excess, Explanation, Neighbour
+    from ..history.explain import Explanation, Neighbour
     from ..records import Decision
     from ..store.records import Event, StoredDecision
     from ..store.views import PastRetrain
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 WIDEST = 120  # columns
-SHORTEST = 5  # characters of a part's number that are shown
+SHORTEST = 12  # characters of a part's number that are shown, its last
 SHORT = "%y-%m-%d %H:%M:%S"
 MOST = 5  # excesses that are named
 
@@ -51,19 +50,17 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 MODEL = "Only what the model alone would have done so, as in an audit or in the shadow mode."
 
 
-@click.command(epilog=options.example("dengine history engine.db --last 20 --events"))
+@verb("dengine history engine.db --last 20 --events")
 @options.store_argument
-@options.cell_options()
 @click.option("--last", type=options.COUNT, default=50, show_default=True, help="The newest so many that are meant.")
 @click.option("--action", type=Known("action"), help="Only what was decided so.")
 @click.option("--model", "predicted", type=Known("action"), help=MODEL)
-@click.option("--reason", type=Known("reason"), cls=Naming, metavar="REASON", help="Only for this one: {reason}.")
+@click.option("--reason", type=Known("reason"), help="Only what was decided for this one.")
 @click.option("--label", type=Known("label"), help="Only what turned out so, or was never reported.")
 @click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
 @click.option("--until", type=Moment(), help="Only before then, likewise.")
 @click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
-@options.json_option
-def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
+def history(store: str, events: bool, **asked: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL that an engine remembers in. In the table good and bad are the labels that were counted, bound
@@ -72,20 +69,15 @@ def history(store: str, events: bool, as_json: bool, **asked: Any) -> None:
     """
     from ..history.status import beside, interleaved
     from ..history.status import history as read
+    from ..records import plain
     from ..store.base import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
         others = beside(opened, since, asked["until"]) if events else {}
-    if as_json:
-        from ..records import plain
-
-        decisions = [plain(past) | {"label": past.label} for past in found]
-        write_json({"verb": "history", "store": store, "decisions": decisions} | others)
-        return
-    for line in lines(list(interleaved(found, others))):
-        click.echo(line)
+    record = {"store": store, "decisions": [plain(past) | {"label": past.label} for past in found]} | others
+    tell(record, _table(interleaved(found, others)))
 
 
 def _bound(made: Decision) -> str:
@@ -100,7 +92,7 @@ def _label(past: StoredDecision) -> str:
 COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which side; and the title
     "<time (UTC)": lambda past: when(past.time, SHORT),
     "<decision": lambda past: past.decision.id,
-    "<part": lambda past: past.decision.part or "-",
+    "<part": lambda past: (past.decision.part or "-")[-SHORTEST:],
     "<action": lambda past: past.decision.action.value,
     "<model": lambda past: "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
     "<bound": lambda past: _bound(past.decision),
@@ -110,28 +102,23 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which 
     ">v": lambda past: str(past.decision.model_version),
     "<label": _label,
 }
-PART = list(COLUMNS).index("<part")
 
 
-def lines(happened: Sequence[StoredDecision | PastRetrain | Event]) -> list[str]:
-    """A table of at most WIDEST columns; retrains and events are lines of their own among the decisions."""
+def _table(happened: Iterable[StoredDecision | PastRetrain | Event]) -> str:
+    """A table; retrains and events are lines of their own among the decisions."""
     from ..store.records import StoredDecision
 
-    if not happened:
-        return ["No decision of that kind."]
+    rows = [
+        [cell(each) for cell in COLUMNS.values()] if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1]
+        for each in happened
+    ]
+    if not rows:
+        return "No decision of that kind."
     titles = [name[1:] for name in COLUMNS]
-    rows = [[cell(each) for cell in COLUMNS.values()] for each in happened if isinstance(each, StoredDecision)]
-    widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    # What is too wide is taken from the parts' numbers, from their beginning: ids are needed whole.
-    too_wide = sum(widths) + 2 * (len(widths) - 1) - WIDEST
-    widths[PART] = min(widths[PART], max(SHORTEST, widths[PART] - max(0, too_wide)))
-    for row in rows:
-        row[PART] = row[PART] if len(row[PART]) <= widths[PART] else "~" + row[PART][1 - widths[PART] :]
+    widths = [max(map(len, column)) for column in zip(titles, *(row for row in rows if isinstance(row, list)), strict=True)]
     sides = "  ".join(f"{{:{name[0]}{width}}}" for name, width in zip(COLUMNS, widths, strict=True))
-    table = [sides.format(*cells).rstrip() for cells in (titles, ["-" * width for width in widths], *rows)]
-    waiting = iter(table[2:])
-    body = [next(waiting) if isinstance(each, StoredDecision) else _told(each)[: WIDEST - 1] for each in happened]
-    return [*table[:2], *body]
+    lines = [titles, ["-" * width for width in widths], *rows]
+    return "\n".join(line if isinstance(line, str) else sides.format(*line).rstrip() for line in lines)
 
 
 def _told(each: PastRetrain | Event) -> str:
@@ -144,15 +131,12 @@ def _told(each: PastRetrain | Event) -> str:
     return f"{when(each.time, SHORT)}  * {what}, {report.n_traces} traces, {duration(report.seconds)}: {report.reason}"
 
 
-@click.command(epilog=options.example("dengine explain engine.db last --out why.png"))
+@verb("dengine explain engine.db last --out why.png")
 @options.store_argument
-@options.cell_options()
 @click.argument("decision", metavar="DECISION")
 @click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
-@options.out_file_option
-@options.force_option
-@options.json_option
-def explain(store: str, decision: str, neighbours: int, out: Path | None, force: bool, as_json: bool) -> None:
+@options.picture_option
+def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None:
     """Say why a decision came out as it did.
 
     DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
@@ -161,6 +145,7 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, force:
     """
     from ..engine.engine import explain_stored
     from ..errors import ReportError
+    from ..experiments.figures import explained_picture
     from ..history.status import history
     from ..store.base import open_store
 
@@ -171,39 +156,23 @@ def explain(store: str, decision: str, neighbours: int, out: Path | None, force:
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
             decision = newest.decision.id
         found = explain_stored(opened, decision, neighbours)
-    files = []
-    if out is not None:
-        from ..experiments.figures import explained_picture, save
-
-        files = [save(explained_picture(found), out, force=force)]
-    if as_json:
-        write_json({"verb": "explain", "store": store} | found.record() | {"files": files})
-        return
-    show(*_tables(found), *(f"Wrote {path}" for path in files))
-
-
-def _tables(found: Explanation) -> Iterator[Any]:
-    past = found.decision
-    yield facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))
+    record, past = {"store": store} | found.record(), found.decision
+    tables = [facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))]
     if found.neighbours:
         title = f"Nearest references of version {found.neighbours_version}; the ball's radius is {found.radius:.3g}"
-        yield facts(title, map(_neighbour, found.neighbours), ("decision", "part", "label", "distance", "fold", "ball"))
+        columns = ("decision", "part", "label", "distance", "fold", "ball")
+        tables.append(facts(title, map(_neighbour, found.neighbours), columns))
+    tell(record, *tables, out=out, made=lambda: {"": explained_picture(found)})
 
 
 def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
-    past = found.decision
+    past, band = found.decision, found.envelope
     version = past.decision.model_version
     yield "decided", f"{when(past.time)}, by " + (f"version {version}" if version else "no model")
     if past.decision.part is not None:
         yield "part", past.decision.part
-    for i, sentence in enumerate(found.said):
-        yield "" if i else "why", sentence
-    for i, note in enumerate(found.notes):
-        yield "" if i else "found again", note
-    yield from _envelope_rows(found.envelope, found)
-
-
-def _envelope_rows(band: Envelope | None, found: Explanation) -> Iterator[tuple[str, str]]:
+    yield from (("" if i else "why", sentence) for i, sentence in enumerate(found.said))
+    yield from (("" if i else "found again", note) for i, note in enumerate(found.notes))
     if band is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
@@ -211,22 +180,14 @@ def _envelope_rows(band: Envelope | None, found: Explanation) -> Iterator[tuple[
     yield "envelope", f"{percent(band.outside, '.0f')} of its samples leave the band of {band.n:,} successes; {usual}"
     if band.not_finite:
         yield "", f"{band.not_finite} samples are NaN or infinite"
-    farthest = sorted(band.excesses, key=lambda each: -each.widths)
+    spec, farthest = found.spec, sorted(band.excesses, key=lambda each: -each.widths)
     for i, each in enumerate(farthest[:MOST]):
-        yield "" if i else "leaves it", _excess(each, found)
+        name = spec.columns[each.channel] if spec.columns else f"channel {each.channel + 1}"
+        where = (f"{name}, " if spec.channels > 1 else "") + f"{each.from_s:.3f} to {each.to_s:.3f} s"
+        samples = f"(samples {each.first} to {each.last}) {'above' if each.above else 'below'}"
+        yield "" if i else "leaves it", f"{where} {samples}, by up to {each.widths:.1f} band widths"
     if len(farthest) > MOST:
         yield "", f"and {len(farthest) - MOST} times less far"
-
-
-def _excess(each: Excess, found: Explanation) -> str:
-    spec = found.spec
-    name = spec.columns[each.channel] if spec.columns else f"channel {each.channel + 1}"
-    where = f"{name}, " if spec.channels > 1 else ""
-    side = "above" if each.above else "below"
-    if each.first == each.last:
-        return f"{where}at {each.from_s:.3f} s (sample {each.first}) {side}, by {each.widths:.1f} band widths"
-    times = f"{each.from_s:.3f} to {each.to_s:.3f} s (samples {each.first} to {each.last})"
-    return f"{where}{times} {side}, by up to {each.widths:.1f} band widths"
 
 
 def _neighbour(each: Neighbour) -> tuple[str, ...]:

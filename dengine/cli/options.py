@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
 from importlib.util import find_spec
@@ -13,11 +11,10 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import DengineError, SettingError
+from ..errors import SettingError
+from .output import Out, as_json, json_option
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from ..datasets import Dataset
     from ..recipe import Recipe
 
@@ -27,6 +24,17 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
 ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
 LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
+OWN = "module:Class"
+
+
+def ends_in(example: str) -> str:
+    """The end of a help."""
+    return f"\b\nExample:\n  {example}"
+
+
+def verb(example: str) -> Callable[[Command], click.Command]:
+    """A command that speaks JSON, and whose help ends in an example."""
+    return lambda command: click.command(epilog=ends_in(example))(json_option(command))
 
 
 def names_of(kind: str) -> tuple[str, ...]:
@@ -34,44 +42,35 @@ def names_of(kind: str) -> tuple[str, ...]:
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
     from ..experiments.rivals import RIVALS
+    from ..recipe import RECIPES
     from ..records import FITS, Action, Reason
-    from ..reducers import REDUCERS
     from ..store.views import LABELS
 
     known: dict[str, Iterable[str]] = {"guarantee": RULES, "interval": INTERVALS, "stops": get_args(Stops)}
-    known |= {"reducer": REDUCERS, "rival": RIVALS, "fit": FITS, "label": LABELS}
+    known |= {"recipe": RECIPES, "rival": RIVALS, "method": [*RECIPES, *RIVALS], "fit": FITS, "label": LABELS}
     known |= {"action": [each.value for each in Action], "reason": [each.value for each in Reason]}
     return tuple(known[kind])
 
 
 class Known(click.ParamType[Any]):
-    """A name of a kind, see `names_of`; or `module:Class`, where `own` may be given."""
+    """A name of a kind, see `names_of`; own : what else may be given, which has a dot or a colon in it."""
 
     name = "name"
 
-    def __init__(self, kind: str, own: bool = False) -> None:
+    def __init__(self, kind: str, own: str = "") -> None:
         self.kind, self.own = kind, own
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """[local|pooled|module:Class]."""
-        return f"[{'|'.join([*names_of(self.kind), *(['module:Class'] if self.own else [])])}]"
+        return f"[{'|'.join(filter(None, [*names_of(self.kind), self.own]))}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The name; what is in no table is a usage error."""
         names = names_of(self.kind)
-        if value not in names and not (self.own and ":" in value):
-            own = ", or module:Class of your own" if self.own else ""
+        if value not in names and not (self.own and {".", ":"} & set(value)):
+            own = f", or {self.own} of your own" if self.own else ""
             self.fail(f"{value!r} is not one of {', '.join(map(repr, names))}{own}.", param, ctx)
         return str(value)
-
-
-class Naming(click.Option):
-    """An option whose help says what can be named, in the place of {reducer} and other kinds."""
-
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Its words and its help."""
-        self.help = re.sub(r"{(\w+)}", lambda kind: ", ".join(names_of(kind[1])), self.help or "")
-        return super().get_help_record(ctx)
 
 
 class Listed(click.ParamType[Any]):
@@ -81,6 +80,10 @@ class Listed(click.ParamType[Any]):
 
     def __init__(self, of: click.ParamType[Any]) -> None:
         self.of = of
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
+        """[wilson|binomial],... or LIST."""
+        return f"{self.of.get_metavar(param, ctx)},..." if isinstance(self.of, Known) else "LIST"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
         """'0.5,0.1' -> (0.5, 0.1); a wrong one among them is a usage error."""
@@ -116,25 +119,35 @@ def given(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def cell_options(*names: str, product: bool = False) -> Callable[[Command], Command]:
-    """`--cell`, or other names of it, and where asked for `--product`; the verb's `store` then says whose rows it means."""
+def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
+    from ..store.records import address
 
-    def with_options(command: Command) -> Command:
-        @wraps(command)
-        def named(store: str | None, cell_id: str | None, product: str | None = None, **others: Any) -> Any:
-            from ..store.records import address
+    if store is None and (cell_id or product):
+        raise click.UsageError("A cell and its product are known to a store: name it, --store FILE|URL.")
+    return None if store is None else address(store, cell_id, product)
 
-            if store is None and (cell_id or product):
-                raise click.UsageError("A cell and its product are known to a store: name it, --store FILE|URL.")
-            return command(store=None if store is None else address(store, cell_id, product), **others)
 
-        if product:
-            about = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
-            named = click.option("--product", metavar="NAME", help=about)(named)
-        whose = "Whose rows of the store, where it holds several cells; `dengine status` lists them.  [default: cell]"
-        return click.option(*(names or ("--cell", "--cell-id")), "cell_id", metavar="NAME", help=whose)(named)
+_WHOSE = "Whose rows of the store, where it holds several cells; `dengine status` lists them.  [default: cell]"
+_PRODUCT = "What the cell makes: cells of one product share labels and versions.  [default: as the store says]"
 
-    return with_options
+
+def a_store(store: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """A store that is there, and whose rows of it are meant."""
+    whose = click.option("--cell", "--cell-id", "cell_id", metavar="NAME", help=_WHOSE)
+    return gathered("store", _address, {"store": store, "cell_id": whose})
+
+
+store_argument = a_store(click.argument("store", metavar="STORE"))
+
+
+def store_option(text: str, *cell: str, required: bool = False) -> Callable[[Command], Command]:
+    """`--store`, which may be made, with its cell's id, by `--cell-id` and other names, and product."""
+    options: dict[str, Callable[[Command], Command]] = {
+        "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
+        "cell_id": click.option(*cell, "--cell-id", "cell_id", metavar="NAME", help=_WHOSE),
+        "product": click.option("--product", metavar="NAME", help=_PRODUCT),
+    }
+    return gathered("store", _address, options)
 
 
 def short_name(name: str) -> str:
@@ -160,10 +173,9 @@ class RecipeChoice:
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
 
-        policy = dict(self.settings)
-        novelty = policy.pop("novelty", None)
+        policy = {name: value for name, value in self.settings.items() if name != "novelty"}
         recipe = Recipe.load(name or self.recipe or self.reducer or "conv").with_policy(**policy)
-        recipe = recipe.with_settings(novelty=novelty)
+        recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)  # now, and not when a store was made for it
         return recipe
@@ -187,14 +199,14 @@ _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
-    "guarantee": click.option("--guarantee", type=Known("guarantee", own=True), help=_GUARANTEE),
+    "guarantee": click.option("--guarantee", type=Known("guarantee", OWN), help=_GUARANTEE),
     "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
 }
 SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}
-_REDUCER = "{reducer}, or module:Class of your own, looked for in this folder too.  [default: conv]"
+_REDUCER = "One of your own is looked for in this folder too.  [default: conv]"
 RECIPE = {
-    "reducer": click.option("--reducer", cls=Naming, metavar="NAME", help=_REDUCER),
+    "reducer": click.option("--reducer", type=Known("recipe", f"FILE.toml|{OWN}"), help=_REDUCER),
     "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
 }
 
@@ -216,12 +228,12 @@ class DataChoice:
     data: str
     how: Mapping[str, Any]
 
-    def load(self, quiet: bool = False) -> Dataset:
-        """The data set; what was left out of it is said on stderr, or not. DataError for what cannot be read."""
+    def load(self) -> Dataset:
+        """The data set; what was left out of it is said on stderr. DataError for what cannot be read."""
         from ..datasets import load_dataset
 
         data = load_dataset(self.data, **self.how)
-        for line in [] if quiet else left_out(data, 3):
+        for line in [] if as_json() else left_out(data, 3):
             click.echo(line, err=True)
         return data
 
@@ -283,69 +295,27 @@ def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
     return click.option("--n-jobs", type=int, default=default, show_default=True, callback=checked, help=text)
 
 
-def must_have_mujoco() -> None:
-    """SettingError where the simulated cell cannot run; asked before anything is made or begun."""
-    if find_spec("mujoco") is None:
-        raise SettingError('Expected MuJoCo for the simulated cell, it is not installed: pip install "dengine[sim]".')
+def must_have(what: str, extra: str, *needed: str) -> None:
+    """SettingError where a module is missing; asked before anything is made or begun."""
+    if missing := ", ".join(name for name in needed if find_spec(name) is None):
+        raise SettingError(f'Expected {missing} for {what}, not installed: pip install "dengine[{extra}]".')
 
 
-@dataclass(frozen=True)
-class OutFolder:
-    """Where a verb's CSV and pictures go; force : replace the files that are there; files : those written so far."""
-
-    path: Path
-    force: bool = False
-    files: list[Path] = field(default_factory=list)
-
-    def table(self, frame: pd.DataFrame, name: str) -> None:
-        """Write a table as CSV."""
-        from ..experiments.tables import write_csv
-
-        self.files.append(write_csv(frame, self.path / name, self.force))
-
-    def picture(self, figure: Any, name: str) -> None:
-        """Write a picture."""
-        from ..experiments.figures import save
-
-        self.files.append(save(figure, self.path / name, force=self.force))
-
-
-@contextmanager
-def written(out: OutFolder | None, write: Callable[[OutFolder], None]) -> Iterator[list[Path]]:
-    """Gives the files that were written, and their manifest; a refusal is raised once what was computed has been shown."""
-    from ..files import write_manifest
-
-    refusal: DengineError | None = None
-    files: list[Path] = []
-    try:
-        if out is not None:
-            write(out)
-            files = [*out.files, write_manifest(out.path, out.files, out.force)]
-    except DengineError as error:
-        refusal = error
-    yield files
-    if refusal is not None:
-        raise refusal
-
-
-_OUT = "Folder for the CSV and the pictures; made if need be."
 _KEEP = "Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once."
 _SCENARIO = "What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump."
 _SEED = "An integer; the same seed, the same run."
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
+_NEW_SEED = "An integer, of a new store's engine.  [default: 0]"
 force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
-out_option = gathered(
-    "out",
-    lambda out, force: None if out is None else OutFolder(out, force),
-    {"out": click.option("--out", type=FOLDER, help=_OUT), "force": force_option},
-)
-out_file_option = click.option("--out", type=FILE, help="A picture, .png, .pdf or .svg, drawn into this file.")
+
+
+def _out_option(kind: click.Path, text: str) -> Callable[[Command], Command]:
+    options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
+    return gathered("out", lambda out, force: None if out is None else Out(out, force), options)
+
+
+out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; made if need be.")
+picture_option = _out_option(FILE, "A picture, .png, .pdf or .svg, drawn into this file.")
 keep_option = click.option("--keep", type=FOLDER, metavar="FOLDER", help=_KEEP)
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED)
+new_seed_option = click.option("--seed", type=click.IntRange(0), help=_NEW_SEED)
 scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)
-store_argument = click.argument("store", metavar="STORE")
-
-
-def example(command: str) -> str:
-    """The end of a verb's help."""
-    return f"\b\nExample:\n  {command}"

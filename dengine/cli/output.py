@@ -1,4 +1,4 @@
-"""What a verb shows: one JSON document, or lines and tables on stdout, a progress bar on stderr; and Ctrl-C."""
+"""What a verb shows: one JSON document, or lines and tables on stdout, a progress bar on stderr; its files; and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from textwrap import fill
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from ..errors import without_password
+from ..errors import DengineError, without_password
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
     from ..datasets.importing import ImportReport
@@ -27,23 +27,87 @@ if TYPE_CHECKING:
 
 WIDE = 80  # columns where no terminal says otherwise; every table fits them
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
-Asked = Callable[[], bool]
+JSON = "dengine.json"  # in click's context: whether --json was given
+json_option = click.option(
+    "--json",
+    is_flag=True,
+    expose_value=False,
+    callback=lambda context, option, given: context.meta.update({JSON: given}),
+    help="Print one JSON document and nothing else.",
+)
+
+
+def as_json() -> bool:
+    """Whether the verb that runs was asked for JSON: nothing else is printed then."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(JSON))
+
+
+@dataclass(frozen=True)
+class Out:
+    """Where a verb writes: a folder, or the file of its only picture. force : replace the files that are there."""
+
+    path: Path
+    force: bool = False
+
+    def write(self, made: Mapping[str, Any]) -> list[Path]:
+        """Write tables as CSV, texts and figures by their names, and a manifest; one without a name is the file itself."""
+        from matplotlib.figure import Figure
+
+        from ..experiments.figures import save
+        from ..experiments.tables import write_csv
+        from ..files import write_manifest, write_output
+
+        files = []
+        for name, each in made.items():
+            if isinstance(each, Figure):
+                files.append(save(each, self.path / name, force=self.force))
+            elif isinstance(each, str):
+                files.append(write_output(self.path / name, each.encode("utf-8"), self.force, make_folder=True))
+            else:
+                files.append(write_csv(each, self.path / name, self.force))
+        return files if "" in made else [*files, write_manifest(self.path, files, self.force)]
+
+
+def tell(
+    record: Mapping[str, Any], *parts: Any, out: Out | None = None, made: Callable[[], Mapping[str, Any]] | None = None
+) -> None:
+    """Print what a verb found: its record as one JSON document, or for people these tables and lines.
+
+    made : gives what is written to `out`. A refusal to write is raised once what was computed has been shown.
+    """
+    files: list[Path] = []
+    refusal: DengineError | None = None
+    if out is not None and made is not None:
+        try:
+            files = out.write(made())
+        except DengineError as error:
+            refusal = error
+    if as_json():
+        from ..records import plain
+
+        named = {"verb": click.get_current_context().info_name} | dict(record)
+        written = named if made is None else named | {"files": files}
+        click.echo(json.dumps(plain(written), indent=2, allow_nan=False))  # NaN, which JSON has not, is null by now
+    else:
+        show(*parts, *(f"Wrote {path}" for path in files))
+    if refusal is not None:
+        raise refusal
 
 
 def show(*parts: Any) -> None:
-    """Print tables and lines to stdout; lines are broken between words, a long path never, and passwords are masked."""
-    out = console()
-    for part in parts:
-        if isinstance(part, str):
-            part = fill(without_password(part), out.width, break_long_words=False, break_on_hyphens=False)
-        out.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
+    """Print tables and text to stdout; passwords are masked.
 
-
-def console() -> Console:
-    """The screen, or a file of its usual width."""
+    A line is broken between words, a long path never; text of several lines stays as it is.
+    """
     from rich.console import Console
 
-    return Console() if sys.stdout.isatty() else Console(width=WIDE)
+    screen = Console() if sys.stdout.isatty() else Console(width=WIDE)
+    for part in parts:
+        if isinstance(part, str):
+            part = without_password(part)
+            part = part if "\n" in part else fill(part, screen.width, break_long_words=False, break_on_hyphens=False)
+        screen.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
 def facts(title: str, rows: Iterable[tuple[str, ...]], columns: Sequence[str] = ("", "")) -> Table:
@@ -58,34 +122,21 @@ def facts(title: str, rows: Iterable[tuple[str, ...]], columns: Sequence[str] = 
     return table
 
 
-def figures(
-    title: str, rows: Sequence[Mapping[str, str]], caption: str = "", words: Sequence[str] = (), total: bool = False
-) -> Table:
-    """A table of numbers, to the right, under the rows' names; words : columns that hold words, and give way.
-
-    total : whether a line sets the last row apart.
-    """
+def figures(title: str, rows: Sequence[Mapping[str, str]], caption: str, total: bool = False) -> Table:
+    """A table of numbers, to the right, under the rows' names. total : whether a line sets the last row apart."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
-    look |= {"caption": f"\n{caption}\n"} if caption else {}
-    table = Table(title=f"\n{without_password(title)}\n", pad_edge=False, show_edge=False, **look)
+    look |= {"caption": f"\n{caption}\n", "pad_edge": False, "show_edge": False}
+    table = Table(title=f"\n{without_password(title)}\n", **look)
     for name in rows[0]:
-        text = name in words
-        table.add_column(name, justify="left" if text else "right", no_wrap=not text, overflow="fold")
+        table.add_column(name, justify="right", no_wrap=True)
     for i, row in enumerate(rows):
         if total and i == len(rows) - 1:
             table.add_section()
         table.add_row(*row.values())
     return table
-
-
-def write_json(result: Mapping[str, Any]) -> None:
-    """Print one JSON document; NaN, which JSON has not, becomes null."""
-    from ..records import plain
-
-    click.echo(json.dumps(plain(result), indent=2, allow_nan=False))
 
 
 def duration(seconds: float) -> str:
@@ -129,9 +180,9 @@ def certificate_record(certificate: Certificate) -> dict[str, Any]:
 
 
 @contextmanager
-def progress(label: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that goes when done; the function it gives advances it by so many."""
-    if quiet:
+def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr that goes when done, none beside JSON; the function it gives advances it by so many."""
+    if as_json():
         yield lambda step: None
         return
     from rich.console import Console
@@ -144,31 +195,36 @@ def progress(label: str, total: int, quiet: bool) -> Iterator[Callable[[int], No
 
 
 class EndAskedError(Exception):
-    """Raised between two steps to leave a loop that belongs to somebody else."""
+    """Raised between two steps to leave a loop that belongs to somebody else; its argument: the steps that were done."""
 
 
 @contextmanager
-def interruptible() -> Iterator[Asked]:
-    """Let Ctrl-C ask for an end, which the loop inside grants between two steps; a second one ends at once.
-
-    Gives a function that says whether it was asked.
-    """
-    if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread alone
-        yield lambda: False
-        return
-    asked = False
-    before = signal.getsignal(signal.SIGINT)
+def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar whose next step ends the work with EndAskedError where Ctrl-C asked for that; a second Ctrl-C ends at once."""
+    asked, done, before = False, 0, signal.getsignal(signal.SIGINT)
+    heard = threading.current_thread() is threading.main_thread()  # Python delivers signals to that one alone
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
         signal.signal(signal.SIGINT, before)
 
-    signal.signal(signal.SIGINT, ask)
-    try:
-        yield lambda: asked
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with progress(label, total) as advance:
+
+        def count(n: int) -> None:
+            nonlocal done
+            done += n
+            advance(n)
+            if asked:
+                raise EndAskedError(done)
+
+        if heard:
+            signal.signal(signal.SIGINT, ask)
+        try:
+            yield count
+        finally:
+            if heard:
+                signal.signal(signal.SIGINT, before)
 
 
 def end_interrupted(*lines: str) -> NoReturn:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,8 @@ import click
 
 from ..errors import SettingError, percent
 from . import options
-from .options import ALPHA, COUNT, LOWER_BOUND, DataChoice, Known, Listed, Naming, OutFolder, RecipeChoice, short_name
-from .output import duration, end_interrupted, figures, progress, show, write_json
+from .options import ALPHA, COUNT, LOWER_BOUND, OWN, DataChoice, Known, Listed, RecipeChoice, short_name, verb
+from .output import Out, duration, end_interrupted, figures, progress, tell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -50,35 +49,25 @@ class Stream:
 
 @dataclass(frozen=True)
 class Finished:
-    """The replays that were finished, in the order in which they were asked for.
+    """The replays that were finished, in the order in which they were asked for; interrupted: how many, where some are not.
 
-    asked : how many were asked for.  found : how many had been kept from an earlier run.  seconds : wall time.
+    found : how many had been kept from an earlier run.  seconds : wall time.
     """
 
     replays: Sequence[Replay]
-    asked: int
+    interrupted: str
     found: int
     seconds: float
 
-    @property
-    def interrupted(self) -> bool:
-        """Whether some are missing."""
-        return len(self.replays) < self.asked
 
-    @property
-    def count(self) -> str:
-        """How many, in words."""
-        return f"Interrupted: {len(self.replays)} of {self.asked} replays were finished"
-
-
-def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream, quiet: bool) -> Finished:
+def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Finished:
     """Play every task; on Ctrl-C what was finished until then."""
     from ..experiments.grid import iterate_replays
 
     done: dict[int, Replay] = {}
     found, begin = 0, time.perf_counter()
     cycles = len(tasks) * (stream.cycles or len(dataset))
-    with _cluster(stream, dataset) as n_jobs, progress(f"replaying {dataset.name}", cycles, quiet) as advance:
+    with _cluster(stream, dataset) as n_jobs, progress(f"replaying {dataset.name}", cycles) as advance:
         # A callback cannot travel to other processes: there the bar moves a replay at a time.
         on_cycle = (lambda cycle: advance(1)) if n_jobs == 1 else None
         try:
@@ -88,7 +77,9 @@ def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream, quiet: bool
                     advance(len(one))
         except KeyboardInterrupt:
             pass  # what is missing says so
-    return Finished([done[i] for i in sorted(done)], len(tasks), found, time.perf_counter() - begin)
+    missing = len(done) < len(tasks)
+    interrupted = f"Interrupted: {len(done)} of {len(tasks)} replays were finished" if missing else ""
+    return Finished([done[i] for i in sorted(done)], interrupted, found, time.perf_counter() - begin)
 
 
 @contextmanager
@@ -97,8 +88,7 @@ def _cluster(stream: Stream, dataset: Dataset) -> Iterator[int]:
     if stream.scheduler is None:
         yield stream.n_jobs
         return
-    if find_spec("distributed") is None:
-        raise SettingError('Expected dask for --scheduler, it is not installed: pip install "dengine[dask]".')
+    options.must_have("--scheduler", "dask", "distributed")
     from distributed import Client
     from joblib import parallel_config
 
@@ -134,16 +124,14 @@ stream_options = options.gathered(
         "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
     },
 )
-REPLAY = "dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/"
 
 
-@click.command(epilog=options.example(REPLAY))
+@verb("dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/")
 @options.data_options()
 @options.recipe_options
 @click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
 @stream_options
 @options.out_option
-@options.json_option
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
@@ -151,32 +139,30 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """
     from ..experiments.replay import Contender
 
-    _replay("replay", [Contender(choice.name, choice.load())], {"confirms": [confirm]}, **played)
+    _replay([Contender(choice.name, choice.load())], {"confirms": [confirm]}, **played)
 
 
 def _list(name: str, of: click.ParamType[Any], text: str = "To be tried.") -> Callable[[Any], Any]:
-    return click.option(f"--{name}", type=Listed(of), cls=Naming, metavar="LIST", help=text)
+    return click.option(f"--{name}", type=Listed(of), help=text)
 
 
 LISTS = {
     "alphas": _list("alphas", ALPHA, "As in 0.5,0.1,0.05."),
     "lower_bounds": _list("lower-bounds", LOWER_BOUND, "As in 0.8,0.9,0.95."),
-    "intervals": _list("intervals", Known("interval"), "Of {interval}."),
-    "guarantees": _list("guarantees", Known("guarantee", own=True), "Of {guarantee}, module:Class of your own."),
+    "intervals": _list("intervals", Known("interval")),
+    "guarantees": _list("guarantees", Known("guarantee", OWN)),
 }
 
 
-@click.command(epilog=options.example("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/"))
+@verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
 @options.data_options()
 @click.option(
     "--reducers",
     "asked",
-    cls=Naming,
-    metavar="NAMES",
     default="conv,umap,pca",
     show_default=True,
-    type=Listed(click.STRING),
-    help="With commas between, of {reducer}, TOML files, module:Class of your own; and rivals: {rival}.",
+    type=Listed(Known("method", f"FILE.toml|{OWN}")),
+    help="With commas between; those that are not dengine's are rivals in the same loop.",
 )
 @options.policy_options
 @click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
@@ -191,7 +177,6 @@ LISTS = {
 )
 @stream_options
 @options.out_option
-@options.json_option
 def compare(
     asked: Sequence[str],
     settings: Mapping[str, Any],
@@ -219,7 +204,7 @@ def compare(
         else Contender(short_name(one), choice.load(one))
         for one in asked
     ]
-    _replay("compare", who, grid | {"confirms": [FEEDBACKS[name] for name in feedback]}, **played)
+    _replay(who, grid | {"confirms": [FEEDBACKS[name] for name in feedback]}, **played)
 
 
 def _must_be_listed(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
@@ -230,32 +215,17 @@ def _must_be_listed(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
             raise click.UsageError(f"--{flag} names one value, here it is asked for: name those to be tried, --{flag}s.")
 
 
-def _replay(
-    verb: str,
-    who: Sequence[Contender],
-    grid: Mapping[str, Any],
-    source: DataChoice,
-    stream: Stream,
-    out: OutFolder | None,
-    as_json: bool,
-) -> None:
-    from ..experiments.grid import grid_tasks
-
-    dataset = source.load(quiet=as_json)
-    tasks = grid_tasks(who, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid)
-    finished = _played(dataset, tasks, stream, as_json)
-    if finished.replays:
-        _report(verb, finished, dataset, stream, out, as_json)
-    if finished.interrupted:
-        end_interrupted(f"{finished.count}; {'the table shows those' if finished.replays else 'there is nothing to show'}.")
-
-
-def _report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out: OutFolder | None, as_json: bool) -> None:
-    """Print the tables, or one JSON document; write CSV, tables and pictures to `out`."""
+def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoice, stream: Stream, out: Out | None) -> None:
+    """Play, and tell what was finished: tables, or one JSON document; CSV, tables and pictures in `out`."""
     from ..experiments import tables
+    from ..experiments.grid import grid_tasks
     from ..experiments.paper import finding_lines, findings
 
-    replays = finished.replays
+    dataset = source.load()
+    tasks = grid_tasks(who, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid)
+    finished = _played(dataset, tasks, stream)
+    if not (replays := finished.replays):
+        end_interrupted(f"{finished.interrupted}; there is nothing to show.")
     frame = tables.frame_of(replays)
     dropped = frame.assign(dropped=[sum(not each.accepted for each in one.retrains) for one in replays])
     sums = dropped.groupby(tables.CONDITION, sort=False)["dropped"].sum()
@@ -268,21 +238,19 @@ def _report(verb: str, finished: Finished, dataset: Dataset, stream: Stream, out
     # The paper's findings are of a grid under one guarantee and one feedback.
     found = findings(frame) if _is_grid(frame) and not _varies(frame, "guarantee", "stops", "confirm") else []
     core = sum(each.seconds for each in replays)
-    with options.written(out, lambda out: _save(frame, replays, title, out)) as files:
-        if as_json:
-            about = {"verb": verb, "data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults}
-            costs = {"seconds": finished.seconds, "core_seconds": core, "found": finished.found}
-            about |= {"interrupted": finished.interrupted, "findings": found, "costs": costs, "files": files}
-            write_json(about | {"rows": rows})
-            return
-        show(tables.pooled_table(rows, title), *tables.promise_lines(rows))
-        for name, some in by_name.items():
-            retrains = [each for one in some for each in one.retrains]
-            show(f"{name}: {tables.retrain_line(retrains)}")
-        many = "" if len(replays) == 1 else "s"
-        kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
-        took = f"{duration(core)} of one core's time, in {duration(finished.seconds)}{kept}."
-        show(*finding_lines(found), f"{len(replays)} replay{many}, {took}", *(f"Wrote {path}" for path in files))
+    costs = {"seconds": finished.seconds, "core_seconds": core, "found": finished.found}
+    record = {"data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults, "rows": rows}
+    record |= {"interrupted": bool(finished.interrupted), "findings": found, "costs": costs}
+    lines = [tables.pooled_table(rows, title), *tables.promise_lines(rows)]
+    for name, some in by_name.items():
+        retrains = [each for one in some for each in one.retrains]
+        lines.append(f"{name}: {tables.retrain_line(retrains)}")
+    kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
+    took = f"{duration(core)} of one core's time, in {duration(finished.seconds)}{kept}."
+    lines += [*finding_lines(found), f"{len(replays)} replay{'' if len(replays) == 1 else 's'}, {took}"]
+    tell(record, *lines, out=out, made=lambda: dict(_made(frame, replays, title)))
+    if finished.interrupted:
+        end_interrupted(f"{finished.interrupted}; the table shows those.")
 
 
 def _grouped(replays: Sequence[Replay], key: Callable[[Replay], str]) -> dict[str, list[Replay]]:
@@ -308,23 +276,22 @@ def _is_grid(frame: pd.DataFrame) -> bool:
     return _varies(frame, "interval", "alpha", "lower_bound")
 
 
-def _save(frame: pd.DataFrame, replays: Sequence[Replay], title: str, out: OutFolder) -> None:
+def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterator[tuple[str, Any]]:
+    """What is written of replays, by name."""
     from ..experiments.figures import curves, embedding_map, grid_figure
     from ..experiments.paper import grid_lines
-    from ..files import write_output
 
-    out.table(frame, "replays.csv")
+    yield "replays.csv", frame
     if _is_grid(frame):
-        page = "\n".join(grid_lines(frame)) + "\n"
-        out.files.append(write_output(out.path / "tables.md", page.encode("utf-8"), out.force, make_folder=True))
+        yield "tables.md", "\n".join(grid_lines(frame)) + "\n"
         for name, some in _grouped(replays, lambda each: _row_name(each, frame, "interval")).items():
-            out.picture(grid_figure(some, name), _file_name(f"grid_{name}"))
+            yield _file_name(f"grid_{name}"), grid_figure(some, name)
     else:
-        out.picture(curves(_grouped(replays, lambda each: _row_name(each, frame)), title), "curves.png")
+        yield "curves.png", curves(_grouped(replays, lambda each: _row_name(each, frame)), title)
     for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
         if one.embedded:
             said = f"{name}, newest parts of one replay (seed {one.seed})"
-            out.picture(embedding_map(one, title=said), _file_name(f"map_{name}"))
+            yield _file_name(f"map_{name}"), embedding_map(one, title=said)
 
 
 def _file_name(title: str) -> str:
@@ -356,24 +323,23 @@ PRICES = {
     "escape": click.option("--escape", type=_COST, required=True, help=_ESCAPE),
     "false_reject": click.option("--false-reject", type=_COST, required=True, help="What a good part costs, sent back."),
 }
-_HALF = "Shuffles of each policy; half choose."
-COSTS = "dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30"
 
 
-@click.command(epilog=options.example(COSTS))
+@verb("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 @options.data_options()
 @options.gathered("prices", dict, PRICES)
 @click.option("--unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @options.recipe_options
 @_list("alphas", ALPHA, "To be tried.  [default: 0.5,0.1,0.05]")
 @_list("lower-bounds", LOWER_BOUND, "To be tried.  [default: 0.8 to 0.99]")
-@click.option("--repeats", type=click.IntRange(2), default=10, show_default=True, help=_HALF)
+@click.option(
+    "--repeats", type=click.IntRange(2), default=10, show_default=True, help="Shuffles of each policy; half choose."
+)
 @options.seed_option
 @click.option("--cycles", type=COUNT, help="Only so many parts of each shuffle.  [default: all]")
 @options.n_jobs_option(-1, "Replays at a time, each in a process; -1: one a core.")
 @options.keep_option
 @options.out_option
-@options.json_option
 def costs(
     choice: RecipeChoice,
     prices: dict[str, float],
@@ -383,8 +349,7 @@ def costs(
     source: DataChoice,
     repeats: int,
     seed: int,
-    out: OutFolder | None,
-    as_json: bool,
+    out: Out | None,
     **how: Any,
 ) -> None:
     """Say which alpha and LB pay.
@@ -399,34 +364,31 @@ def costs(
     from ..experiments.replay import Contender
 
     priced, stream = Costs(**prices), Stream(range(seed, seed + repeats), **how)
-    tried: dict[str, Any] = {"alphas": alphas or ALPHAS, "lower_bounds": lower_bounds or LOWER_BOUNDS}
-    tasks = cost_tasks(Contender(choice.name, choice.load()), seeds=stream.seeds, cycles=stream.cycles, **tried)
-    finished = _played(source.load(quiet=as_json), tasks, stream, as_json)
+    who, tried = Contender(choice.name, choice.load()), (alphas or ALPHAS, lower_bounds or LOWER_BOUNDS)
+    tasks = cost_tasks(who, *tried, stream.seeds, stream.cycles)
+    finished = _played(source.load(), tasks, stream)
     seeds = [each.seed for each in finished.replays]
     if finished.interrupted and sum(seeds.count(seed) == len(tasks) / repeats for seed in set(seeds)) < 2:
         end_interrupted("Interrupted: fewer than two shuffles were finished under every policy; there is nothing to show.")
     curve = curve_of(finished.replays, priced)
-    frame = curve.to_frame()
-
-    def save(out: OutFolder) -> None:
-        out.table(frame, "costs.csv")
-        out.picture(cost_picture(curve, unit=unit), "costs.png")
-
-    with options.written(out, save) as files:
-        if as_json:
-            about = {"verb": "costs", "data": curve.dataset, "unit": unit, "interrupted": finished.interrupted}
-            said = {name: getattr(curve, name) for name in SAID}
-            write_json(about | said | {"rows": frame.to_dict("records"), "files": files})
-        else:
-            title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB"
-            every = f"{curve.baseline:.3g}"
-            first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
-            cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
-            rows = [dict(zip(COLUMNS, each, strict=True)) for each in cells]
-            show(figures(title, rows, CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)))
-            show(curve.sentence, *(f"Wrote {path}" for path in files))
+    frame, every = curve.to_frame(), f"{curve.baseline:.3g}"
+    first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
+    cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
+    tell(
+        {"data": curve.dataset, "unit": unit, "interrupted": bool(finished.interrupted)}
+        | {name: getattr(curve, name) for name in SAID}
+        | {"rows": frame.to_dict("records")},
+        figures(
+            f"{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB",
+            [dict(zip(COLUMNS, each, strict=True)) for each in cells],
+            CAPTION.format(reporting=curve.reporting, cycles=curve.cycles),
+        ),
+        curve.sentence,
+        out=out,
+        made=lambda: {"costs.csv": frame, "costs.png": cost_picture(curve, unit=unit)},
+    )
     if finished.interrupted:
-        end_interrupted(f"{finished.count}; the shuffles that all have are shown.")
+        end_interrupted(f"{finished.interrupted}; the shuffles that all have are shown.")
 
 
 def _cells(row: PolicyCost, chosen: bool) -> tuple[str, ...]:

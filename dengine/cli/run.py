@@ -12,51 +12,42 @@ import click
 
 from ..errors import CellError, SettingError, percent
 from . import options
-from .options import DataChoice, OutFolder, RecipeChoice, short_name
-from .output import EndAskedError, certificate_record, end_interrupted, figures, interruptible, progress, show, write_json
-from .robot import host_option, open_robot, recording_line, recording_record
+from .options import DataChoice, RecipeChoice, short_name, verb
+from .output import EndAskedError, Out, as_json, certificate_record, end_interrupted, figures, steps, tell
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
-    from ..decision.certificate import Certificate
     from ..engine.engine import DataEngine
     from ..experiments.replay import Replay
     from ..records import Cycle
     from ..store.base import Store
 
 STRETCHES = 6
-RUN = "dengine run --cell simulated --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9"
-KINDS = "simulated: physics in MuJoCo. replay: the parts of --data, in their order. ur: a Universal Robots controller."
-SEED = "An integer, of a new store's engine and of the simulated cell.  [default: 0]"
+KINDS = "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a Universal Robots controller."
 
 
-@click.command(epilog=options.example(RUN))
+@verb("dengine run --cell replay --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9")
 @click.option(
-    "--cell", "kind", type=click.Choice(("simulated", "replay", "ur")), default="simulated", show_default=True, help=KINDS
+    "--cell", "kind", type=click.Choice(("replay", "simulated", "ur")), default="replay", show_default=True, help=KINDS
 )
-@host_option
+@click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
 @options.data_options()
 @options.scenario_option
 @click.option("--cycles", type=options.COUNT, default=300, show_default=True, help="Parts to insert, one a cycle.")
-@click.option("--store", metavar="FILE|URL", help="Remembers everything; without one the run is forgotten.")
-@options.cell_options("--cell-id", product=True)
+@options.store_option("Remembers everything; without one the run is forgotten.")
 @options.recipe_options
-@click.option("--seed", type=click.IntRange(0), help=SEED)
+@options.new_seed_option
 @click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
 @options.out_option
-@options.json_option
 def run(
     choice: RecipeChoice,
     kind: str,
-    host: str | None,
-    source: DataChoice,
-    scenario: str,
     cycles: int,
     store: str | None,
     seed: int | None,
     shadow: bool,
-    out: OutFolder | None,
-    as_json: bool,
+    out: Out | None,
+    **cell_of: Any,
 ) -> None:
     """Drive a cell: verify, learn, and verify less.
 
@@ -67,23 +58,21 @@ def run(
     safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
     """
     if kind == "simulated":
-        options.must_have_mujoco()
+        options.must_have("the simulated cell", "sim", "mujoco")
     from ..engine.engine import DataEngine
 
     with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=choice.if_asked()) as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](
-            store=engine.store, seed=engine.seed, source=source, scenario=scenario, cycles=cycles, host=host
-        )
+        cell, name = CELLS[kind](store=engine.store, seed=engine.seed, cycles=cycles, **cell_of)
         opened.callback(getattr(cell, "close", lambda: None))
-        log, changes, failure = _drive(engine, cell, cycles, name, as_json)
+        log, changes, failure = _drive(engine, cell, cycles, name)
         said: dict[str, Any] = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
         certificate = engine.certificate()
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
         said |= {"title": title, "simulated": kind == "simulated", "interrupted": len(log) < cycles}
-        _report(log, said, certificate, cell, out, as_json)
+        _report(log, said | {"certificate": certificate_record(certificate)}, cell, out)
     left = cycles - len(log)
     kept = f"Everything up to cycle {len(log)} is in {store}; the same command with --cycles {left} goes on there."
     if store is None:
@@ -95,33 +84,29 @@ def run(
         end_interrupted(f"Interrupted: {len(log)} of {cycles} cycles were done; {shown}.", kept)
 
 
-def _drive(
-    engine: DataEngine, cell: Cell, cycles: int, name: str, quiet: bool
-) -> tuple[Replay, list[dict[str, Any]], CellError | None]:
+def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> tuple[Replay, list[dict[str, Any]], CellError | None]:
     """What was done, when the safe mode began or ended, and what ended the run, where the cell failed."""
     from ..experiments.replay import RunRecorder
 
     recorder, changes, mode = RunRecorder(cell), list[dict[str, Any]](), engine.safe_mode
-    with interruptible() as asked, progress(name, cycles, quiet) as advance:
 
-        def count(cycle: Cycle) -> None:
-            nonlocal mode
-            advance(1)
-            if cycle.safe_mode != mode:
-                mode = cycle.safe_mode
-                changes.append({"cycle": cycle.index + 1, "reason": mode})
-                if not quiet:
-                    click.echo(_mode_line(changes[-1]), err=True)
-            if asked():  # between two cycles: no part is left half dealt with
-                raise EndAskedError
+    def follow(cycle: Cycle) -> None:
+        nonlocal mode
+        if cycle.safe_mode != mode:
+            mode = cycle.safe_mode
+            changes.append({"cycle": cycle.index + 1, "reason": mode})
+            if not as_json():
+                click.echo(_mode_line(changes[-1]), err=True)
+        count(1)  # which may end the run, between two cycles: no part is left half dealt with
 
+    failure = None
+    try:
         # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
-        try:
-            with suppress(EndAskedError, KeyboardInterrupt):
-                recorder.follow(engine, cycles, count)
-        except CellError as error:
-            return recorder.log(), changes, error
-    return recorder.log(), changes, None
+        with suppress(EndAskedError, KeyboardInterrupt), steps(name, cycles) as count:
+            recorder.follow(engine, cycles, follow)
+    except CellError as error:
+        failure = error
+    return recorder.log(), changes, failure
 
 
 def _mode_line(change: Mapping[str, Any]) -> str:
@@ -164,39 +149,72 @@ def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> t
 
 
 def _robot(source: DataChoice, host: str | None, **others: Any) -> tuple[Cell, str]:
-    return open_robot(host, source), f"robot at {host}"
+    from ..cells.ur.cell import UrCell
+    from ..datasets.dataset import names_of
+
+    if not host:
+        raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
+    how: dict[str, Any] = {name: source.how[name] for name in ("samples", "rate_hz", "trigger") if name in source.how}
+    if "channel" in source.how:
+        how["channels"] = names_of(source.how["channel"])
+    name, port = host_and_port(host)
+    return UrCell(name, port=port, **how).open(), f"robot at {host}"
+
+
+def host_and_port(address: str) -> tuple[str, int]:
+    """A controller's host, and its port, RTDE's where none is named; SettingError for what is no port."""
+    from ..cells.ur.protocol import PORT
+
+    host, _, port = address.partition(":")
+    if port and not port.isdecimal():
+        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    return host, int(port) if port else PORT
 
 
 CELLS: dict[str, Callable[..., tuple[Cell, str]]] = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
+CAPTION = (
+    "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
+    "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
+    "cycles of safe mode."
+)
+COLUMNS = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
+COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
 
 
-def _report(
-    log: Replay, said: dict[str, Any], certificate: Certificate, cell: Cell, out: OutFolder | None, as_json: bool
-) -> None:
+def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> None:
+    """Tell what a run did, of which the cell may say what its clock shows, and what was missing of its recordings."""
     from ..experiments.figures import run_picture
     from ..experiments.tables import retrain_line
 
     total, stretches = log.stretch(), log.stretches(STRETCHES)
     clock = asdict(cell.report()) if hasattr(cell, "report") else None
-    worst, recording = max((r.seconds for r in log.retrains), default=None), recording_record(cell)
-
-    def save(out: OutFolder) -> None:
-        out.table(log.to_frame().reset_index(), "run.csv")
-        out.picture(run_picture(log, said["title"]), "run.png")
-
-    with options.written(out, save) as files:
-        if as_json:
-            counts = {"total": total, "stretches": stretches, "cell": clock, "recording": recording, "files": files}
-            retrains = {"retrains": log.retrains, "retrain_max_s": worst}
-            write_json({"verb": "run"} | said | counts | retrains | {"certificate": certificate_record(certificate)})
-            return
-        timed = clock is not None
-        rows = [_cells(row, timed) for row in (*stretches, total)]
-        caption = CAPTION + (" good/h: good parts passed on an hour." if timed else "")
-        show(figures(said["title"], rows, caption, total=True))
-        show(*([] if clock is None else [_clock_line(clock)]), *([] if recording is None else [recording_line(recording)]))
-        show(retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), certificate.sentence)
-        show(*(f"Wrote {path}" for path in files))
+    recording = {"incomplete": cell.incomplete, **asdict(cell.recorder.report())} if hasattr(cell, "recorder") else None
+    rows = []
+    for row in (*stretches, total):
+        cells = {
+            "cycles": f"{row['first_cycle']} to {row['last_cycle']}",
+            "verified": percent(row["verified_share"], ".0f"),
+        }
+        cells |= {title: str(row[name]) for title, name in COLUMNS.items()}
+        if clock is not None:
+            cells["good/h"] = "-" if row["parts_per_hour"] is None else f"{row['parts_per_hour']:.1f}"
+        rows.append(cells)
+    caption = CAPTION + (" good/h: good parts passed on an hour." if clock is not None else "")
+    lines = [] if clock is None else [_clock_line(clock)]
+    if recording is not None:
+        counts = "{packages} packages, {missing} missing, {late} late, {reconnects} reconnects".format(**recording)
+        lines += [f"Recorded: {counts}. Traces with a gap, verified and never learned from: {recording['incomplete']}."]
+    lines += [retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), said["certificate"]["sentence"]]
+    worst = max((each.seconds for each in log.retrains), default=None)
+    tell(
+        said
+        | {"total": total, "stretches": stretches, "cell": clock, "recording": recording}
+        | {"retrains": log.retrains, "retrain_max_s": worst},
+        figures(said["title"], rows, caption, total=True),
+        *lines,
+        out=out,
+        made=lambda: {"run.csv": log.to_frame().reset_index(), "run.png": run_picture(log, said["title"])},
+    )
 
 
 def _clock_line(clock: dict[str, Any]) -> str:
@@ -208,19 +226,3 @@ def _clock_line(clock: dict[str, Any]) -> str:
         f"Simulated: {clock['parts_per_hour']:.1f} good parts an hour. Against verifying every part {result}; this counts "
         f"what stops ({clock['stops']}) and good parts sent back to the bin ({clock['sent_back']}) cost.{silent}"
     )
-
-
-CAPTION = (
-    "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
-    "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
-    "cycles of safe mode."
-)
-
-
-def _cells(row: dict[str, Any], timed: bool) -> dict[str, str]:
-    names = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
-    names |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
-    cells = {"cycles": f"{row['first_cycle']} to {row['last_cycle']}", "verified": percent(row["verified_share"], ".0f")}
-    cells |= {title: str(row[name]) for title, name in names.items()}
-    rate = row["parts_per_hour"]
-    return cells | ({"good/h": "-" if rate is None else f"{rate:.1f}"} if timed else {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import click
 from ..errors import SettingError
 from . import options
 from .options import COUNT, FILE, RecipeChoice
-from .robot import host_and_port
+from .run import host_and_port
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -31,11 +30,10 @@ WAITS = "Seconds that a decision may wait in line; then it is verify, and record
 RATE = "Requests a second of one client; 0: any."
 
 
-@click.command(epilog=options.example("dengine serve --store cell.db --port 8000"))
-@click.option("--store", metavar="FILE|URL", help="Remembers everything; made where there is none.")
+@click.command(epilog=options.ends_in("dengine serve --store cell.db --port 8000"))
+@options.store_option("Remembers everything; made where there is none.")
 @click.option("--demo", is_flag=True, help=DEMO)
 @click.option("--speed", type=SPEED, default=1.0, show_default=True, help="Parts a second of --demo.")
-@options.cell_options("--cell-id", product=True)
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
 @click.option("--token-file", type=FILE, help="A file, its owner's alone, with the token that every request has to say.")
@@ -55,7 +53,7 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
 @click.option("--samples", type=COUNT, default=1000, show_default=True, help="Of a recorded trace.")
-@click.option("--seed", type=click.IntRange(0), help="An integer, of a new store's engine.  [default: 0]")
+@options.new_seed_option
 @options.recipe_options
 def serve(
     choice: RecipeChoice,
@@ -77,7 +75,9 @@ def serve(
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
     machines reach it only with --host, which wants --token-file, and should have --cert and --key.
     """
-    must_have_serve(*(["asyncua"] if how["opcua"] else []))
+    options.must_have("the server", "serve", *NEEDED)
+    if how["opcua"]:
+        options.must_have("OPC UA", "opcua", "asyncua")
     from ..cells import RtdeRecorder
     from ..recipe import Recipe
     from ..serve.demo import POLICY, playing
@@ -111,10 +111,3 @@ def _opened(store: str, seed: int | None, recipe: Recipe | None, shadow: bool, e
     if shadow:
         engine.set_shadow(True, "dengine serve --shadow")
     return engine
-
-
-def must_have_serve(*beside: str) -> None:
-    """SettingError where the server cannot run; asked before anything is made or begun."""
-    if missing := [name for name in (*NEEDED, *beside) if find_spec(name) is None]:
-        extras = "serve,opcua" if "asyncua" in missing else "serve"
-        raise SettingError(f'Expected {", ".join(missing)} for the server, not installed: pip install "dengine[{extras}]".')

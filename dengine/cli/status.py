@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..errors import percent
 from . import options
-from .output import certificate_record, duration, facts, interruptible, show, when, write_json
+from .options import verb
+from .output import Out, as_json, certificate_record, duration, facts, show, tell, when
 
 if TYPE_CHECKING:
     from ..history.status import Judged, Span, Status
-    from ..recipe import Recipe
-    from ..store.peers import CellSummary
 
-STEP = 0.05  # seconds between two looks for Ctrl-C
 Rows = Iterator[tuple[str, str]]
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 GUARANTEES = {
@@ -32,103 +30,76 @@ STOPS = {
     "all": "of all bad parts: an accepted part that no stop follows counts as good",
 }
 SHADOW = "all of what it is certain of: the shadow mode, in which it only says what it would have done"
-
-
 LAST = "The newest so many decisions, looked at apart."
 WATCH = "Show it again every so many seconds, 5 if none are given, until Ctrl-C; after STORE."
 WATCHING: dict[str, Any] = {"type": click.FloatRange(0.1), "is_flag": False, "flag_value": 5.0, "metavar": "[SECONDS]"}
 
 
-@click.command(epilog=options.example("dengine status engine.db --last 500"))
+@verb("dengine status engine.db --last 500")
 @options.store_argument
-@options.cell_options()
 @click.option("--last", type=options.COUNT, default=500, show_default=True, help=LAST)
 @click.option("--watch", **WATCHING, help=WATCH)
-@options.out_file_option
-@options.force_option
-@options.json_option
-def status(store: str, last: int, watch: float | None, out: Path | None, force: bool, as_json: bool) -> None:
+@options.picture_option
+def status(store: str, last: int, watch: float | None, out: Out | None) -> None:
     """Say how an engine is doing, and what its store holds.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. Where it holds
     several cells and none is named, they are listed; cells of one product share labels and versions. The interval of bad
     accepted parts is of one look; what is certified holds however often one looks.
     """
-    if watch is not None and as_json:
+    if watch is not None and as_json():
         raise click.UsageError("--watch and --json exclude each other.")
+    from ..files import check_output
+    from ..records import plain
+    from ..store.base import must_be_there
+    from ..store.peers import list_cells
+    from ..store.records import CellAddress, address
+
     if out is not None:
-        from ..files import check_output
-
-        check_output(out, force)
-    if cells := _several(store):
-        if as_json:
-            write_json({"verb": "status", "store": store, "cells": cells})
+        check_output(out.path, out.force)
+    if not isinstance(store, CellAddress):
+        must_be_there(store)
+        first, *others = cells = list_cells(store)
+        if others:
+            columns = [name.replace("_id", "").replace("_", " ") for name in asdict(first)]
+            rows = [tuple(map(_cell, asdict(each).items())) for each in cells]
+            said = "Name one of them, --cell NAME, and how it is doing is shown."
+            tell({"store": store, "cells": cells}, facts(store, rows, columns), said)
             return
-        show(_cells_table(store, cells), "Name one of them, --cell NAME, and how it is doing is shown.")
-        return
-    found = _read(store, last, out)
-    files = [] if out is None else [out]
-    if as_json:
-        from ..records import plain
-
-        said = plain(found) | {"certificate": certificate_record(found.certificate)}
-        write_json({"verb": "status", "store": store} | said | {"files": files})
-        return
-    show(*_tables(store, found), *(f"Wrote {path}" for path in files))
-    with interruptible() as asked:  # Ctrl-C is how watching ends, so that is no failure
+        store = address(store, first.cell_id)
+    found, picture = _read(store, last, out)
+    record = {"store": store} | plain(found) | {"certificate": certificate_record(found.certificate)}
+    tell(record, *_tables(store, found), out=out, made=lambda: picture)
+    with suppress(KeyboardInterrupt):  # Ctrl-C is how watching ends, so that is no failure
         while watch is not None:
-            end = time.monotonic() + watch
-            while (left := end - time.monotonic()) > 0:
-                if asked():
-                    return
-                time.sleep(min(STEP, left))
-            tables = _tables(store, _read(store, last, out))
+            time.sleep(watch)
+            found, picture = _read(store, last, out)
+            if out is not None:
+                replace(out, force=True).write(picture)
             if sys.stdout.isatty():
                 click.clear()
-            show(*tables)
+            show(*_tables(store, found))
 
 
-def _read(store: str, last: int, out: Path | None) -> Status:
+def _read(store: str, last: int, out: Out | None) -> tuple[Status, dict[str, Any]]:
     """The status, and its picture where one is asked for."""
+    from ..experiments.figures import status_picture
     from ..history.status import course
     from ..history.status import status as status_of
     from ..store.base import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
-        if out is not None:
-            from ..experiments.figures import save, status_picture
-
-            title = f"{found.cell}: {found.recipe.name}"
-            save(status_picture(course(opened, found.recipe, last), title), out, force=True)
-        return found
+        if out is None:
+            return found, {}
+        return found, {"": status_picture(course(opened, found.recipe, last), f"{found.cell}: {found.recipe.name}")}
 
 
-def _several(store: str) -> list[CellSummary]:
-    """The cells of a database that holds others than the one that is meant where none is named; else none."""
-    from ..store.base import must_be_there
-    from ..store.peers import list_cells
-    from ..store.records import CellAddress
-
-    if isinstance(store, CellAddress):
-        return []
-    must_be_there(store)
-    found = list_cells(store)
-    return found if len(found) > 1 or found[0].cell_id != "cell" else []
-
-
-def _cells_table(store: str, found: list[CellSummary]) -> Any:
-    columns: dict[str, Callable[[CellSummary], str]] = {
-        "cell": lambda cell: cell.cell_id,
-        "product": lambda cell: cell.product or "-",
-        "decisions": lambda cell: f"{cell.decisions:,}",
-        "labels": lambda cell: f"{cell.labels:,}",
-        "version": lambda cell: "-" if cell.version is None else str(cell.version),
-        "last seen (UTC)": lambda cell: when(cell.last_seen, "%Y-%m-%d %H:%M:%S"),
-    }
-    if any(cell.owner for cell in found):
-        columns["owner"] = lambda cell: cell.owner or "-"
-    return facts(store, [tuple(cell_of(each) for cell_of in columns.values()) for each in found], tuple(columns))
+def _cell(named: tuple[str, Any]) -> str:
+    name, value = named
+    if name == "last_seen":
+        return when(value)
+    return "-" if value is None else f"{value:,}" if isinstance(value, int) else value
 
 
 def _tables(store: str, found: Status) -> list[Any]:
@@ -143,16 +114,18 @@ def _tables(store: str, found: Status) -> list[Any]:
 
 
 def _span_rows(span: Span, alpha: float) -> Rows:
+    of = span.decisions
     yield "from", when(span.first)
-    yield "verified", _of(span.verified, span.decisions)
-    yield "accepted", _of(span.accepted, span.decisions)
+    yield "verified", _of(span.verified, of)
+    yield "accepted", _of(span.accepted, of)
     yield "of them bad", _bad(span, alpha) if span.accepted else "none was accepted"
-    yield "rejected", _of(span.rejected, span.decisions)
-    yield "audits", _of(span.audits, span.decisions)
-    yield "would accept", _would(span.would_accept, "bad")
-    yield "would reject", _would(span.would_reject, "good")
-    yield "novel", _of(span.novel, span.decisions)
-    yield "safe mode", _of(span.safe_mode, span.decisions)
+    yield "rejected", _of(span.rejected, of)
+    yield "audits", _of(span.audits, of)
+    for name, said, wrong in (("accept", span.would_accept, "bad"), ("reject", span.would_reject, "good")):
+        checked = f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {_held(said, '95 %')}"
+        yield f"would {name}", checked if said.n else "none was checked"
+    yield "novel", _of(span.novel, of)
+    yield "safe mode", _of(span.safe_mode, of)
     yield "bad traces", f"{span.quarantined:,}" + (f", and {span.errors:,} model errors" if span.errors else "")
     yield "retrains", f"{span.retrains:,}, {sum(span.dropped.values()):,} dropped"
     yield "dropped for", "\n".join(f"{n}: {reason.removeprefix('dropped: ')}" for reason, n in span.dropped.items()) or "-"
@@ -167,14 +140,9 @@ def _bad(span: Span, alpha: float) -> str:
     bad = span.bad_accepts
     if not bad.by:
         return f"{span.stops:,} known; of the others nothing is"
-    lead = f"{bad.wrong:,} of {bad.known:,}{' audited' if bad.by == 'audits' else ''}"
-    stops = f", beside {span.stops:,} stops" if bad.by == "audits" and span.stops else ""
-    return f"{lead}{stops}: {_held(bad, f'alpha {alpha:g}')}"
-
-
-def _would(said: Judged, wrong: str) -> str:
-    """What checks said of parts that the model was certain of."""
-    return f"{said.n:,} checked, {said.wrong:,} of them {wrong}: {_held(said, '95 %')}" if said.n else "none was checked"
+    audited = bad.by == "audits"
+    stops = f", beside {span.stops:,} stops" if audited and span.stops else ""
+    return f"{bad.wrong:,} of {bad.known:,}{' audited' if audited else ''}{stops}: {_held(bad, f'alpha {alpha:g}')}"
 
 
 def _held(said: Judged, level: str) -> str:
@@ -184,37 +152,30 @@ def _held(said: Judged, level: str) -> str:
 
 
 def _settings_rows(found: Status) -> Rows:
-    recipe, policy = found.recipe, found.recipe.policy
+    recipe, policy, spec = found.recipe, found.recipe.policy, found.trace
     if found.model is not None:  # reducer and numbers of the recipe have no effect: to show them would be a lie
         yield "model", f"{found.model}, decides by its own rule"
     else:
         yield "reducer", f"{recipe.name}, seed {found.settings.get('seed', '0')}"
         yield "policy", f"alpha {policy.alpha:g}, LB {percent(policy.lower_bound, 'g')}, {policy.interval} interval"
         yield "guarantee", GUARANTEES.get(policy.guarantee, policy.guarantee)
-        yield "neighbours", _neighbours(recipe)
+        if recipe.fraction is None:
+            yield "neighbours", f"within a radius of {recipe.radius:g}, in the unit of the scaled embedding"
+        else:
+            rejects = recipe.reject_fraction or recipe.fraction
+            shares = f"{percent(recipe.fraction, 'g')}, to reject {percent(rejects, 'g')}"
+            yield "neighbours", f"the nearest {shares}, of the references"
         yield "novelty", f"verified beyond {recipe.novelty:g} times the usual distance" if recipe.novelty else "off"
     yield "stops known", STOPS[policy.stops]
     yield "audits", SHADOW if found.shadow else f"{percent(policy.audit_rate, 'g')} of what it is certain of"
     schedule = f"every {recipe.retrain_every} new labels, within {duration(recipe.budget)}"
     yield "retrain", f"{schedule}, on the newest {recipe.window:,}"
-    yield "trace", _contract(found)
-
-
-def _neighbours(recipe: Recipe) -> str:
-    if recipe.fraction is None:
-        return f"within a radius of {recipe.radius:g}, in the unit of the scaled embedding"
-    judged = "" if recipe.reject_fraction is None else f"; a rejection is judged by {percent(recipe.reject_fraction, 'g')}"
-    return f"the nearest {percent(recipe.fraction, 'g')} of the references{judged}"
-
-
-def _contract(found: Status) -> str:
-    spec = found.trace
     if spec is None:
-        return "none yet: the first trace sets it"
-    channels = "" if spec.channels == 1 else f"{spec.channels} channels of "
-    limit = "" if spec.limit is None else f", sensor limit {spec.limit:g} {spec.unit}"
-    seconds = duration(spec.samples / spec.rate_hz)
-    return f"{channels}{spec.samples} samples at {spec.rate_hz:g} Hz ({seconds}), in {spec.unit}{limit}"
+        yield "trace", "none yet: the first trace sets it"
+    else:
+        limit = "" if spec.limit is None else f", sensor limit {spec.limit:g} {spec.unit}"
+        length = f"{spec.samples} samples at {spec.rate_hz:g} Hz ({duration(spec.samples / spec.rate_hz)})"
+        yield "trace", f"{spec.channels} x {length}, in {spec.unit}{limit}"
 
 
 def _count_rows(found: Status) -> Rows:
@@ -223,13 +184,12 @@ def _count_rows(found: Status) -> Rows:
         yield "product", f"{found.product}: labels and versions are shared with its other cells"
     yield "decisions", f"{found.ever.decisions}: {_listed(found.actions)}"
     yield "reasons", _listed(found.reasons)
-    yield "quarantined", str(found.ever.quarantined)
     yield "labels", f"{found.labels}: {_listed(found.sources)}"
     yield "labels waiting", f"{found.new_labels:,} new, a retrain is due at {found.recipe.retrain_every:,}"
     yield "never reported", f"{found.ever.unlabelled:,} verified, {found.unreported:,} accepted"
     if found.corrected or found.forgotten:
         yield "put right", f"{found.corrected} labels corrected, {found.forgotten} more forgotten"
-    yield "first, last", f"{when(found.ever.first)} to {when(found.ever.last)}"
+    yield "newest", when(found.ever.last)
     if found.write_failures:
         yield "write failures", str(found.write_failures)
 
@@ -239,28 +199,19 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 def _promise_rows(found: Status) -> Rows:
-    novel, decisions = found.ever.novel, found.ever.decisions
-    recent = f"of the newest {found.recent:,} that labels tell of, {_of(found.recent_novel, found.recent)}"
-    share = f" ({percent(novel / decisions)})" if decisions else ""
-    yield "novel", f"{novel:,} of {decisions:,} decisions{share}; {recent}"
+    yield "novel", f"of the newest {found.recent:,} that labels tell of, {_of(found.recent_novel, found.recent)}"
     since = when(found.safe_mode_time)
     mode = f"on since {since}, every part is verified: {found.safe_mode}" if found.safe_mode else f"off, ended {since}"
     yield "safe mode", "off" if found.safe_mode_time is None else mode
-    if (watch := found.watch) is not None:
-        way = (("accepts", watch.accepts), ("rejects", watch.rejects), ("novelty", watch.novelty))
-        yield "way to an alarm", ", ".join(f"{name} {percent(share, '.0f')}" for name, share in way)
+    if found.watch is not None:
+        yield "way to an alarm", ", ".join(f"{name} {percent(share, '.0f')}" for name, share in asdict(found.watch).items())
     yield "accepted", f"{found.certificate.sentence} {found.certificate.advice}"
     yield "rejected", found.certificate.sentence_on_rejects
 
 
 def _retrain_rows(found: Status) -> Rows:
-    reports = [each.report for each in found.retrains]
-    dropped = [each for each in reports if not each.accepted]
     yield "version", str(found.version) if found.version else "none yet: every part is verified"
-    yield "retrains", f"{len(reports)}, {len(dropped)} dropped"
-    if dropped:
-        yield "last drop", dropped[-1].reason
-    if reports:
+    if reports := [each.report for each in found.retrains]:
         last, worst = reports[-1], max(reports, key=lambda each: each.seconds)
-        yield "last retrain", f"{duration(last.seconds)} on {last.n_traces} traces, {last.n_steps} steps"
+        yield "last retrain", f"{duration(last.seconds)} on {last.n_traces} traces, {last.n_steps} steps: {last.reason}"
         yield "worst retrain", f"{duration(worst.seconds)}, to version {worst.version}"

@@ -1,33 +1,152 @@
-"""`dengine verify` and `dengine import-labels`: a store's history checked, and a cell program's labels taken into it."""
+"""What is done to a store by hand: `dengine correct`, `forget`, `rollback`, `policy`, `retrain`, `verify` and others."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import getpass
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from . import options
-from .output import imported_line, progress, show, write_json
+from .options import POLICY, Known, verb
+from .output import certificate_record, facts, imported_line, progress, tell
 
 if TYPE_CHECKING:
+    from ..engine.corrections import Changed
+    from ..engine.engine import DataEngine
     from ..store.verification import HistoryReport
 
+LABELS = {"good": True, "bad": False}
 SHOWN = 20  # faults that a screen shows
 
 
-@click.command(epilog=options.example("dengine verify engine.db"))
-@options.store_argument
-@click.option("--cell", metavar="ID", help="Of this cell alone.  [default: of all cells]")
-@click.option(
-    "--expect",
-    metavar="DIGEST",
-    help="A digest that an earlier check showed: the history must still hold it, or it was cut off or made anew.",
+def _login() -> str:
+    """The login name; "" where the system has none for this user."""
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # in a container a number may have no name
+        return ""
+
+
+shadow_option = click.option(
+    "--shadow",
+    type=click.Choice(["on", "off"]),
+    callback=lambda context, option, state: None if state is None else state == "on",
+    help="Verify every part, and let the model only say what it would have done; or let it decide again.",
 )
-@options.json_option
+interval_option = click.option("--interval", type=Known("interval"), help="The confidence interval.")
+author_option = click.option("--author", default=_login, help="Who says so, for the record.  [default: the login name]")
+
+
+def _changed(store: str, author: str, change: Callable[[DataEngine], Changed]) -> None:
+    """Open the store's engine, change something, and say what happened."""
+    from ..engine.engine import DataEngine
+    from ..store.base import UNHURRIED
+
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
+        changed = change(engine)
+        certificate, policy = engine.certificate(), engine.policy
+    recorded = "" if changed.event is None else f" Event {changed.event}, by {author or 'nobody named'}."
+    record = {"store": store, "author": author, "changed": changed.event is not None} | asdict(changed)
+    tell(record | {"policy": policy, "certificate": certificate_record(certificate)}, f"{changed.text}{recorded}")
+
+
+@verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
+@options.store_argument
+@click.argument("decision", metavar="ID")
+@click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@author_option
+def correct(store: str, decision: str, label: str, author: str) -> None:
+    """Say that a label was wrong: the part was good, or bad.
+
+    From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
+    decided; the correction is a later row. A forgotten label counts again by it.
+    """
+    _changed(store, author, lambda engine: engine.correct(decision, LABELS[label], author))
+
+
+@verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
+@options.store_argument
+@click.argument("decisions", metavar="ID...", nargs=-1, required=True)
+@click.option("--reason", default="", help="Why, for the record.")
+@author_option
+def forget(store: str, decisions: tuple[str, ...], reason: str, author: str) -> None:
+    """Leave labels out of all that is learned and counted.
+
+    Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
+    where one is unknown or has no label, none.
+    """
+    _changed(store, author, lambda engine: engine.forget(*decisions, author=author, reason=reason))
+
+
+@verb("dengine rollback engine.db 1")
+@options.store_argument
+@click.argument("version", metavar="VERSION", type=int)
+@author_option
+def rollback(store: str, version: int, author: str) -> None:
+    """Let an earlier model version answer again, as a new one.
+
+    Labels that came since are among its references, and corrections count.
+    """
+    _changed(store, author, lambda engine: engine.rollback(version, author))
+
+
+@verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
+@options.store_argument
+@options.gathered("settings", options.given, POLICY | {"interval": interval_option, "shadow": shadow_option})
+@author_option
+def policy(store: str, settings: dict[str, Any], author: str) -> None:
+    """Show the policy in force, or decide by another one.
+
+    What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
+    and the certificate, start anew: a tolerance that is chosen after the data was seen needs fresh evidence. The shadow
+    mode lasts over restarts; `dengine status` counts what the model would have done, and how much of that was wrong.
+    """
+    if settings:
+        _changed(store, author, lambda engine: engine.set_policy(replace(engine.policy, **settings), author))
+        return
+    from ..engine.engine import DataEngine
+
+    with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
+        now = engine.policy
+    rows = [(name, str(value)) for name, value in asdict(now).items()]
+    tell({"store": store, "changed": False, "policy": now}, facts(f"{store}: the policy in force", rows))
+
+
+@verb("dengine retrain engine.db")
+@options.store_argument
+@author_option
+def retrain(store: str, author: str) -> None:
+    """Train now, on the store's labels as they count.
+
+    A candidate that fails its gate is dropped and recorded, and the version before goes on answering.
+    """
+    from ..engine.engine import DataEngine
+    from ..experiments.tables import retrain_line
+    from ..store.base import UNHURRIED
+
+    with DataEngine.open(store, wait=UNHURRIED) as engine:
+        report = engine.retrain()
+        text = f"trained by hand on {report.n_traces} traces: {report.reason}"
+        engine.store.put_event("retrain", text, asdict(report), author)
+    answers = f"Version {report.version} answers." if report.version else "No version answers yet."
+    tell({"store": store, "author": author, "retrain": report}, f"{answers} {retrain_line([report])}")
+    if not report.accepted:
+        raise click.ClickException(f"The retrain was {report.reason}.")
+
+
+EXPECT = "A digest that an earlier check showed: the history must still hold it, or it was cut off or made anew."
+
+
+@verb("dengine verify engine.db")
+@click.argument("store", metavar="STORE")
+@click.option("--cell", metavar="ID", help="Of this cell alone.  [default: of all cells]")
+@click.option("--expect", metavar="DIGEST", help=EXPECT)
 @click.pass_context
-def verify(context: click.Context, store: str, cell: str | None, expect: str | None, as_json: bool) -> None:
+def verify(context: click.Context, store: str, cell: str | None, expect: str | None) -> None:
     """Check that a store's history is what was written.
 
     Every row is held against its sum, and every entry of the ledger against its rows; what was changed, is missing or was
@@ -35,12 +154,9 @@ def verify(context: click.Context, store: str, cell: str | None, expect: str | N
     """
     from ..store.verification import count_rows, verify_history
 
-    with progress("rows", count_rows(store, cell), quiet=as_json) as advance:
+    with progress("rows", count_rows(store, cell)) as advance:
         report = verify_history(store, cell, expect, advance)
-    if as_json:
-        write_json({"verb": "verify", "store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults})
-    else:
-        show(*_lines(report))
+    tell({"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}, *_lines(report))
     if not report.ok:
         context.exit(1)
 
@@ -60,13 +176,11 @@ def _lines(report: HistoryReport) -> list[str]:
     return [*lines, f"Faults: {len(report.faults)}. This history is not as it was written."]
 
 
-@click.command("import-labels", epilog=options.example("dengine import-labels cell.csv --store engine.db"))
+@verb("dengine import-labels cell.csv --store engine.db")
 @click.argument("journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path))
-@click.option("--store", required=True, metavar="FILE|URL", help="The store that the cell's model was exported from.")
+@options.store_option("The store that the cell's model was exported from.", "--cell", required=True)
 @click.option("--any-model", is_flag=True, help="Take a journal of a model that the store does not know as its export.")
-@options.cell_options()
-@options.json_option
-def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> None:
+def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Take a cell program's labels back into the store.
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is imported.
@@ -74,7 +188,4 @@ def import_labels(journal: Path, store: str, any_model: bool, as_json: bool) -> 
     from ..export.cell_journal import import_journal
 
     report = import_journal(store, journal, any_model=any_model)
-    if as_json:
-        write_json({"verb": "import-labels", "store": store, "journal": journal} | asdict(report))
-        return
-    show(imported_line(report, store))
+    tell({"store": store, "journal": journal} | asdict(report), imported_line(report, store))

@@ -137,7 +137,7 @@ def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path
 def test_every_help_ends_in_a_command_that_works(
     verb: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if verb in ("run", "simulate"):
+    if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make their own
         shutil.copy(file, tmp_path)
@@ -325,7 +325,6 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
     [
         ["status", "missing.db"],
         ["replay", "--data", "missing.npz"],
-        ["replay", "--reducer", "missing", "--data", "DATA"],
         ["replay", "--recipe", "missing.toml", "--data", "DATA"],
         ["replay", "--data", "DATA", "--cycles", "5000"],
         ["replay", "--data", "DATA", "--part", "serial"],
@@ -353,6 +352,10 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(
         (["replay", "--alpha", "2"], "2.0 is not in the range"),
         (["replay", "--lower-bound", "0.4"], "0.4 is not in the range"),
         (["replay", "--guarantee", "global"], "'global' is not one of 'local', 'pooled'"),
+        (
+            ["replay", "--reducer", "missing"],
+            "'missing' is not one of 'conv', 'umap', 'pca', 'rocket', 'paper', or FILE.toml",
+        ),
         (["replay", "--stops", "most"], "'most' is not one of 'all', 'some'"),
         (["replay", "--audit-rate", "1"], "1.0 is not in the range 0.0<=x<1.0"),
         (["replay", "--novelty", "-1"], "-1.0 is not in the range x>=0.0"),
@@ -406,7 +409,7 @@ def test_times_and_sizes_are_as_a_person_writes_them(write: Callable[[float], st
     assert write(value) == expected
 
 
-@pytest.mark.parametrize("words", ["run --cycles 3 --store e.db", "simulate --n 3 --out traces.npz"])
+@pytest.mark.parametrize("words", ["run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out traces.npz"])
 def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
     words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -474,7 +477,7 @@ def test_a_run_and_its_status_say_when_safe_mode_began_and_what_is_certified(cha
     ):
         assert words in out
     assert re.search(r"safe mode on since \d{4}-\d\d-\d\d ", out)
-    assert re.search(r"novel \d+ of 320 decisions \(\d+\.\d %\); of the newest \d+ that labels tell of, \d+ \(", out)
+    assert re.search(r"novel of the newest \d+ that labels tell of, \d+ \(", out)
     held = document("status", store)
     assert (held["certificate"], held["safe_mode"]) == (shown["certificate"], "too many traces were novel")
     assert held["safe_mode_time"] == held["events"][-1]["time"]

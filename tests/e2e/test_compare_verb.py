@@ -106,7 +106,7 @@ def test_the_help_names_every_rival() -> None:
         ("--feedback silence", 2, "'silence' is not one of"),
         ("--reducers pca,pca", 2, "a name of its own"),
         ("--intervals wald", 2, "'wald' is not one of 'wilson', 'binomial'"),
-        ("--reducers nearest", 1, "Expected a recipe among"),
+        ("--reducers nearest", 2, "'nearest' is not one of 'conv'"),
     ],
 )
 def test_a_wrong_list_says_what_was_expected(asked: str, code: int, expected: str) -> None:

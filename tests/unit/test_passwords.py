@@ -99,7 +99,7 @@ def test_no_verb_shows_the_password_of_what_it_cannot_use(words: list[str], tmp_
 
 def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
     assert SECRET not in json.dumps(plain({"store": NOBODY, "all": [NOBODY, (NOBODY,)], "path": Path(NOBODY)}))
-    with progress(f"importing {NOBODY}", 3, False) as advance:
+    with progress(f"importing {NOBODY}", 3) as advance:
         advance(3)
     assert SECRET not in "".join(capsys.readouterr())
 
