@@ -57,9 +57,9 @@ def stream(scenario: str, cycles: int, seed: int, n_jobs: int, folder: Path) -> 
     """The scenario's labelled traces, simulated where they are not there yet."""
     path = folder / f"{scenario}_{cycles}_{seed}.npz"
     if not path.is_file():
-        from dengine.cells.simulation.generate import save_traces, simulate
+        from dengine.cells.simulation.generate import save_insertions, simulate
 
-        save_traces(path, simulate(cycles, seed, scenario, n_jobs))
+        save_insertions(path, simulate(cycles, seed, scenario, n_jobs), seed, scenario)
     return path
 
 

@@ -115,12 +115,12 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
 
     options.must_have("the simulated cell", "sim", "mujoco")
     check_output(out, force)  # before minutes of physics
-    from ..cells.simulation.generate import save_traces
-    from ..cells.simulation.generate import simulate as simulate_traces
+    from ..cells.simulation.generate import save_insertions
+    from ..cells.simulation.generate import simulate as simulated
 
     with progress(f"simulating {scenario}", n) as advance:
-        traces = simulate_traces(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
-    path, good = save_traces(out, traces, force), int(traces.y.sum())
+        insertions = simulated(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
+    path, good = save_insertions(out, insertions, seed, scenario, force), sum(each.success for each in insertions)
     record = {"simulated": True, "scenario": scenario, "n": n, "successes": good, "file": path}
     tell(record, f"Simulated {n} insertions ({scenario}): {good} successes, {n - good} failures.", f"Wrote {path}")
 

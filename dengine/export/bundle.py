@@ -21,7 +21,6 @@ import re
 import secrets
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -34,7 +33,7 @@ from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
 from ..errors import ExportError, OutputError
-from ..files import check_output, write_output
+from ..files import UNREADABLE, check_output, write_output
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
@@ -45,7 +44,6 @@ SCHEMA = 2
 METADATA = "dengine.json"
 SHA256 = re.compile(r"[0-9a-f]{64}")
 SUM_BYTES = 2**16
-UNREADABLE = (zipfile.BadZipFile, zlib.error, StopIteration, ValueError, EOFError, NotImplementedError, RuntimeError)
 
 KeyFile = str | os.PathLike[str]
 
@@ -61,9 +59,8 @@ def make_key(path: KeyFile) -> Path:
     except FileExistsError as error:
         raise ExportError(f"{target} is there already, and files may be signed with it; name a new one.") from error
     except OSError as error:
-        raise ExportError(
-            f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
-        ) from error
+        said = f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
+        raise ExportError(said) from error
     with os.fdopen(descriptor, "w", encoding="ascii") as file:
         file.write(secrets.token_hex(32) + "\n")
         file.flush()
@@ -76,29 +73,13 @@ def signature(content: bytes, key: KeyFile) -> str:
     try:
         secret = Path(key).read_bytes().rstrip(b"\r\n")
     except OSError as error:
-        raise ExportError(
-            f"The key's file {key} cannot be read: {error.strerror}; dengine export --make-key writes one."
-        ) from error
+        said = f"The key's file {key} cannot be read: {error.strerror}; dengine export --make-key writes one."
+        raise ExportError(said) from error
     if len(secret) < SHORTEST_KEY:
         raise ExportError(
             f"Expected a key of {SHORTEST_KEY} bytes or more in {key}, got {len(secret)}; use dengine export --make-key."
         )
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
-
-
-def check_signature(path: Path, content: bytes, key: KeyFile) -> None:
-    """ExportError unless the content was signed with this key."""
-    found = signature(content, key)
-    try:
-        known = listed(beside(path, "sig").read_text(encoding="utf-8"), path.name)
-    except FileNotFoundError as error:
-        raise ExportError(
-            f"A key was given, and {path} is not signed: {error.filename} is missing; export it anew with it."
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ExportError(f"The signature of {path} cannot be read: {error}.") from error
-    if not any(hmac.compare_digest(each.encode(), found.encode()) for each in known):
-        raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
 
 
 def beside(path: Path, suffix: str) -> Path:
@@ -109,16 +90,6 @@ def beside(path: Path, suffix: str) -> Path:
 def sum_file(path: Path) -> Path:
     """Where the checksum lies."""
     return beside(path, "sha256")
-
-
-def listed(text: str, name: str) -> list[str]:
-    """The first words of the lines that are about a file, or about none in particular.
-
-    A file that was renamed together with its one line is still known by it.
-    """
-    lines = [line.strip().partition(" ") for line in text.splitlines() if line.strip()]
-    found = [word for word, _, about in lines if about.lstrip(" *") in ("", name)]
-    return [lines[0][0]] if not found and len(lines) == 1 else found
 
 
 def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
@@ -231,31 +202,31 @@ def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
 
 
 def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
-    """A file's content; ExportError unless its sum file lists its sum, and, with a key, its signature fits.
+    """A file's content; ExportError unless its sum is as its sum file says, and, with a key, it was signed with this key.
 
     libtorch itself does not notice flipped bits.
     """
     _read(path, most=0)  # of the two it is the file itself that is named where both are missing
-    for _ in range(3):  # an export may replace file and sums between the two looks
-        sums = _sums_of(path)
-        content = _read(path)
-        found = hashlib.sha256(content).hexdigest()
-        if found in sums:
-            if key is not None:
-                check_signature(path, content, key)
-            return content
-        if _sums_of(path) == sums:
-            break
-    expected = " or ".join(f"{digest[:12]}…" for digest in sums)
-    raise ExportError(f"{path} is damaged or truncated: its SHA-256 is {found[:12]}…, expected {expected}; copy it again.")
-
-
-def _sums_of(path: Path) -> list[str]:
-    """The sums that a sum file lists for a file."""
-    sums = listed(_read(sum_file(path), most=SUM_BYTES).decode("utf-8", errors="replace"), path.name)
-    if not sums or any(not SHA256.fullmatch(each) for each in sums):
+    expected = _first_word(_read(sum_file(path), SUM_BYTES))
+    if not SHA256.fullmatch(expected):
         raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
-    return sums
+    content = _read(path)
+    found = hashlib.sha256(content).hexdigest()
+    if found != expected:
+        known = f"its SHA-256 is {found[:12]}…, expected {expected[:12]}…"
+        raise ExportError(f"{path} is damaged or truncated: {known}; copy it again.")
+    if key is not None:
+        signed = signature(content, key)
+        if not (file := beside(path, "sig")).exists():
+            raise ExportError(f"A key was given, and {path} is not signed: {file} is missing; export it anew with it.")
+        if not hmac.compare_digest(_first_word(_read(file, SUM_BYTES)).encode(), signed.encode()):
+            raise ExportError(f"{path} has no signature by the key in {key}: it was changed, or signed with another one.")
+    return content
+
+
+def _first_word(content: bytes) -> str:
+    """Of a sum's or a signature's line; the file's name follows it."""
+    return (content.decode("utf-8", errors="replace").split() or [""])[0]
 
 
 def _read(path: Path, most: int = -1) -> bytes:
@@ -272,7 +243,7 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
     """What the content of a TorchScript file says of itself."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            name = next(n for n in archive.namelist() if n.endswith(f"extra/{METADATA}"))
+            name = next((n for n in archive.namelist() if n.endswith(f"extra/{METADATA}")), METADATA)
             metadata = json.loads(archive.read(name))
     except UNREADABLE as error:
         raise ExportError(f"{path} is not a dengine export: it holds no {METADATA}.") from error

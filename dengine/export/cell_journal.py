@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,22 +40,14 @@ EXPORTED = "export"  # the kind of the events that record a model's sum
 
 @dataclass(frozen=True, slots=True)
 class JournalLine:
-    """A part: its trace (C, T), its label, None where nothing was heard of it, and what was decided, as in `Decision`.
+    """A part: what was decided, its trace (C, T), and its label, None where nothing was heard of it.
 
     late : whether the label came after the next part was decided on; an accepted part has a line of its own before it then.
     """
 
-    id: str
+    decision: Decision
     trace: NDArray[np.float32]
     label: bool | None
-    part: str | None
-    action: Action
-    predicted: Action
-    reason: Reason
-    lower: float
-    upper: float
-    n_success: int
-    n_failure: int
     late: bool = False
 
 
@@ -84,99 +76,83 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
             f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import it with the "
             "dengine whose program wrote it."
         )
-    reader = _Reader(spec)
+    lines: list[JournalLine] = []
+    parts: dict[str, JournalLine] = {}  # by id, as known by now
+    last: list[JournalLine] = []  # the part that was decided on last, while nothing was heard of it
     for number, raw in enumerate(whole[1:], start=2):
-        reader.take(raw, f"line {number} of {path}")
-    waits = reader.open is not None and reader.open.action is Action.ACCEPT
-    reader.settle()
-    lines = [line for line in reader.lines if line.label is not None or line.action is Action.ACCEPT]
+        where = f"line {number} of {path}"
+        kind, *words = _words(raw, where)
+        if kind == "part":
+            line = _part(words, spec, where)
+            if line.decision.id in parts:
+                again = f"Expected one line of the part {line.decision.id}, {where} is another"
+                raise DataError(f"{again}; the journal was pasted together.")
+            lines += last  # the next part comes: no sooner is an accepted one counted of which nothing was heard
+            last = [line] if line.label is None else []
+        else:
+            line = _labelled(words, parts, where)
+            line = replace(line, late=line.decision.id not in [each.decision.id for each in last])
+            last = last if line.late else []
+        parts[line.decision.id] = line
+        lines += [line] if line.label is not None else []
+    waits = any(line.decision.action is Action.ACCEPT for line in last)
+    lines = [line for line in [*lines, *last] if line.label is not None or line.decision.action is Action.ACCEPT]
     if not lines:
         raise DataError(f"{path} holds no labels yet.")
     return Journal(lines, waits, head[3], len(tail))
 
 
-class _Reader:
-    """Takes lines in, one after the other."""
+def _words(raw: bytes, where: str) -> list[str]:
+    """A line's words, its checksum tried and taken off."""
+    said, _, crc = raw.rpartition(b",")
+    if f"{zlib.crc32(said):08x}".encode() != crc:
+        raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
+    try:
+        words = said.decode("utf-8").split(",")
+    except UnicodeDecodeError as error:
+        raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
+    if words[0] not in ("part", "label"):
+        raise DataError(f"Expected a line that begins with part or label in {where}, got {words[0][:20]!r}.")
+    return words
 
-    def __init__(self, spec: TraceSpec) -> None:
-        self.spec = spec
-        self.lines: list[JournalLine] = []
-        self.open: JournalLine | None = None  # the part that was decided on last, while nothing was heard of it
-        self._parts: dict[str, JournalLine] = {}  # by id, as known by now
 
-    def take(self, raw: bytes, where: str) -> None:
-        """Check one line, and take it in."""
-        said, _, crc = raw.rpartition(b",")
-        if f"{zlib.crc32(said):08x}".encode() != crc:
-            raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
-        try:
-            kind, *words = said.decode("utf-8").split(",")
-        except UnicodeDecodeError as error:
-            raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
-        if kind == "part":
-            self._take_part(self._part(words, where), where)
-        elif kind == "label":
-            self._take_label(words, where)
-        else:
-            raise DataError(f"Expected a line that begins with part or label in {where}, got {kind[:20]!r}.")
+def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
+    """An earlier part with its label."""
+    if len(words) != 2 or words[0] not in parts or words[1] not in LABELS:
+        raise DataError(f"Expected an earlier part's id and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}.")
+    known = parts[words[0]]
+    if known.decision.action is Action.REJECT or known.label is not None:
+        raise DataError(f"Expected one label of a part that was not rejected in {where}, got another of {words[0]}.")
+    return replace(known, label=LABELS[words[1]])
 
-    def _take_part(self, line: JournalLine, where: str) -> None:
-        if line.id in self._parts:
-            raise DataError(
-                f"Expected one line of the part {line.id}, {where} is another; the journal was pasted together."
-            )
-        self.settle()
-        self._parts[line.id] = line
-        if line.label is None:
-            self.open = line
-        else:
-            self.lines.append(line)
 
-    def settle(self) -> None:
-        """The next part comes: no sooner is an accepted one counted of which nothing was heard."""
-        if self.open is not None:
-            self.lines.append(self.open)
-        self.open = None
+def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
+    id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
+    try:
+        action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
+        bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
+    except ValueError as error:
+        raise DataError(f"The decision in {where} cannot be read: {error}.") from error
+    if not (0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT):
+        raise DataError(f"Expected bounds between 0 and 1 and counts in {where}, got {','.join(decided[3:7])[:60]!r}.")
+    rejected = action is Action.REJECT
+    if not id_ or (label not in LABELS and label != "") or (rejected and label != ""):
+        raise DataError(f"Expected an id, and a label of 1, 0 or nothing in {where}, got {id_[:20]!r}, {label[:20]!r}.")
+    trace = np.zeros((1, 0), dtype=np.float32) if rejected else _trace(words[10:], spec, where)
+    known = (*bound, None, 0, reason, reason is Reason.AUDIT, 1.0, part or None)
+    return JournalLine(Decision(id_, action, predicted, *known), trace, LABELS.get(label))
 
-    def _take_label(self, words: list[str], where: str) -> None:
-        if len(words) != 2 or words[0] not in self._parts or words[1] not in LABELS:
-            raise DataError(
-                f"Expected an earlier part's id and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}."
-            )
-        known, label = self._parts[words[0]], LABELS[words[1]]
-        if known.action is Action.REJECT or known.label is not None:
-            raise DataError(f"Expected one label of a part that was not rejected in {where}, got another of {known.id}.")
-        late = known is not self.open
-        self._parts[known.id] = replace(known, label=label, late=late)
-        self.lines.append(self._parts[known.id])
-        if not late:
-            self.open = None
 
-    def _part(self, words: list[str], where: str) -> JournalLine:
-        id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
-        try:
-            action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
-            bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
-        except ValueError as error:
-            raise DataError(f"The decision in {where} cannot be read: {error}.") from error
-        if not (0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT):
-            raise DataError(f"Expected bounds between 0 and 1 and counts in {where}, got {','.join(decided[3:7])[:60]!r}.")
-        rejected = action is Action.REJECT
-        if not id_ or (label not in LABELS and label != "") or (rejected and label != ""):
-            raise DataError(f"Expected an id, and a label of 1, 0 or nothing in {where}, got {id_[:20]!r}, {label[:20]!r}.")
-        trace = np.zeros((1, 0), dtype=np.float32) if rejected else self._trace(words[10:], where)
-        return JournalLine(id_, trace, LABELS.get(label), part or None, action, predicted, reason, *bound)
-
-    def _trace(self, words: list[str], where: str) -> NDArray[np.float32]:
-        expected = self.spec.channels * self.spec.samples
-        if len(words) != expected and (self.spec.fit == "strict" or not words or len(words) % self.spec.channels):
-            raise DataError(f"Expected {expected} samples in {where}, got {len(words)}; it is damaged, or of another cell.")
-        try:
-            with np.errstate(over="ignore"):
-                values = np.array([float(word) for word in words]).astype(np.float32)
-        except ValueError as error:
-            raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
-        return as_trace(values.reshape(self.spec.channels, -1), self.spec)
+def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
+    expected = spec.channels * spec.samples
+    if len(words) != expected and (spec.fit == "strict" or not words or len(words) % spec.channels):
+        raise DataError(f"Expected {expected} samples in {where}, got {len(words)}; it is damaged, or of another cell.")
+    try:
+        with np.errstate(over="ignore"):
+            values = np.array([float(word) for word in words]).astype(np.float32)
+    except ValueError as error:
+        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
+    return as_trace(values.reshape(spec.channels, -1), spec)
 
 
 def import_journal(
@@ -221,13 +197,13 @@ def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
     """
     if stops == "some":
         return journal.lines
-    late = {line.id: line.label for line in journal.lines if line.late}
+    late = {line.decision.id: line.label for line in journal.lines if line.late}
     waits = next((line for line in reversed(journal.lines) if line.label is None), None) if journal.waits else None
     return [
         replace(line, label=True) if line.label is None else line
         for line in journal.lines
         # A late label has a line of its own: it brings the stop, and the first line the confirmation.
-        if line is not waits and not (line.action is Action.ACCEPT and late.get(line.id) == line.late)
+        if line is not waits and not (line.decision.action is Action.ACCEPT and late.get(line.decision.id) == line.late)
     ]
 
 
@@ -241,25 +217,23 @@ def _import_lines(
     silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
     for start in range(0, len(lines), CHUNK):
         labels: list[NewLabel] = []
-        for i in range(start, min(start + CHUNK, len(lines))):
-            line, (fault, hash_) = lines[i], looks[i]
-            held = store.get_decision(line.id)
+        for line, (fault, hash_) in zip(lines[start : start + CHUNK], looks[start : start + CHUNK], strict=True):
+            decision, label = line.decision, line.label
+            held = store.get_decision(decision.id)
             if held is None:
-                audit, reason = line.reason is Reason.AUDIT, REASONS[fault] if fault else line.reason
-                counted = line.lower, line.upper, line.n_success, line.n_failure
-                propensity = 1.0 if line.predicted is Action.VERIFY else policy.audited_share
-                told = (*counted, None, 0, reason, audit, propensity, line.part)
-                decision = Decision(line.id, line.action, line.predicted, *told)
-                store.put_decision(decision, line.trace, own_hash(hash_, line.part), bool(fault))
+                propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
+                reason = REASONS[fault] if fault else decision.reason
+                new = replace(decision, reason=reason, propensity=propensity)
+                store.put_decision(new, line.trace, own_hash(hash_, decision.part), bool(fault))
             elif held.source is not None:  # a forgotten one has a label too
-                if line.label is not None:
-                    counts["known" if line.label == held.success else "contradicted"] += 1
+                if label is not None:
+                    counts["known" if label == held.success else "contradicted"] += 1
                 continue
-            if counts_silence and line.action is Action.ACCEPT:  # one that was held without a label was counted as silent
-                silent += (line.label is None) - (held is not None)
-            if line.label is not None:
-                source = source_of(line.id, line.action, line.reason is Reason.AUDIT, line.label)
-                labels.append(NewLabel(line.id, line.label, source, 0, None, 0 if fault else silent))
+            if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
+                silent += (label is None) - (held is not None)
+            if label is not None:
+                source = source_of(decision.id, decision.action, decision.audit, label)
+                labels.append(NewLabel(decision.id, label, source, 0, None, 0 if fault else silent))
                 silent = silent if fault else 0
                 counts["quarantined" if fault else "imported"] += 1
         if labels:

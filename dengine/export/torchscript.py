@@ -146,17 +146,15 @@ class ExportedModel:
 
         The trace becomes a reference, and the rule is told. A faulty trace is not learned from.
         """
-        return self._tell(self.module.learn, trace, as_success(success), _hash_of(part))
+        with torch.inference_mode():
+            x = torch.from_numpy(as_trace(trace, self.trace))
+            held: int = self.module.learn(x, as_success(success), _hash_of(part))
+        self.metadata["references"] = held
+        return held
 
     def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
         """Tell that an accepted part was bad and stopped the system; as `learn`."""
-        return self._tell(self.module.stop, trace, _hash_of(part))
-
-    def _tell(self, method: Any, trace: ArrayLike, *what: Any) -> int:
-        with torch.inference_mode():
-            held: int = method(torch.from_numpy(as_trace(trace, self.trace)), *what)
-        self.metadata["references"] = held
-        return held
+        return self.learn(trace, False, part)
 
     @property
     def safe_mode(self) -> str:

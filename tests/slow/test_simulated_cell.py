@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from dengine.cells.simulation.cell import SimulatedCell, insert_once
+from dengine.cells.simulation.cell import Insertion, SimulatedCell, insert_once
 from dengine.cells.simulation.conditions import SCENARIOS, CellParameters, Conditions, draw_conditions, find_scenario
-from dengine.cells.simulation.generate import save_traces, simulate, simulate_balanced
+from dengine.cells.simulation.generate import save_insertions, simulate
 from dengine.cells.simulation.world import push
 from dengine.errors import DengineError, SettingError
 from dengine.records import Outcome
@@ -49,10 +49,14 @@ def test_a_part_beside_the_hole_rests_on_the_rim_at_the_force_limit() -> None:
     assert pushed.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
 
 
+def traces(insertions: list[Insertion]) -> np.ndarray:
+    return np.stack([each.trace for each in insertions])
+
+
 def test_a_trace_depends_on_seed_and_cycle_only() -> None:
-    few, many = simulate(3, seed=9, n_jobs=1), simulate(6, seed=9, n_jobs=2)
-    np.testing.assert_array_equal(few.X, many.X[:3])
-    assert not np.array_equal(few.X, simulate(3, seed=10, n_jobs=1).X)
+    few, many = traces(simulate(3, seed=9, n_jobs=1)), traces(simulate(6, seed=9, n_jobs=2))
+    np.testing.assert_array_equal(few, many[:3])
+    assert not np.array_equal(few, traces(simulate(3, seed=10, n_jobs=1)))
 
 
 def test_the_cell_still_makes_the_bundled_traces() -> None:
@@ -60,17 +64,6 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
         bundled, cycles, seed = stored["X"][:5] * stored["scale"], stored["cycle"][:5], int(stored["seed"])
     made = np.stack([insert_once(CellParameters(), seed, int(cycle)).trace for cycle in cycles])
     assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
-
-
-def test_quotas_keep_the_first_of_each_label_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("dengine.cells.simulation.generate._BLOCK", 5)
-    traces = simulate_balanced(successes=2, failures=2, seed=5, n_jobs=1)
-    assert sorted(traces.y) == [0, 0, 1, 1]
-    assert list(traces.cycle) == sorted(traces.cycle)
-    whole = simulate(int(traces.cycle[-1]) + 1, seed=5, n_jobs=1)
-    np.testing.assert_array_equal(whole.X[traces.cycle], traces.X)
-    for label in (0, 1):
-        np.testing.assert_array_equal(np.flatnonzero(whole.y == label)[:2], traces.cycle[traces.y == label])
 
 
 def test_the_clock_charges_cycles_verifications_and_stops() -> None:
@@ -131,9 +124,10 @@ def test_scenarios_change_what_they_say_and_nothing_else() -> None:
 
 def test_a_bias_jump_shifts_the_force_and_keeps_the_truth() -> None:
     before, after = simulate(4, seed=1, n_jobs=1), simulate(4, seed=1, n_jobs=1, scenario="bias_jump")
-    np.testing.assert_array_equal(before.height_mm, after.height_mm)
-    np.testing.assert_array_equal(before.X[:2], after.X[:2])
-    np.testing.assert_allclose(after.X[2:].mean(axis=1) - before.X[2:].mean(axis=1), 8.0, atol=0.2)
+    assert [each.height_mm for each in before] == [each.height_mm for each in after]
+    moved = traces(after) - traces(before)
+    assert not moved[:2].any()
+    np.testing.assert_allclose(moved[2:].mean(axis=1), 8.0, atol=0.2)
 
 
 def test_the_sensor_draw_does_not_touch_the_world() -> None:
@@ -166,11 +160,11 @@ def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None
 
 @pytest.mark.parametrize(("channels", "shape"), [("z", (4, 1000)), ("all", (4, 6, 1000))])
 def test_saved_traces_come_back_within_one_step(tmp_path, channels: str, shape: tuple[int, ...]) -> None:
-    traces = simulate(4, seed=6, n_jobs=1, channels=channels)
-    with np.load(save_traces(tmp_path / "traces.npz", traces), allow_pickle=False) as saved:
+    made = simulate(4, seed=6, n_jobs=1, channels=channels)
+    with np.load(save_insertions(tmp_path / "traces.npz", made, seed=6), allow_pickle=False) as saved:
         assert saved["X"].dtype == np.int16
         assert saved["X"].shape == shape
-        np.testing.assert_allclose(saved["X"] * saved["scale"], traces.X, atol=0.51 * float(saved["scale"].max()))
-        np.testing.assert_array_equal(saved["y"], traces.y)
-        np.testing.assert_array_equal(saved["cause"], traces.cause)
+        np.testing.assert_allclose(saved["X"] * saved["scale"], traces(made), atol=0.51 * float(saved["scale"].max()))
+        np.testing.assert_array_equal(saved["y"], [each.success for each in made])
+        np.testing.assert_array_equal(saved["cause"], [each.cause for each in made])
         assert float(saved["rate_hz"]) == 500

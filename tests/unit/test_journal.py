@@ -78,7 +78,7 @@ def test_a_journal_reads_as_it_was_written(make_data: Callable[..., Dataset], tm
     back = read_journal(write(tmp_path / "cell.csv", new.X, new.y), TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
     assert [line.label for line in back] == new.y.astype(bool).tolist()
-    assert {line.reason for line in back} == {Reason.NO_MODEL}
+    assert {line.decision.reason for line in back} == {Reason.NO_MODEL}
 
 
 CELL = [
@@ -157,7 +157,7 @@ LATE = [
 
 def test_labels_that_came_late_stand_where_they_came(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     journal = read_journal(write_lines(tmp_path / "cell.csv", make_data(9, seed=4).X, LATE), TraceSpec(100))
-    found = [(line.id, line.label, line.late) for line in journal.lines]
+    found = [(line.decision.id, line.label, line.late) for line in journal.lines]
     assert found == [
         ("a-1", True, True),
         ("a-2", None, False),  # went on, when the next part came

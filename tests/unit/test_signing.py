@@ -96,20 +96,3 @@ def test_a_signature_of_another_tool_is_not_replaced(key: Path, tmp_path: Path) 
         write_export(tmp_path / "model.ts", b"one", key=key)
     assert own.read_text().startswith("-----BEGIN")
     assert not (tmp_path / "model.ts").exists()
-
-
-def test_a_file_is_known_by_any_line_of_a_sum_file_that_is_about_it(model: ModelPrediction, tmp_path: Path) -> None:
-    file = export_torchscript(model, tmp_path / "model.ts")
-    total = tmp_path / "model.ts.sha256"
-    line = total.read_text()
-    wrong = f"{hashlib.sha256(b'other').hexdigest()}  model.ts\n"
-    for text in (line + wrong, wrong + line, line.split()[0], line.replace("  ", " *"), line.replace("model.ts", "old.ts")):
-        total.write_text(text)
-        assert read_metadata(file)["references"] == 60
-    for text in (wrong, wrong + line.replace("model.ts", "other.ts"), wrong + wrong):
-        total.write_text(text)
-        with pytest.raises(ExportError, match="is damaged or truncated"):
-            read_metadata(file)
-    total.write_text(line.replace("model.ts", "one.ts") + line.replace("model.ts", "two.ts"))
-    with pytest.raises(ExportError, match="holds no SHA-256 sum of"):
-        read_metadata(file)

@@ -9,20 +9,61 @@ Nothing waits: the cell's clock counts the seconds that production would have ta
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from ...errors import DengineError, SettingError
 from ...records import Outcome
-from .conditions import CHANNELS, CellParameters, Conditions, draw_conditions, find_scenario
-from .sensor import SensorFaults, draw_sensor, read_sensor
+from .conditions import CHANNELS, RATE_HZ, CellParameters, Conditions, draw_conditions, find_scenario
 from .world import DEPTH_MM, TIME_STEP_S, Push, push
 
 CAUSES = ("none", "missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "wrong_part")
 STUCK_MM = 4.0  # a part that came this close to its seat is stuck above it, one further up is wedged
 SLIP_MM = 1.0  # a part that moved this far in the gripper has slipped
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFaults:
+    """One trace's draw, in this order. All in newtons, but for `ripple_hz` and `dropped_share`."""
+
+    noise_n: float
+    ripple_n: float
+    ripple_hz: float
+    bias_n: float
+    drift_n: float
+    step_n: float
+    dropped_share: float
+
+
+def draw_sensor(parameters: CellParameters, rng: np.random.Generator) -> SensorFaults:
+    """Draw the faults of one trace, from a stream of their own: nothing but the force itself can tell the outcome."""
+    drawn = {each.name: float(rng.uniform(*getattr(parameters, each.name))) for each in fields(SensorFaults)}
+    return replace(SensorFaults(**drawn), bias_n=drawn["bias_n"] + parameters.bias_offset_n)
+
+
+def read_sensor(
+    wrench: NDArray[np.float64], faults: SensorFaults, parameters: CellParameters, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """What the sensor reports of a true wrench (samples, 6), as (6, samples) float32: newtons and newton metres."""
+    keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
+    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], wrench.T, axis=-1)  # the first-order low-pass in the sensor
+    unit = np.array([1.0] * 3 + [parameters.torque_scale_m] * 3)[:, None]  # newtons to each channel's own unit
+    sign = rng.choice((-1.0, 1.0), size=(6, 1))
+    sign[2] = 1.0  # the z-force keeps the sign that was drawn, the other channels get one of their own
+    samples = true.shape[1]
+    time_s = np.arange(samples) / RATE_HZ
+    phase = rng.uniform(0, 2 * np.pi, size=(6, 1))
+    slow = faults.bias_n + faults.drift_n * time_s / time_s[-1]
+    ripple = faults.ripple_n * np.sin(2 * np.pi * faults.ripple_hz * time_s + phase)
+    noise = faults.noise_n * rng.standard_normal(true.shape)
+    reading = true / unit + sign * slow + ripple + noise
+    steps = np.round(reading / faults.step_n) * faults.step_n
+    arrived = np.where(rng.random(samples) < faults.dropped_share, 0, np.arange(samples))
+    held = steps[:, np.maximum.accumulate(arrived)]  # of a dropped sample the last that arrived, in all channels at once
+    return np.asarray(held * unit, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +74,14 @@ class Insertion:
     success : whether the final height is within the tolerance; nothing else enters the label.
     cause : of a failure, one of `CAUSES`; `"none"` for a success.
     height_mm : of the part's top over its nominal seated height.
-    conditions, sensor : what was drawn.
+    cycle : of the cell.  conditions, sensor : what was drawn.
     """
 
     trace: NDArray[np.float32]
     success: bool
     cause: str
     height_mm: float
+    cycle: int
     conditions: Conditions
     sensor: SensorFaults
 
@@ -52,7 +94,7 @@ def insert_once(
     channels : `"z"` for the z-force, `"all"` for force x, y, z and torque x, y, z.
     time_step_s : of the physics.
     """
-    world_rng, sensor_rng, _ = streams(seed, cycle)
+    world_rng, sensor_rng, _ = _streams(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
     faults = draw_sensor(parameters, sensor_rng)
@@ -61,14 +103,15 @@ def insert_once(
     return Insertion(
         trace=reading[2] if CHANNELS[channels] == 1 else reading,
         success=success,
-        cause="none" if success else diagnose(conditions, pushed),
+        cause="none" if success else _cause(conditions, pushed),
         height_mm=pushed.height_mm,
+        cycle=cycle,
         conditions=conditions,
         sensor=faults,
     )
 
 
-def diagnose(conditions: Conditions, pushed: Push) -> str:
+def _cause(conditions: Conditions, pushed: Push) -> str:
     """Name the cause of a failure: the fault that was drawn if it took effect, else where the part came to rest."""
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip over the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -82,7 +125,7 @@ def diagnose(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def streams(seed: int, cycle: int) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+def _streams(seed: int, cycle: int) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
     """Independent streams of one cycle: for the world, for the sensor, and for what the line notices afterwards."""
     world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
     return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
@@ -172,7 +215,7 @@ class SimulatedCell:
     def proceed(self) -> Outcome:
         """Pass the part on unverified. A bad one stops the system, but for its silent share."""
         success = self._take("proceed").success
-        chance = float(streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
+        chance = float(_streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
         if success:
             self._counts["finished"] += 1
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN

@@ -153,25 +153,15 @@ class Conditions:
     angular_nm_rad: float
 
 
-# Each quantity with its setting, in the order in which they are drawn.
-_DRAWS: dict[str, str | Range] = {
-    "offset_x_mm": "offset_sd_mm",
-    "offset_y_mm": "offset_sd_mm",
-    "tilt_x_deg": "tilt_sd_deg",
-    "tilt_y_deg": "tilt_sd_deg",
+# What is drawn by a setting of another name, or in a range of its own; all else goes by its own name.
+_DRAWN_BY: dict[str, str | Range] = {
+    **dict.fromkeys(("offset_x_mm", "offset_y_mm"), "offset_sd_mm"),
+    **dict.fromkeys(("tilt_x_deg", "tilt_y_deg"), "tilt_sd_deg"),
     "yaw_deg": "yaw_sd_deg",
     "protrusion_mm": "protrusion_sd_mm",
-    "grip_n": "grip_n",
-    "part_mass_kg": "part_mass_kg",
     "extra_length_mm": "length_sd_mm",
-    "clearance_mm": "clearance_mm",
-    "chamfer_mm": "chamfer_mm",
-    "friction": "friction",
-    "debris_x_mm": (-5.0, 5.0),
-    "debris_y_mm": (-5.0, 5.0),
+    **dict.fromkeys(("debris_x_mm", "debris_y_mm"), (-5.0, 5.0)),
     "debris_softness_s": (0.003, 0.02),
-    **{name: name for name in ("gap_mm", "delay_s", "speed_mm_s", "force_limit_n", "overtravel_mm")},
-    **{name: name for name in ("lateral_n_mm", "axial_n_mm", "angular_nm_rad")},
 }
 
 
@@ -183,7 +173,9 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
         value = getattr(p, setting) if isinstance(setting, str) else setting
         return float(rng.uniform(*value) if isinstance(value, tuple) else rng.normal(0.0, value))
 
-    right = Conditions("none", extra_width_mm=0.0, debris_mm=0.0, **{name: drawn(by) for name, by in _DRAWS.items()})
+    usual = {"fault": "none", "extra_width_mm": 0.0, "debris_mm": 0.0}
+    names = [each.name for each in fields(Conditions) if each.name not in usual]  # in the order in which they are drawn
+    right = Conditions(**usual, **{name: drawn(_DRAWN_BY.get(name, name)) for name in names})  # type: ignore[arg-type]
     weak_grip_n, debris_mm = drawn("weak_grip_n"), drawn("debris_mm")
     extra_length_mm = drawn("extra_length_mm") * float(rng.choice((-1, 1)))
     extra_width_mm = drawn("extra_width_mm") * float(rng.choice((-1, 1)))

@@ -198,7 +198,7 @@ def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_
     assert kills >= 3
     assert decided == whole
     held = read_journal(journal, TraceSpec(SAMPLES)).lines
-    assert acknowledged.items() <= {line.id: line.label for line in held if line.label is not None}.items()
+    assert acknowledged.items() <= {line.decision.id: line.label for line in held if line.label is not None}.items()
 
 
 def play(start: Any, X: np.ndarray, y: np.ndarray, parts: list[str | None], due: list[list[int]]) -> dict[int, str]:
@@ -296,7 +296,7 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
     assert refused > 10
     held = read_journal(journal, TraceSpec(SAMPLES))  # no half line is left
     assert held.cut == 0
-    assert set(acknowledged) <= {line.id for line in held.lines if line.label}
+    assert set(acknowledged) <= {line.decision.id for line in held.lines if line.label}
     with program(programs, learned.file, "--journal", journal) as cell:  # there is room again
         assert not cell.ask(asked(X[0])).startswith("-")
 

@@ -5,8 +5,6 @@
 #include <iterator>
 #include <sstream>
 #include <string>
-#include <string_view>
-#include <vector>
 
 #include "fault.hpp"
 #include "sha256.hpp"
@@ -19,23 +17,11 @@ inline std::string read_file(const std::string& path, const std::string& advice)
     return {std::istreambuf_iterator<char>(file), {}};
 }
 
-inline std::string name_of(const std::string& path) { return path.substr(path.find_last_of('/') + 1); }
-
-// The first words of the lines that are about a file, or about none in particular. Two while a file is being replaced: the
-// earlier one and the next. A file that was renamed together with its one line is still known by it.
-inline std::vector<std::string> listed(const std::string& text, const std::string& name) {
-    std::vector<std::string> found, others;
-    std::istringstream lines(text);
-    for (std::string line; std::getline(lines, line);) {
-        while (!line.empty() && (line.back() == '\r' || line.back() == ' ')) line.pop_back();
-        const auto space = line.find(' ');
-        const std::string word = line.substr(0, space);
-        if (word.empty()) continue;
-        const auto begin = space == std::string::npos ? space : line.find_first_not_of(" *", space);
-        const std::string about = begin == std::string::npos ? "" : line.substr(begin);
-        (about.empty() || about == name ? found : others).push_back(word);
-    }
-    return found.empty() && others.size() == 1 ? others : found;
+// Of the line of a sum or a signature; the file's name follows it.
+inline std::string first_word(const std::string& text) {
+    std::string word;
+    std::istringstream(text) >> word;
+    return word;
 }
 
 // The secret that a file was signed with: what the key's file holds, without the line end.
@@ -49,23 +35,18 @@ inline std::string read_key(const std::string& path) {
 inline void check_signature(const std::string& path, const std::string& bytes, const std::string& key_path) {
     const std::string found = sha256::hmac(read_key(key_path), bytes);
     const std::string text = read_file(path + ".sig", "; a key was given, and the file is not signed: export it with --key");
-    bool right = false;
-    for (const auto& word : listed(text, name_of(path))) right |= sha256::same(word, "hmac-sha256:" + found);
-    if (!right) throw Fault(DENGINE_BAD_MODEL, "its signature is not one by this key; it was changed, or signed with another key");
+    if (!sha256::same(first_word(text), "hmac-sha256:" + found)) {
+        throw Fault(DENGINE_BAD_MODEL, "its signature is not one by this key; it was changed, or signed with another key");
+    }
 }
 
 // A file's content and its sum. libtorch does not notice flipped bits, and runs whatever program a file holds.
 inline std::string checked_bytes(const std::string& path, const std::string& key_path, std::string& sum) {
     const std::string bytes = read_file(path, "; an export is a file and its .sha256, copied together");
     if (!key_path.empty()) check_signature(path, bytes, key_path);
-    const std::string text = read_file(path + ".sha256", "; an export is a file and its .sha256, copied together");
+    const std::string word = first_word(read_file(path + ".sha256", "; an export is a file and its .sha256, copied together"));
     sum = sha256::hex(bytes);
-    bool any = false, right = false;
-    for (const auto& word : listed(text, name_of(path))) {
-        any |= word.size() == 64;
-        right |= word == sum;
-    }
-    if (!any) throw Fault(DENGINE_BAD_MODEL, "its .sha256 holds no SHA-256 sum of it; copy it again");
-    if (!right) throw Fault(DENGINE_BAD_MODEL, "it is damaged or truncated: its SHA-256 differs; copy it again");
+    if (word.size() != 64) throw Fault(DENGINE_BAD_MODEL, "its .sha256 holds no SHA-256 sum of it; copy it again");
+    if (word != sum) throw Fault(DENGINE_BAD_MODEL, "it is damaged or truncated: its SHA-256 differs; copy it again");
     return bytes;
 }
