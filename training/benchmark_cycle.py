@@ -13,15 +13,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
-from common import POLICY, options
-from rich.console import Console
-from rich.table import Table
+from common import POLICY, options, quantiles, tell, wall_time
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
-from dengine.cli.output import duration
-from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
 
 BUDGET = 0.45
@@ -31,28 +25,27 @@ WARM_UP = 0.07  # share of the cycles beside a retrain that are not timed
 def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repeats: int) -> list[dict[str, Any]]:
     """Every quantity, a row each."""
     played = [replay(data, recipe, seed) for seed in range(replays)]
-    retrains = np.array([each.seconds for one in played for each in one.retrains])
     engine = filled_engine(data, recipe)
-    whole = np.array([engine.retrain().seconds for _ in range(repeats)])  # as the last one of a long run sees it
-    rows = [
-        row(f"retrain, all of {replays} replays", retrains, BUDGET),
-        row(f"retrain on {len(data)} traces", whole, BUDGET),
-    ]
-    decide = decide_times(filled_engine(data, recipe), data)
-    rows.append(row("decide", decide))
+    found = {
+        f"retrain, all of {replays} replays": [each.seconds for one in played for each in one.retrains],
+        f"retrain on {len(data)} traces": [engine.retrain().seconds for _ in range(repeats)],  # as a long run's last
+    }
+    engine = filled_engine(data, recipe)
+    found["decide"] = [wall_time(engine.decide, trace)[0] for _ in range(3) for trace in data.X]
     spawned = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     for name, executor in (("thread", ThreadPoolExecutor(1)), ("process", spawned)):
-        seconds, swapping = beside(data, recipe, executor)
-        rows += [row(f"decide, retraining in a {name}", seconds), row(f"decide and swap, {name}", swapping)]
+        found[f"decide, retraining in a {name}"], found[f"decide and swap, {name}"] = beside(data, recipe, executor)
     if umap_repeats:
-        fit, transform = umap_times(data, umap_repeats)
-        rows += [
-            row(f"UMAP fit on {len(data)} traces", fit),
-            row("UMAP single transform", transform),
-            ratio("UMAP fit / retrain", fit, whole, 6.0),
-            ratio("UMAP single transform / decide", transform, decide, 15.0),
-        ]
-    return rows
+        X = as_traces(data.X).reshape(len(data), -1)
+        make_reducer("umap").fit(X[:200])  # compiles
+        reducer = make_reducer("umap")
+        found[f"UMAP fit on {len(data)} traces"] = [wall_time(reducer.fit, X)[0] for _ in range(umap_repeats)]
+        reducer.transform(X[:1])
+        found["UMAP single transform"] = [wall_time(reducer.transform, x[None])[0] for x in X[:200]]
+    return [
+        {"what": name, **quantiles(seconds), "target_s": BUDGET if name.startswith("retrain") else None}
+        for name, seconds in found.items()
+    ]
 
 
 def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = None) -> DataEngine:
@@ -66,72 +59,21 @@ def filled_engine(data: Dataset, recipe: Recipe, executor: Executor | None = Non
     return engine
 
 
-def decide_times(engine: DataEngine, data: Dataset, times: int = 3) -> np.ndarray:
-    """Wall time of each decision, over the set, `times` times."""
-    seconds = []
-    for trace in np.concatenate([data.X] * times):
-        begin = time.perf_counter()
-        engine.decide(trace)
-        seconds.append(time.perf_counter() - begin)
-    return np.array(seconds)
-
-
-def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[np.ndarray, np.ndarray]:
+def beside(data: Dataset, recipe: Recipe, executor: Executor) -> tuple[list[float], list[float]]:
     """Wall time of the decisions made while retrains run in the executor, and of those that also swap a version in."""
-    engine = filled_engine(data, recipe, executor)
-    seconds, swapping, cell = [], [], ReplayCell(data)
+    engine, cell = filled_engine(data, recipe, executor), ReplayCell(data)
+    seconds: list[float] = []
+    swapping: list[float] = []
     with executor:
         for i in range(len(data)):
             if not engine.retraining:
                 engine.start_retrain()
-            trace, version = cell.insert(), engine.version
-            begin = time.perf_counter()
-            engine.decide(trace)
+            version, (took, _) = engine.version, wall_time(engine.decide, cell.insert())
             if i > WARM_UP * len(data):  # the pool starts its worker on the first
-                (seconds if engine.version == version else swapping).append(time.perf_counter() - begin)
+                (seconds if engine.version == version else swapping).append(took)
             time.sleep(0.002)  # a cell does other things between two parts
         engine.close()
-    return np.array(seconds), np.array(swapping)
-
-
-def umap_times(data: Dataset, repeats: int) -> tuple[np.ndarray, np.ndarray]:
-    """UMAP's fit on the whole set and its transform of one trace, after a fit that compiles."""
-    X = as_traces(data.X).reshape(len(data), -1)
-    make_reducer("umap").fit(X[:200])
-    fits, reducer = [], make_reducer("umap")
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        reducer.fit(X)
-        fits.append(time.perf_counter() - begin)
-    reducer.transform(X[:1])
-    singles = []
-    for x in X[:200]:
-        begin = time.perf_counter()
-        reducer.transform(x[None])
-        singles.append(time.perf_counter() - begin)
-    return np.array(fits), np.array(singles)
-
-
-def row(name: str, seconds: np.ndarray, target: float | None = None) -> dict[str, Any]:
-    """One line of the table, in milliseconds; NaN where it never happened, as a swap within few cycles."""
-    p50, p99, worst = 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0]) if len(seconds) else np.full(3, np.nan)
-    limit = None if target is None else 1e3 * target
-    return {"what": name, "n": len(seconds), "median": p50, "p99": p99, "worst": worst, "target": limit, "unit": "ms"}
-
-
-def ratio(name: str, slow: np.ndarray, fast: np.ndarray, target: float) -> dict[str, Any]:
-    """A ratio of medians, and at its worst: the fastest of the slow against the slowest of the fast."""
-    middle = worst = np.nan
-    if len(slow) and len(fast):
-        middle, worst = np.median(slow) / np.median(fast), slow.min() / fast.max()
-    return {"what": name, "n": len(slow), "median": middle, "p99": np.nan, "worst": worst, "target": target, "unit": "x"}
-
-
-def written(value: float | None, unit: str) -> str:
-    """A cell of the table as a person writes it."""
-    if value is None or np.isnan(value):
-        return ""
-    return duration(value / 1e3) if unit == "ms" else f"{value:.0f} {unit}"
+    return seconds, swapping
 
 
 def main() -> None:
@@ -143,12 +85,7 @@ def main() -> None:
     args = parser.parse_args()
     recipe = Recipe.load(args.recipe).with_policy(**POLICY)
     rows = measure(load_dataset(args.data, args.samples), recipe, args.replays, args.repeats, args.umap_repeats)
-    write_csv(pd.DataFrame(rows), args.out / "benchmark_cycle.csv", force=True)
-    table = Table("what", "n", "median", "p99", "worst", "target", title="A cycle's times")
-    for r in rows:
-        numbers = (written(r[key], r["unit"]) for key in ("median", "p99", "worst", "target"))
-        table.add_row(r["what"], str(r["n"]), *numbers)
-    Console(width=110).print(table)
+    tell(rows, "A cycle's times", args.out / "benchmark_cycle.csv")
 
 
 if __name__ == "__main__":

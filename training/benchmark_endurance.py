@@ -18,14 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from common import POLICY, options
-from rich.console import Console
-from rich.table import Table
+from common import POLICY, noisy, options, quantiles, tell, wall_time
 
 from dengine import Action, DataEngine, Dataset, Recipe, load_dataset
-from dengine.cli.output import duration, size
-from dengine.experiments.tables import write_csv
 
 FLAT = 0.05  # growth of memory after the first mark that still counts as flat
 
@@ -33,11 +28,6 @@ FLAT = 0.05  # growth of memory after the first mark that still counts as flat
 def memory() -> int:
     """Bytes that the process holds in memory at present (Linux)."""
     return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def stored(path: Path) -> int:
-    """Bytes of a SQLite file and of its log."""
-    return sum(each.stat().st_size for each in path.parent.glob(f"{path.name}*"))
 
 
 def states(path: Path) -> int:
@@ -48,36 +38,23 @@ def states(path: Path) -> int:
 
 def endure(data: Dataset, recipe: Recipe, cycles: int, every: int, path: Path) -> list[dict[str, Any]]:
     """A row after each `every` cycles."""
-    rng, rows, decide, report = np.random.default_rng(0), [], [], []
+    rng, rows = np.random.default_rng(0), list[dict[str, Any]]()
+    taken: dict[str, list[float]] = {"decide": [], "report": []}
     with DataEngine.from_recipe(recipe, store=path) as engine:
         begin = time.perf_counter()
         for cycle in range(1, cycles + 1):
-            i = int(rng.integers(len(data)))
-            x = (data.X[i] + rng.normal(0.0, 0.2, data.X[i].shape)).astype(np.float32)
-            decide.append(-time.perf_counter())
-            decision = engine.decide(x)
-            decide[-1] += time.perf_counter()
+            (x,), (good,) = noisy(data, 1, rng)
+            seconds, decision = wall_time(engine.decide, x)
+            taken["decide"].append(seconds)
             if decision.action is Action.VERIFY:
-                report.append(-time.perf_counter())
-                engine.report(decision.id, bool(data.y[i]))
-                report[-1] += time.perf_counter()
+                taken["report"].append(wall_time(engine.report, decision.id, bool(good))[0])
             if cycle % every == 0 or cycle == cycles:
                 engine.flush()
-                known = engine.store.status()
-                rows.append(
-                    {
-                        "cycles": cycle,
-                        "seconds": time.perf_counter() - begin,
-                        "memory": memory(),
-                        "file": stored(path),
-                        "labels": known["labels"],
-                        "versions": known["versions"],
-                        "states": states(path),
-                        "decide_p99_s": float(np.quantile(decide, 0.99)),
-                        "report_p99_s": float(np.quantile(report, 0.99)) if report else float("nan"),
-                    }
-                )
-                decide, report = [], []
+                known, file = engine.store.status(), sum(each.stat().st_size for each in path.parent.glob(f"{path.name}*"))
+                row = {"cycles": cycle, "time_s": time.perf_counter() - begin, "memory_bytes": memory(), "file_bytes": file}
+                row |= {name: known[name] for name in ("labels", "versions")} | {"with_arrays": states(path)}
+                rows.append(row | {f"{name},_p99_s": quantiles(each)["p99_s"] for name, each in taken.items()})
+                taken = {name: [] for name in taken}
     return rows
 
 
@@ -90,18 +67,10 @@ def main() -> None:
     recipe, data = Recipe.load(args.recipe).with_policy(**POLICY), load_dataset(args.data, args.samples)
     with tempfile.TemporaryDirectory(dir=args.folder) as folder:
         rows = endure(data, recipe, args.cycles, args.every, Path(folder) / "cell.db")
-    write_csv(pd.DataFrame(rows), args.out / "benchmark_endurance.csv", force=True)
-    heads = ("cycles", "time", "memory", "file", "labels", "versions", "with arrays", "decide, p99", "report, p99")
-    table = Table(*heads, title="One cell on SQLite")
-    for row in rows:
-        counted = (f"{row[key]:,}" for key in ("labels", "versions", "states"))
-        p99 = ("-" if np.isnan(row[key]) else duration(row[key]) for key in ("decide_p99_s", "report_p99_s"))
-        known = (f"{row['cycles']:,}", duration(row["seconds"]), size(row["memory"]), size(row["file"]))
-        table.add_row(*known, *counted, *p99)
-    console, growth = Console(width=120), rows[-1]["memory"] / rows[0]["memory"] - 1.0
-    console.print(table)
+    tell(rows, "One cell on SQLite", args.out / "benchmark_endurance.csv")
+    growth = rows[-1]["memory_bytes"] / rows[0]["memory_bytes"] - 1.0
     said = "flat" if growth <= FLAT else "not flat"
-    console.print(f"Memory after {rows[0]['cycles']:,} cycles to the end: {100 * growth:+.1f} %, {said}.", highlight=False)
+    print(f"Memory after {rows[0]['cycles']:,} cycles to the end: {100 * growth:+.1f} %, {said}.")
 
 
 if __name__ == "__main__":

@@ -14,23 +14,18 @@ import argparse
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import pandas as pd
-from common import options
-from rich.console import Console
+from common import options, tell, wall_time
 from rich.progress import track
-from rich.table import Table
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
 from dengine.datasets.importing import import_labelled, train_until_done
 from dengine.errors import ExportError
-from dengine.experiments.tables import write_csv
 from dengine.export import sum_file
 from dengine.export.onnx import export_onnx, load_onnx
 from dengine.records import Action
@@ -41,13 +36,12 @@ BOUND_TOLERANCE = 1e-6
 AUDIT_RATE = 0.1
 
 
-class Finding(NamedTuple):
-    """One row of the table."""
+Row = dict[str, Any]
 
-    what: str
-    value: float
-    unit: str = ""
-    target: str = ""
+
+def finding(what: str, value: float, unit: str = "", target: str = "") -> Row:
+    """One row of the table."""
+    return {"what": what, "value": round(float(value)), "unit": unit, "target": target}
 
 
 def train(data: Dataset, recipe: Recipe, retrains: int, **policy: Any) -> DataEngine:
@@ -88,19 +82,12 @@ def differing(found: list[Any], expected: list[Any]) -> int:
 
 def microseconds(decide: Callable[[Any], Any], X: np.ndarray, calls: int) -> np.ndarray:
     """(calls,) wall time of each call."""
-    taken = np.empty(calls)
-    for i in range(calls):
-        begin = time.perf_counter()
-        decide(X[i % len(X)])
-        taken[i] = 1e6 * (time.perf_counter() - begin)
-    return taken
+    return 1e6 * np.array([wall_time(decide, X[i % len(X)])[0] for i in range(calls)])
 
 
-def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", "")) -> list[Finding]:
+def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", "")) -> list[Row]:
     """Median and 99th percentile."""
-    return [
-        Finding(f"{name}, p{p}", float(np.percentile(taken, p)), "µs", t) for p, t in zip((50, 99), targets, strict=True)
-    ]
+    return [finding(f"{name}, p{p}", np.percentile(taken, p), "µs", t) for p, t in zip((50, 99), targets, strict=True)]
 
 
 def ask(command: list[Any], stdin: bytes, expected: list[Any]) -> tuple[int, np.ndarray]:
@@ -111,7 +98,7 @@ def ask(command: list[Any], stdin: bytes, expected: list[Any]) -> tuple[int, np.
     return differing(found, expected), np.array([float(w[-1]) for w in lines])
 
 
-def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path, cell: Path | None) -> list[Finding]:
+def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path, cell: Path | None) -> list[Row]:
     """Engine and file go on from one retrain on half the data set, through the other half and random traces.
 
     What was verified is told, an accepted part only where it was bad; a part in four comes again.
@@ -135,14 +122,14 @@ def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path,
             exported.learn(x, bool(success), part)
         lines.append(f"{part},{int(success) if heard else ''}," + ",".join(f"{value:.9g}" for value in x.ravel()))
     rows = [
-        Finding("decisions compared while learning", len(X), ""),
-        Finding("of them accepted", sum(d.action is Action.ACCEPT for d in decisions), ""),
-        Finding("Python differs while learning in", differing(list(map(told, found)), decisions), "", "0"),
+        finding("decisions compared while learning", len(X), ""),
+        finding("of them accepted", sum(d.action is Action.ACCEPT for d in decisions), ""),
+        finding("Python differs while learning in", differing(list(map(told, found)), decisions), "", "0"),
     ]
     if cell is not None:
         command = [cell, file, "--parts", "--learn", "--journal", folder / "cell.csv"]
         wrong, _ = ask(command, "\n".join(lines).encode() + b"\n", decisions)
-        rows.append(Finding("C++ differs while learning in", wrong, "", "0"))
+        rows.append(finding("C++ differs while learning in", wrong, "", "0"))
     return rows
 
 
@@ -177,7 +164,7 @@ def taken_damaged(file: Path, n: int, folder: Path, cell: Path | None) -> int:
     return taken
 
 
-def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
+def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
     """Every row of the table."""
     data, rng = load_dataset(args.data), np.random.default_rng(1)
     engine = train(data, Recipe.load(args.reducer), args.retrains)
@@ -187,29 +174,29 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Finding]:
     exported = load_exported(file)
     first = microseconds(exported.decide, known, 1)[0]
     rows = [
-        Finding("file size", file.stat().st_size / 1e3, "kB", "< 1 MB"),
-        Finding("decisions compared", len(X), ""),
-        Finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
-        Finding("of them audits", sum(d.audit for d in expected)),
-        Finding("Python differs in", differing(list(map(told, exported.decide_many(X))), expected), "", "0"),
-        Finding("first call after loading", first, "µs", "<= 1 ms"),
+        finding("file size", file.stat().st_size / 1e3, "kB", "< 1 MB"),
+        finding("decisions compared", len(X), ""),
+        finding("of them certain", sum(d.predicted is not Action.VERIFY for d in expected), ""),
+        finding("of them audits", sum(d.audit for d in expected)),
+        finding("Python differs in", differing(list(map(told, exported.decide_many(X))), expected), "", "0"),
+        finding("first call after loading", first, "µs", "<= 1 ms"),
         *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")),
     ]
     if args.cell is not None:
         times, command = 1 + args.calls // len(known), [args.cell, file, "--binary"]
         wrong, _ = ask(command, X.tobytes(), expected)
         _, taken = ask(command, known.tobytes() * times, expected[: len(known)] * times)
-        rows += [Finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
+        rows += [finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
         model = load_exported(export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace))
         new = X[len(known) :]  # a reference that is asked about itself has a vote in ONNX
         found = list(map(told, runtime.decide_many(new)))
-        rows.append(Finding("onnxruntime differs in", differing(found, model.decide_many(new))))
+        rows.append(finding("onnxruntime differs in", differing(found, model.decide_many(new))))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
     rows += compare_learning(data, Recipe.load(args.reducer), args.retrains, folder, args.cell)
     not_refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
-    return [*rows, Finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
+    return [*rows, finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
 
 
 def main() -> None:
@@ -226,12 +213,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "damaged").mkdir()
         rows = measure(args, Path(folder))
-    write_csv(pd.DataFrame(rows), args.out / "benchmark_export.csv", force=True)
-    table = Table("what", "value", "unit", "target", title=f"Exported decision: {args.reducer} on {args.data}")
-    for row in rows:
-        table.add_row(row.what, f"{row.value:,.0f}", row.unit, row.target)
-    Console(width=None if sys.stdout.isatty() else 100).print(table)
-    sys.exit(any(row.target == "0" and row.value > 0 for row in rows))
+    tell(rows, f"Exported decision: {args.reducer} on {args.data}", args.out / "benchmark_export.csv", width=100)
+    sys.exit(any(row["target"] == "0" and row["value"] > 0 for row in rows))
 
 
 if __name__ == "__main__":

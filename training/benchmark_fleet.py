@@ -17,29 +17,20 @@ import time
 import uuid
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from common import POLICY, options
-from rich.console import Console
-from rich.table import Table
+from common import POLICY, noisy, options, quantiles, tell, wall_time
 
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore, load_dataset
-from dengine.cli.output import duration
 from dengine.experiments.tables import write_csv
 
 STEP = 1.0 / 16.0  # N a digit of a mark: exact in float32, and small beside an insertion
 DIGITS = 5  # of a mark: the cell, and the cycle in base 100
-
-
-CALLS = {
-    "decide": "decide",
-    "report": "report",
-    "report that retrains": "retraining",
-    "settle, with news of peers": "settle",
-}
+CALLS = ("decide", "report", "report that retrains", "settle, with news of peers")
 
 
 @dataclass(frozen=True)
@@ -69,10 +60,7 @@ class Worked:
 
     cell: int
     sent: dict[str, tuple[int, bool]] = field(default_factory=dict)
-    decide: list[float] = field(default_factory=list)
-    report: list[float] = field(default_factory=list)
-    retraining: list[float] = field(default_factory=list)
-    settle: list[float] = field(default_factory=list)
+    seconds: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in CALLS})
     certain: int = 0
     version: int = 0
     others: int = 0
@@ -94,11 +82,10 @@ def read_mark(x: np.ndarray) -> tuple[int, int]:
 
 def stream(data: Dataset, cell: int) -> Iterator[tuple[int, np.ndarray, bool]]:
     """Cycle, marked trace and truth, for ever: bundled traces with fresh sensor noise."""
-    rng, cycle = np.random.default_rng(cell), 0
-    while True:
-        i = int(rng.integers(len(data)))
-        yield cycle, mark(data.X[i] + rng.normal(0.0, 0.2, len(data.X[i])), cell, cycle), bool(data.y[i])
-        cycle += 1
+    rng = np.random.default_rng(cell)
+    for cycle in count():
+        X, y = noisy(data, 1, rng)
+        yield cycle, mark(X[0, 0], cell, cycle), bool(y[0])
 
 
 def work(plan: Plan, cell: int, data: Dataset, ready: Any, done: Any) -> None:
@@ -121,18 +108,14 @@ def work(plan: Plan, cell: int, data: Dataset, ready: Any, done: Any) -> None:
 
 def one_cycle(engine: DataEngine, worked: Worked, cycle: int, x: np.ndarray, good: bool) -> None:
     """Decide, report, settle; each timed."""
-    begin = time.perf_counter()
-    decision = engine.decide(x)
-    worked.decide.append(time.perf_counter() - begin)
+    took, decision = wall_time(engine.decide, x)
+    worked.seconds["decide"].append(took)
     worked.certain += decision.action is not Action.VERIFY
     if decision.action is Action.VERIFY:
-        begin = time.perf_counter()
-        retrain = engine.report(decision.id, good)
-        (worked.report if retrain is None else worked.retraining).append(time.perf_counter() - begin)
+        took, retrain = wall_time(engine.report, decision.id, good)
+        worked.seconds["report" if retrain is None else "report that retrains"].append(took)
         worked.sent[decision.id] = cycle, good
-    begin = time.perf_counter()
-    engine.settle()
-    worked.settle.append(time.perf_counter() - begin)
+    worked.seconds["settle, with news of peers"].append(wall_time(engine.settle)[0])
 
 
 def run(plan: Plan, data: Dataset) -> list[Worked]:
@@ -172,24 +155,18 @@ def check(plan: Plan, worked: Worked) -> dict[str, Any]:
 
 def show(plan: Plan, worked: list[Worked], out: Path) -> bool:
     """Tables on the screen and as CSV; whether nothing was lost, wrong or mixed."""
-    kind, rows = "PostgreSQL" if plan.url.startswith("postgres") else "SQLite", []
-    table = Table("call", "n", "p50", "p99", "worst", title=f"{plan.cells} cells on one {kind}, {plan.seconds:g} s")
-    for about, name in CALLS.items():
-        seconds = np.concatenate([getattr(each, name) for each in worked])
-        found = np.quantile(seconds, [0.5, 0.99, 1.0]) if len(seconds) else np.full(3, np.nan)
-        rows.append({"call": about, "n": len(seconds), **dict(zip(("p50_s", "p99_s", "worst_s"), found, strict=True))})
-        table.add_row(about, f"{len(seconds):,}", *("-" if np.isnan(each) else duration(each) for each in found))
-    write_csv(pd.DataFrame(rows), out / "benchmark_fleet.csv", force=True)
+    kind, taken = "PostgreSQL" if plan.url.startswith("postgres") else "SQLite", {name: list[float]() for name in CALLS}
+    for each in worked:
+        for name, seconds in each.seconds.items():
+            taken[name] += seconds
+    rows = [{"call": name, **quantiles(seconds)} for name, seconds in taken.items()]
+    tell(rows, f"{plan.cells} cells on one {kind}, {plan.seconds:g} s", out / "benchmark_fleet.csv")
     counted = pd.DataFrame([check(plan, each) for each in worked])
     write_csv(counted, out / "benchmark_fleet_cells.csv", force=True)
-    total, decided = counted.sum(), sum(len(each.decide) for each in worked)
-    console = Console(width=110)
-    console.print(table)
-    console.print(
-        f"{decided / plan.seconds:.0f} decisions a second. Labels sent {total.sent:,}, stored {total.stored:,}, "
-        f"lost {total.lost}, wrong {total.wrong}; traces mixed {total.mixed}. "
-        f"Versions {', '.join(map(str, counted.version))}.",
-        highlight=False,
+    total = counted.sum()
+    print(
+        f"{rows[0]['n'] / plan.seconds:.0f} decisions a second. Labels sent {total.sent:,}, stored {total.stored:,}, lost "
+        f"{total.lost}, wrong {total.wrong}; traces mixed {total.mixed}. Versions {', '.join(map(str, counted.version))}."
     )
     return bool(total.sent == total.stored and not (total.lost or total.wrong or total.mixed))
 

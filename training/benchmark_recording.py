@@ -16,18 +16,16 @@ import csv
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from common import POLICY, options
-from rich.console import Console
-from rich.table import Table
+from common import POLICY, options, tell, wall_time
 
 from dengine import Cell, DataEngine, Dataset, Recipe, ReplayCell, load_dataset
 from dengine.cells import FakeController, UrCell
@@ -137,16 +135,11 @@ def theirs(seconds: float) -> str:
     return f"ur_rtde's file of {len(steps) + 1} rows: {skipped} packages are not in it, {again} rows repeat the one before."
 
 
-def table(found: pd.DataFrame) -> Table:
+def counted(found: pd.DataFrame) -> list[dict[str, Any]]:
     """A row a kind of trouble."""
-    shown = Table(title=f"{len(found)} insertions", title_justify="left")
     columns = ["not_sent", "recorded", "differing", "unreported", "invented", "late", "repeated", "reconnects"]
-    for name in ("trouble", "insertions", *columns):
-        shown.add_column(name.replace("_", " "), justify="left" if name == "trouble" else "right")
-    groups = [(kind or "none", group) for kind, group in found.groupby("trouble")]
-    for kind, group in [*groups, ("all", found)]:
-        shown.add_row(kind, str(len(group)), *(str(int(group[name].sum())) for name in columns))
-    return shown
+    groups = [*((kind or "none", group) for kind, group in found.groupby("trouble")), ("all", found)]
+    return [{"trouble": kind, "insertions": len(group), **group[columns].sum().to_dict()} for kind, group in groups]
 
 
 def main() -> None:
@@ -162,17 +155,15 @@ def main() -> None:
         parser.error('expected ur_rtde for --ur-rtde, it is not installed: pip install "dengine[ur]"')
     data = load_dataset("insertion", asked.samples)
     wrong = troubles(asked.insertions, data.X.shape[-1], np.random.default_rng(asked.seed))
-    begin = time.perf_counter()
-    found = record(data, asked.insertions, asked.speed or None, wrong)
-    console = Console()
-    console.print(f"Recorded in {duration(time.perf_counter() - begin)}.", table(found))
-    console.print(f"{int(found.start_unseen.sum())} starts fell into a gap: no sample's place in those traces is known.")
+    took, found = wall_time(record, data, asked.insertions, asked.speed or None, wrong)
+    tell(counted(found), f"{len(found)} insertions, recorded in {duration(took)}")
+    print(f"{int(found.start_unseen.sum())} starts fell into a gap: no sample's place in those traces is known.")
     for name in asked.recipes.split(","):
-        console.print(compare(data, Recipe.load(name).with_policy(**POLICY), asked.insertions))
+        print(compare(data, Recipe.load(name).with_policy(**POLICY), asked.insertions))
     if asked.ur_rtde > 0:
-        console.print(theirs(asked.ur_rtde))
+        print(theirs(asked.ur_rtde))
     if asked.out is not None:
-        console.print(f"Wrote {write_csv(found, asked.out / 'recording.csv', force=True)}")
+        print(f"Wrote {write_csv(found, asked.out / 'recording.csv', force=True)}")
 
 
 if __name__ == "__main__":

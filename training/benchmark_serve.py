@@ -1,14 +1,12 @@
 """`dengine serve` over loopback: how long a decision takes beside `engine.decide`, and what kills take back.
 
     python training/benchmark_serve.py --n 10000 --kills 50
-    python training/benchmark_serve.py --n 0 --kills 50 --deadline 0.01
 
 Run it on an idle machine. Every part that is not rejected is reported, so that retrains go on in the background all the
 time. With --kills the client and the server are killed so often each, at random moments; each client writes what it was
-answered to the disk before it goes on. With --deadline others fill the server's line, so that many answers are late. At the
-end all of it is compared: with what is answered then, and with the store. Exit code 1 if an acknowledged label was lost, or
-an id was answered twice differently. --folder is where the stores are: a decision under a caller's own id is on the disk
-before it is answered, so its disk counts.
+answered to the disk before it goes on. At the end all of it is compared: with what is answered then, and with the store.
+Exit code 1 if an acknowledged label was lost, or an id was answered twice differently. --folder is where the stores are: a
+decision under a caller's own id is on the disk before it is answered, so its disk counts.
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ import select
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import xmlrpc.client
 from collections import defaultdict
@@ -30,9 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import POLICY, options
-from rich.console import Console
-from rich.table import Table
+from common import POLICY, options, quantiles, tell, wall_time
 
 from dengine import DataEngine, Dataset, Recipe, load_dataset
 from dengine.cli.output import progress
@@ -42,11 +37,9 @@ from dengine.serve.server import quick_switches
 from dengine.store import open_store
 
 RAW, JSON = "application/octet-stream", "application/json"
-TARGET = 5.0  # milliseconds, of HTTP's p99
 NOISE = 0.01  # newtons, so that no trace comes twice
 PATIENCE = 120.0  # seconds for a server to start, and for a client to ask again while it is away
 LONGEST = 1.5  # seconds between two kills
-CROWD = 8  # who asks beside the client, where answers are to be late
 SAME = ("id", "action", "predicted", "reason", "lower", "upper", "n_success", "n_failure", "model_version", "part")
 Ask = Callable[[np.ndarray, str], dict[str, Any]]
 
@@ -117,7 +110,7 @@ class Connection:
 # ------------------------------------------------------------------------------------------------- how long it takes
 
 
-def drive(data: Dataset, n: int, asks: dict[str, Ask], tell: Callable[[str, bool], object], name: str, pace: float) -> Any:
+def drive(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, name: str, pace: float) -> Any:
     """Seconds of each decision by each way of asking, taken in turn; of each report; and versions that answered."""
     seconds: dict[str, list[float]] = {way: [] for way in asks}
     rng, order = np.random.default_rng(0), np.random.default_rng(0).permutation(len(data))
@@ -125,27 +118,24 @@ def drive(data: Dataset, n: int, asks: dict[str, Ask], tell: Callable[[str, bool
     for i in range(n * len(asks)):
         way, k = list(asks)[i % len(asks)], order[i % len(data)]
         trace = (data.X[k] + rng.normal(0.0, NOISE, data.X.shape[-1])).astype(np.float32)
-        begin = time.perf_counter()
-        said = asks[way](trace, f"{name}-{i}")
-        seconds[way].append(time.perf_counter() - begin)
+        took, said = wall_time(asks[way], trace, f"{name}-{i}")
+        seconds[way].append(took)
         versions.add(said.get("model_version"))
         if said["action"] != "reject":
-            begin = time.perf_counter()
-            tell(said["id"], bool(data.y[k]))
-            told.append(time.perf_counter() - begin)
+            told.append(wall_time(told_by, said["id"], bool(data.y[k]))[0])
         time.sleep(pace)
     return seconds, told, len(versions) - 1
 
 
-def timed(data: Dataset, n: int, asks: dict[str, Ask], tell: Any, trained: Callable[[], bool], pace: float) -> Any:
+def timed(data: Dataset, n: int, asks: dict[str, Ask], told_by: Any, trained: Callable[[], bool], pace: float) -> Any:
     """`drive` once the first version answers."""
-    drive(data, 100, {"warm": next(iter(asks.values()))}, tell, "warm", pace)
+    drive(data, 100, {"warm": next(iter(asks.values()))}, told_by, "warm", pace)
     until = time.monotonic() + PATIENCE
     while not trained():
         if time.monotonic() > until:
             raise RuntimeError(f"No first version within {PATIENCE:g} s.")
         time.sleep(0.05)
-    return drive(data, n, asks, tell, "timed", pace)
+    return drive(data, n, asks, told_by, "timed", pace)
 
 
 def over_the_network(data: Dataset, n: int, recipe: Path, folder: Path, pace: float) -> dict[str, list[float]]:
@@ -193,27 +183,23 @@ def within(data: Dataset, n: int, recipe: Path, folder: Path, pace: float) -> di
 
 def syncs(folder: Path, times: int = 500) -> list[float]:
     """What the disk takes for 4 kB that are to be safe: a decision under a caller's id waits for one of these."""
-    seconds = []
     with (folder / "sync").open("wb", buffering=0) as file:
-        for _ in range(times):
-            begin = time.perf_counter()
+
+        def sync() -> None:
             file.write(bytes(4096))
             os.fdatasync(file.fileno())
-            seconds.append(time.perf_counter() - begin)
-    return seconds
+
+        return [wall_time(sync)[0] for _ in range(times)]
 
 
-def table(found: dict[str, list[float]]) -> Table:
+def rows_of(found: dict[str, list[float]]) -> list[dict[str, Any]]:
     """A row a way of asking, with the ratio to the engine itself."""
-    shown = Table(title=f"milliseconds; HTTP's p99 is to be at most {TARGET:g}")
-    for name in ("what", "n", "p50", "p99", "worst", "p50 to engine.decide's", "p99 to engine.decide's"):
-        shown.add_column(name, justify="left" if name == "what" else "right")
-    quantiles = {name: 1e3 * np.quantile(seconds, [0.5, 0.99, 1.0]) for name, seconds in found.items()}
-    for name, q in quantiles.items():
-        base = quantiles["engine.decide, request id" if "request id" in name else "engine.decide"]
-        ratios = ["" if "report" in name else f"{ratio:.1f}" for ratio in (q / base)[:2]]
-        shown.add_row(name, f"{len(found[name]):,}", *(f"{each:.2f}" for each in q), *ratios)
-    return shown
+    rows = {name: {"what": name, **quantiles(seconds)} for name, seconds in found.items()}
+    for name, row in rows.items():
+        base = rows["engine.decide, request id" if "request id" in name else "engine.decide"]
+        for q in ("p50", "p99"):
+            row[f"{q} to engine.decide's"] = None if "report" in name else round(row[f"{q}_s"] / base[f"{q}_s"], 1)
+    return list(rows.values())
 
 
 # ------------------------------------------------------------------------------------------- client and server killed
@@ -267,19 +253,6 @@ def client(port: int, file: Path) -> None:
         number += 1
 
 
-def crowd(port: int) -> None:
-    """Ask without a pause and without an id, so that whoever else asks waits in line; until killed."""
-    traces = [numbered(number)[0] for number in range(50)]
-
-    def ask() -> None:
-        connection = Connection(port, PATIENCE)
-        while True:
-            connection.decide(random.choice(traces))
-
-    for _ in range(CROWD):
-        threading.Thread(target=ask).start()
-
-
 def begin(call: str) -> subprocess.Popen[bytes]:
     """A process that does this with what is in this file."""
     path = os.pathsep.join([str(Path(__file__).resolve().parent), *filter(None, sys.path)])
@@ -296,19 +269,15 @@ def wait_for_more(file: Path) -> None:
         time.sleep(0.05)
 
 
-def kill(times: int, folder: Path, seed: int, deadline: float | None, console: Console) -> bool:
+def kill(times: int, folder: Path, seed: int) -> bool:
     """Kill client and server so often each, in an order by chance; then compare everything. Whether all was kept."""
     rng, victims, file = random.Random(seed), ["client"] * times + ["server"] * times, folder / "client.jsonl"
     rng.shuffle(victims)
-    words = [] if deadline is None else ["--deadline", str(deadline)]
-    server = Server(folder, "--reducer", "pca", "--no-page", "--alpha", "0.1", "--lower-bound", "0.9", *words)
+    server = Server(folder, "--reducer", "pca", "--no-page", "--alpha", "0.1", "--lower-bound", "0.9")
     server.start()
-    running: dict[str, subprocess.Popen[bytes]] = {}
     asking = f"client({server.port}, Path({str(file)!r}))"
+    asker = begin(asking)
     try:
-        if deadline is not None:
-            running["crowd"] = begin(f"crowd({server.port})")
-        running["client"] = begin(asking)
         with progress("kills", 2 * times) as advance:
             for victim in victims:
                 wait_for_more(file)
@@ -318,29 +287,27 @@ def kill(times: int, folder: Path, seed: int, deadline: float | None, console: C
                     time.sleep(rng.uniform(0.0, 0.2))
                     server.start()
                 else:
-                    running["client"].kill()
-                    running["client"].wait()
-                    running["client"] = begin(asking)
+                    end(asker)
+                    asker = begin(asking)
                 advance(1)
         wait_for_more(file)
-        end(running)
+        end(asker)
         said, differently, lost = compare(file, Connection(server.port, PATIENCE))
     finally:
-        end(running)
+        end(asker)
         server.end()
     with DataEngine.open(folder / "cell.db") as engine:  # it opens, with all that waited in the journal
         said += f", {engine.version} versions"
     compare_with_store(file, folder / "cell.db", differently, lost)
-    console.print(f"{times} kills of the client, {times} of the server: {said}.")
-    console.print(f"Answered twice differently: {len(differently)}. Lost: {len(lost)}.")
+    print(f"{times} kills of the client, {times} of the server: {said}.")
+    print(f"Answered twice differently: {len(differently)}. Lost: {len(lost)}.")
     return not differently and not lost
 
 
-def end(running: dict[str, subprocess.Popen[bytes]]) -> None:
-    """SIGKILL to all of them."""
-    for each in running.values():
-        each.kill()
-        each.wait()
+def end(asker: subprocess.Popen[bytes]) -> None:
+    """SIGKILL."""
+    asker.kill()
+    asker.wait()
 
 
 def compare(file: Path, connection: Connection) -> tuple[str, set[str], set[str]]:
@@ -349,9 +316,7 @@ def compare(file: Path, connection: Connection) -> tuple[str, set[str], set[str]
     for each in read(file):
         if "answer" in each:
             answers[each["answer"]["id"]].append(each["answer"])
-    late = sum(any(one["late"] for one in each) for each in answers.values())
-    said = f"{len(answers):,} ids, {sum(map(len, answers.values())):,} answers ({late} ids late), "
-    said += f"{len(told):,} acknowledged labels"
+    said = f"{len(answers):,} ids, {sum(map(len, answers.values())):,} answers, {len(told):,} acknowledged labels"
     differently = set()
     for id_, given in answers.items():
         now = connection.decide(numbered(int(id_.removeprefix("part-")))[0], id_)
@@ -381,21 +346,21 @@ def main() -> None:
     parser = options(__doc__, data="insertion", samples=None, recipe="conv", folder=None)
     parser.add_argument("--n", type=int, default=10_000, help="decisions by each way of asking; 0: none")
     parser.add_argument("--kills", type=int, default=0, help="of the client, and as many of the server")
-    parser.add_argument("--deadline", type=float, help="seconds, of the server under kills, whose line others fill then")
     parser.add_argument("--pace", type=float, default=0.002, help="seconds between two parts")
     parser.add_argument("--seed", type=int, default=0, help="of the kills' moments")
     args = parser.parse_args()
-    console, well = Console(width=124), True
+    well = True
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         folder, recipe = Path(name), Path(name) / "recipe.toml"
         if args.n:
             data = load_dataset(args.data, args.samples)
             recipe.write_text(Recipe.load(args.recipe).with_policy(**POLICY).to_toml(), encoding="utf-8")
             found = {"fdatasync of 4 kB": syncs(folder)} | within(data, args.n, recipe, folder, args.pace)
-            console.print(table(found | over_the_network(data, args.n, recipe, folder, args.pace)))
+            found |= over_the_network(data, args.n, recipe, folder, args.pace)
+            tell(rows_of(found), "dengine serve over loopback; HTTP's p99 is to be at most 5 ms")
         if args.kills:
             (folder / "kills").mkdir()
-            well = kill(args.kills, folder / "kills", args.seed, args.deadline, console)
+            well = kill(args.kills, folder / "kills", args.seed)
     sys.exit(0 if well else 1)
 
 

@@ -1,10 +1,23 @@
-"""The options that several scripts have, in one place."""
+"""What several scripts have: options, a stopwatch, a table on the screen and as CSV."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+
+from dengine import Dataset
+from dengine.cli.output import duration, figures, size
+from dengine.errors import percent
+from dengine.experiments.tables import write_csv
+from dengine.traces import as_traces
 
 POLICY = {"alpha": 0.1, "lower_bound": 0.9}
 
@@ -19,6 +32,7 @@ def span(text: str) -> range:
 
 KNOWN: dict[str, tuple[Any, str]] = {
     "data": (str, "a bundled set, a folder of recordings, or an .npz file with X and y"),
+    "part": (str, "name of the array of parts' numbers in the file"),
     "samples": (int, "use the first so many samples of each trace; all by default"),
     "recipe": (str, "a recipe's name or TOML file, or module:Class"),
     "alpha": (float, "error level of the interval"),
@@ -39,3 +53,47 @@ def options(description: str | None, **defaults: Any) -> argparse.ArgumentParser
         kind, text = KNOWN[name]
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, default=default, help=text)
     return parser
+
+
+def wall_time(call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+    """Seconds until a call returns, and what it returns."""
+    begin = time.perf_counter()
+    found = call(*given)
+    return time.perf_counter() - begin, found
+
+
+def quantiles(seconds: Sequence[float] | np.ndarray) -> dict[str, Any]:
+    """How many, their median, 99th percentile and worst; NaN where there are none."""
+    found = np.quantile(seconds, [0.5, 0.99, 1.0]).tolist() if len(seconds) else [math.nan] * 3
+    return {"n": len(seconds)} | dict(zip(("p50_s", "p99_s", "worst_s"), found, strict=True))
+
+
+def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None, width: int = 124) -> None:
+    """Print rows as a table, and write them as CSV; a column's ending is its unit: _s, _bytes, _share."""
+    if path is not None:
+        write_csv(pd.DataFrame(rows), path, force=True)
+    shown = [{_heading(name): _written(name, value) for name, value in row.items()} for row in rows]
+    words = [_heading(name) for name, value in rows[0].items() if isinstance(value, str)]
+    Console(width=width).print(figures(title, shown, words=words))
+
+
+def _heading(name: str) -> str:
+    return name.removesuffix("_s").removesuffix("_bytes").removesuffix("_share").replace("_", " ")
+
+
+def _written(name: str, value: Any) -> str:
+    if isinstance(value, str) or value is None:
+        return value or ""
+    if math.isnan(value):
+        return "-"
+    for ending, write in (("_s", duration), ("_bytes", size), ("_share", percent)):
+        if name.endswith(ending):
+            return write(value)
+    return f"{value:,}" if float(value).is_integer() else f"{value:,.3g}"
+
+
+def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Labelled traces (n, C, T), and (n,): recorded ones with 0.2 units of fresh sensor noise."""
+    rows = rng.integers(len(data), size=n)
+    X = as_traces(data.X[rows])
+    return X + rng.normal(0.0, 0.2, X.shape).astype(np.float32), data.y[rows]

@@ -4,7 +4,9 @@
     python training/compare_ablations.py --data screw_driving.npz --samples 400 --only radius,folds,length
 
 Axes: radius, retrain (labels between two retrains), folds, features (what they are made of), length (a part is decided on
-the beginning of its trace: 0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee.
+the beginning of its trace: 0.2 of 2 s are 0.4 s), channels (of traces that have several), feedback, interval, guarantee,
+promises (what honesty, novelty, audits, parts and the pooled guarantee each cost, every stop known: dishonest heads are
+trained on all labels, their own fold's too).
 Writes ablations.csv, a row a replay, and ablations.png. Finished replays are kept in --keep, so that an interrupted run
 goes on.
 """
@@ -19,6 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import torch
 from common import POLICY, options
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -28,6 +31,8 @@ from dengine.experiments.figures import GREEN, LIMIT, save
 from dengine.experiments.grid import Task, play_tasks
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
+from dengine.reducers import ConvReducer
+from dengine.reducers.heads import CrossFittedScores, FeatureEmbedding
 
 CYCLES = 1503
 
@@ -89,6 +94,39 @@ def policy(name: str, values: tuple[str, ...], **others: Any) -> Callable[[Datas
     return lambda data, base: {value: Variant(data, base.with_policy(**{name: value}, **others)) for value in values}
 
 
+class DishonestScores(CrossFittedScores):
+    """Every head is trained on every fold's labels, which are then counted in it: for comparison only."""
+
+    def _head(self, k: int, g: torch.Tensor, y: torch.Tensor, outside: torch.Tensor, l2: float) -> Any:
+        return super()._head(k, g, y, torch.ones_like(outside), l2)
+
+
+class DishonestReducer(ConvReducer):
+    """conv with such heads."""
+
+    def _build(self, channels: int, samples: int) -> None:
+        super()._build(channels, samples)
+        features = self.net_.features
+        self.net_ = FeatureEmbedding(features, DishonestScores(features.n_out, self.folds, self.n_components)).eval()
+
+
+def promises(data: Dataset, base: Recipe) -> Variants:
+    """The paper's rule, and what is promised beyond it, one after the other."""
+    plain, known = replace(data, part=None), base.with_policy(stops="all")
+    bare, pooled = replace(known, novelty=0.0), known.with_policy(guarantee="pooled")
+    found = {
+        "the paper's rule": Variant(plain, replace(base, novelty=0.0)),
+        "silence confirms": Variant(plain, bare),
+        "the same, dishonest": Variant(plain, replace(bare, reducer=DishonestReducer(), params={})),
+        "novelty": Variant(plain, known),
+        "novelty, pooled": Variant(plain, pooled),
+        "2 % audits": Variant(plain, pooled.with_policy(audit_rate=0.02)),
+        "10 % audits": Variant(plain, pooled.with_policy(audit_rate=0.1)),
+    }
+    named = {"novelty, parts named": Variant(data, known), "novelty, pooled, parts named": Variant(data, pooled)}
+    return found | ({} if data.part is None else named)
+
+
 AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
     "radius": setting("radius", (0.02, 0.03, 0.05, 0.07, 0.1, 0.2)),
     "retrain": setting("retrain_every", (25, 50, 100, 200, 400)),
@@ -99,6 +137,7 @@ AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
     "feedback": feedback,
     "interval": policy("interval", ("wilson", "clopper_pearson", "jeffreys", "binomial")),
     "guarantee": policy("guarantee", ("local", "pooled"), stops="all"),
+    "promises": promises,
 }
 
 
@@ -139,14 +178,22 @@ def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
 
 def main() -> None:
     """Parse, play every axis that was asked for, print, write."""
-    defaults = {"data": "insertion", "samples": None, "recipe": "conv", **POLICY, "seeds": "100:110", "cycles": CYCLES}
+    defaults = {
+        "data": "insertion",
+        "samples": None,
+        "part": "part",
+        "recipe": "conv",
+        **POLICY,
+        "seeds": "100:110",
+        "cycles": CYCLES,
+    }
     parser = options(__doc__, **defaults, n_jobs=-1, keep=None, out=Path("out"))
     parser.add_argument("--only", default=",".join(AXES), help="axes, with commas between")
     args = parser.parse_args()
     axes = args.only.split(",")
     if unknown := set(axes) - set(AXES):
         parser.error(f"expected axes among {', '.join(AXES)}, got {', '.join(sorted(unknown))}")
-    data = load_dataset(args.data, args.samples)
+    data = load_dataset(args.data, args.samples, args.part)
     base = Recipe.load(args.recipe).with_policy(alpha=args.alpha, lower_bound=args.lower_bound)
     with TemporaryDirectory() as kept:  # what stands on several axes, the recipe as it is, is played once
         args.keep = args.keep or kept

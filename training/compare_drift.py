@@ -16,16 +16,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from common import options
+from common import options, tell
 from joblib import Parallel, delayed
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.table import Table
 
 from dengine import Policy, Recipe
 from dengine.cells.simulation.conditions import CellParameters, first_change
@@ -68,7 +66,7 @@ def play(scenario: str, method: str, path: Path, seed: int) -> Run:
     return Run(scenario, method, replay(path, METHODS[method], seed, shuffle=False))
 
 
-def row_of(run: Run) -> dict[str, object]:
+def row_of(run: Run) -> dict[str, Any]:
     """What happened, in numbers; None where it did not."""
     log, n = run.log, len(run.log)
     alarm, back = alarm_and_back(log.safe_mode, (first_change(run.scenario, n) or 1) - 1)
@@ -113,33 +111,29 @@ def seconds_saved(log: Replay) -> float:
     return cell.verify_s * (total["accepted"] + total["rejected"]) - lost
 
 
-CELLS = {
-    "accepted": lambda r: str(r["accepted"]),
-    "bad": lambda r: str(r["false_positive"]),
-    "bad/1000\nbefore / after": lambda r: f"{r['escapes_before']:.1f} / {r['escapes_after']:.1f}",
-    "verified\nbefore / after": lambda r: f"{r['verified_before']:.0%} / {r['verified_after']:.0%}",
-    "novel\nbefore / after": lambda r: f"{r['novel_before']} / {r['novel_after']}",
-    "alarms\nbefore / after": lambda r: f"{r['alarms_before']} / {r['alarms_after']}",
-    "alarm": lambda r: "-" if r["alarm"] is None else str(r["alarm"]),
-    "lasts": lambda r: "-" if r["alarm"] is None else "open" if r["back"] is None else str(r["back"]),
-    "saved s": lambda r: f"{r['saved_s']:.0f}",
-}
+CAPTION = """Before / after: halves of the run. bad/1000: bad parts accepted for 1,000 parts passed on, checked or not.
+alarm: cycles from the change until all is verified; lasts: cycles until that ended. saved: against verifying every part, what
+stops and good parts sent back cost taken off. dengine's guarantee is pooled, and it takes accepted parts that no stop follows
+for good; that of the others is local, and they know stops alone."""
 
 
-def table_of(rows: Sequence[dict[str, object]]) -> Table:
-    """The rows for a screen."""
-    caption = (
-        "bad/1000: bad parts accepted for 1,000 parts passed on, checked or not. alarm: cycles from the change until all "
-        "is verified, -: never; lasts: cycles until that ended. before, after: halves of the run. saved: against "
-        "verifying every part, what stops and good parts sent back cost taken off. dengine's guarantee is pooled, and it "
-        "takes accepted parts that no stop follows for good; that of the others is local, and they know stops alone."
-    )
-    table = Table("scenario", "method", title="simulated cell, (alpha, LB) = (0.1, 90 %)", caption=caption)
-    for name in CELLS:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(str(row["scenario"]), str(row["method"]), *(show(row) for show in CELLS.values()))
-    return table
+def shown(row: dict[str, Any]) -> dict[str, Any]:
+    """A row for a screen; what is told of both halves as before / after."""
+    lasts = "open" if row["alarm"] and row["back"] is None else row["back"] or "-"
+    halves = {
+        "bad/1000": ("escapes", ".1f"),
+        "verified": ("verified", ".0%"),
+        "novel": ("novel", ""),
+        "alarms": ("alarms", ""),
+    }
+    return {
+        **{name: row[name] for name in ("scenario", "method", "accepted")},
+        "bad": row["false_positive"],
+        **{title: f"{row[f'{of}_before']:{form}} / {row[f'{of}_after']:{form}}" for title, (of, form) in halves.items()},
+        "alarm": row["alarm"] or "-",
+        "lasts": lasts,
+        "saved, s": f"{row['saved_s']:.0f}",
+    }
 
 
 def picture(runs: Sequence[Run]) -> Figure:
@@ -197,7 +191,8 @@ def main() -> None:
     played = Parallel(n_jobs=args.n_jobs)(delayed(play)(s, m, streams[s], args.seed) for s, m in tasks)
     runs = sorted(played, key=lambda run: (scenarios.index(run.scenario), methods.index(run.method)))
     rows = [row_of(run) for run in runs]
-    Console(width=150).print(table_of(rows))
+    tell([shown(row) for row in rows], "simulated cell, (alpha, LB) = (0.1, 90 %)", width=150)
+    print(CAPTION)
     figure = picture(runs)
     write_csv(pd.DataFrame(rows), args.out / "drift.csv", force=True)
     written = save(figure, args.out / "drift.png", dpi=80, force=True)

@@ -44,13 +44,12 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/compare_reducers.py report --data insertion": f"{ONE_REPLAY} --reducers conv,pca,knn",
     "python training/compare_reducers.py report --data screw_driving.npz": f"{ONE_REPLAY} --reducers conv,pca",
     "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
-    "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1 --umap-most 1",
+    "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1",
     "python -m tests.slow.proof.noise": "--data screw_driving.npz --samples 100 --seeds 100:101",
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
     "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",
     "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100 --ur-rtde 0",
-    "python training/compare_costs.py": "--seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/check_cost_choice.py": "--data small.npz --parts 40 --repeats 2 --escapes 60 --n-jobs 1",
     "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
@@ -62,7 +61,7 @@ NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what ins
 CPP = ("cmake", "build/")
 HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
 PYTHON = ("dengine ", "python training/", "python -m tests.", "python snippet.py")
-HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "torchmetrics", "umap")
+HEAVY = ("matplotlib.pyplot", "pandas", "rich.table", "scipy.special", "sklearn.linear_model", "umap")
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(
     ["dengine.cli", "dengine.engine.engine", "dengine.experiments.grid", "dengine.store.sql", *HEAVY]
