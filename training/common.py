@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.table import Table
 
 from dengine import Dataset
-from dengine.cli.output import duration, figures, size
+from dengine.cli.output import duration, size
 from dengine.errors import percent
 from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
@@ -72,9 +74,12 @@ def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None
     """Print rows as a table, and write them as CSV; a column's ending is its unit: _s, _bytes, _share."""
     if path is not None:
         write_csv(pd.DataFrame(rows), path, force=True)
-    shown = [{_heading(name): _written(name, value) for name, value in row.items()} for row in rows]
-    words = [_heading(name) for name, value in rows[0].items() if isinstance(value, str)]
-    Console(width=width).print(figures(title, shown, words=words))
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
+    for name, value in rows[0].items():
+        table.add_column(_heading(name), justify="left" if isinstance(value, str) else "right")
+    for row in rows:
+        table.add_row(*(_written(name, value) for name, value in row.items()))
+    Console(width=width).print(table)
 
 
 def _heading(name: str) -> str:

@@ -111,10 +111,11 @@ def seconds_saved(log: Replay) -> float:
     return cell.verify_s * (total["accepted"] + total["rejected"]) - lost
 
 
-CAPTION = """Before / after: halves of the run. bad/1000: bad parts accepted for 1,000 parts passed on, checked or not.
-alarm: cycles from the change until all is verified; lasts: cycles until that ended. saved: against verifying every part, what
-stops and good parts sent back cost taken off. dengine's guarantee is pooled, and it takes accepted parts that no stop follows
-for good; that of the others is local, and they know stops alone."""
+CAPTION = """Before / after: halves of the run. bad/1000: bad parts accepted for 1,000 parts passed on, checked or
+not. alarm: cycles from the change until all is verified; lasts: cycles until that ended. saved: against
+verifying every part, what stops and good parts sent back cost taken off. dengine's guarantee is pooled,
+and it takes accepted parts that no stop follows for good; that of the others is local, and they know
+stops alone."""
 
 
 def shown(row: dict[str, Any]) -> dict[str, Any]:
