@@ -132,7 +132,10 @@ def _channels(frame: Any) -> list[Any]:
 
 
 def _as_real(values: ArrayLike) -> NDArray[np.float32]:
-    array: NDArray[Any] = np.asarray(values)
+    try:
+        array: NDArray[Any] = np.asarray(values)
+    except (ValueError, TypeError) as error:
+        raise TraceError(f"Expected real numbers, in rows of one length, got others: {error}.") from error
     if array.dtype == np.float32:
         return array  # as a controller sends it: the guard below costs a tenth of a decision
     if array.dtype.kind not in "fiub":

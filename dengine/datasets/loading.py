@@ -182,11 +182,11 @@ def _labels(y: Any) -> Any:
     """Labels as they came; words as 1 and 0."""
     try:
         words = np.asarray(y)
-    except (ValueError, TypeError) as error:
+        text = words.astype(np.str_) if words.dtype.kind == "S" else words
+    except (ValueError, TypeError) as error:  # UnicodeDecodeError too
         raise DataError(f"Expected a label for each trace, 1 (success) or 0 (failure), got others: {error}.") from error
     if words.dtype.kind not in "OUS" or words.ndim != 1:
         return words
-    text = words.astype(np.str_) if words.dtype.kind == "S" else words
     try:
         return np.array([label_of(word) for word in text.tolist()], dtype=np.int8)
     except UnreadableError as error:

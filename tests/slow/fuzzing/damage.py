@@ -1,0 +1,49 @@
+"""What hypothesis draws here: odd values of every kind, arrays, and files with damaged bytes.
+
+DENGINE_FUZZ=20000 python -m pytest tests/slow/fuzzing --hypothesis-seed=1
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+ASKED = os.environ.get("DENGINE_FUZZ", "")
+SAMPLES = 40
+OBJECTS = [object(), int, len, range(3), slice(1), np.ma.masked, np.datetime64("nat"), "\ud800", 10**400]
+
+plain = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=300)
+nested = st.recursive(
+    plain, lambda each: st.lists(each, max_size=4) | st.dictionaries(st.text(max_size=5), each, max_size=3)
+)
+shapes = st.sampled_from(
+    [(), (0,), (1,), (SAMPLES - 1,), (SAMPLES,), (1, SAMPLES), (SAMPLES, 1), (2, SAMPLES), (1, 1, SAMPLES)]
+)
+arrays = hnp.arrays(hnp.scalar_dtypes() | st.sampled_from([np.dtype("S3"), np.dtype("U2")]), shapes)
+anything = nested | st.binary(max_size=9) | st.complex_numbers() | st.sampled_from(OBJECTS) | arrays
+traces = arrays | arrays.map(np.ndarray.tolist) | arrays.map(lambda found: found.astype(object)) | anything
+
+
+def tries(share: float = 1.0) -> Callable[[Any], Any]:
+    """How often a test is tried: DENGINE_FUZZ times its share; without it 100 times, the same ones each time."""
+    n = max(5, int(share * int(ASKED or 100)))
+    options: dict[str, Any] = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
+    options["phases"] = Phase.generate, Phase.shrink
+    return settings(max_examples=n, derandomize=not ASKED, **options)
+
+
+@st.composite
+def spoilt(draw: st.DrawFn, content: bytes) -> bytes:
+    """The content with bytes changed, cut, put in, or zeroed."""
+    out = bytearray(content)
+    for _ in range(draw(st.sampled_from([1, 1, 1, 2, 8]))):
+        at = draw(st.integers(0, len(out)))
+        end = at + draw(st.sampled_from([0, 1, 1, 2, 8, 100, len(out)]))
+        out[at:end] = draw(st.binary(max_size=8) | st.just(bytes(end - at)))
+    return bytes(out)
