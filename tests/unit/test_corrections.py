@@ -210,16 +210,6 @@ def test_what_has_no_label_is_refused_with_advice_and_changes_nothing(verb: str,
     assert (engine.store.events(), engine.store.corrections()) == ([], [])
 
 
-@pytest.mark.parametrize("success", [100, -1, "0", "NG", float("nan"), None, 2])
-def test_a_label_that_is_none_is_refused(success: object, data: Dataset) -> None:
-    engine = make()
-    decision = engine.decide(data.X[0])
-    engine.report(decision.id, True)
-    with pytest.raises(ReportError, match="Expected a label, True"):
-        engine.correct(decision.id, success)
-    assert engine.store.labelled().labels.tolist() == [1]
-
-
 def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:
     engine = make()
     play(engine, data, 0, 60, confirm=True)
@@ -387,18 +377,6 @@ def test_a_rival_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_lab
     assert again_.model.y.tolist() == engine.model.y.tolist()
 
 
-@pytest.mark.parametrize(
-    ("verb", "value", "message"),
-    [
-        *(("rollback", each, "number of a version") for each in (True, "1", 1.0, None)),
-        *(("set_policy", each, "Expected a Policy") for each in (None, "pooled", {"alpha": 0.1})),
-    ],
-)
-def test_what_is_no_version_and_no_policy_is_refused(verb: str, value: object, message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        getattr(make(), verb)(value)
-
-
 def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bounds(
     kept: Callable[..., DataEngine], data: Dataset
 ) -> None:
@@ -471,17 +449,6 @@ def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) 
         each.decide(data.X[161])
         each.flush()
         assert len(each.store.unreported_accepts()) >= silent
-
-
-def test_a_reopened_store_keeps_the_policy_and_refuses_the_old_one(tmp_path: Path, data: Dataset) -> None:
-    new = Policy(alpha=0.05, lower_bound=0.85)
-    with make(store=tmp_path / "engine.db") as engine:
-        play(engine, data, 0, 60, confirm=True)
-        engine.set_policy(new)
-    with DataEngine.open(tmp_path / "engine.db") as engine:
-        assert engine.policy == new
-    with pytest.raises(SettingError, match="lower_bound"):
-        DataEngine.open_or_create(tmp_path / "engine.db", policy=RECIPE.policy)
 
 
 def test_of_a_rival_only_what_the_engine_does_itself_can_change(data: Dataset) -> None:

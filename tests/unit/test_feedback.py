@@ -11,7 +11,6 @@ from dengine.errors import ReportError, StoreError, TraceError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.store import MemoryStore
 from tests.support.driving import drive as play
-from tests.support.driving import evidence
 
 LOCAL = Policy(alpha=0.1, lower_bound=0.9)
 POOLED = replace(LOCAL, guarantee="pooled")
@@ -35,10 +34,6 @@ def accepted(engine: DataEngine, data: Dataset) -> Decision:
             return decision
         engine.report(decision.id, True)
     raise AssertionError("nothing was accepted")
-
-
-def said(cycles: list) -> list[tuple]:
-    return [(*evidence(cycle.decision), cycle.safe_mode) for cycle in cycles]
 
 
 def spoiled(stream: Dataset) -> Dataset:
@@ -123,21 +118,6 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     status = engine.store.status()
     outcomes = engine.store.outcomes()
     assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
-
-
-@pytest.mark.parametrize("stops", ["some", "all"])
-@pytest.mark.parametrize("guarantee", ["local", "pooled"])
-def test_an_engine_opened_again_decides_and_counts_on_as_if_it_had_not_stopped(
-    stream: Dataset, tmp_path: Path, guarantee: str, stops: str
-) -> None:
-    policy = replace(LOCAL, guarantee=guarantee, stops=stops, audit_rate=0.1)
-    whole = said(play(make(policy), stream))
-    url = str(tmp_path / "parted.db")
-    parted = []
-    for first in range(0, 500, 125):
-        with DataEngine.open_or_create(url, recipe=replace(RECIPE, policy=policy), replaying=True) as engine:
-            parted += said(play(engine, stream, first, first + 125))
-    assert parted == whole
 
 
 def test_a_killed_engine_confirms_after_it_was_opened_what_had_gone_on(stream: Dataset, tmp_path: Path) -> None:
@@ -234,18 +214,6 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_are_not(make_data)
         cycles = play(engine, Dataset(X[order], y[order], part=parts))
         last = [c.retrain for c in cycles if c.retrain is not None][-1]
         assert ("give their numbers" in last.reason) is said
-
-
-def test_the_certificate_counts_what_really_happened(stream: Dataset) -> None:
-    engine = make(replace(POOLED, stops="all"))
-    cycles = play(engine, stream)
-    bad = sum(c.source is Source.STOP for c in cycles)
-    certificate = engine.certificate()
-    n_accepted = sum(c.decision.action is Action.ACCEPT for c in cycles)
-    assert n_accepted - 1 <= certificate.accepted.n <= n_accepted
-    assert certificate.accepted.n_bad == bad
-    assert bad / n_accepted <= certificate.accepted.upper < 0.1
-    assert certificate.rejected.upper == 1.0  # nobody looked
 
 
 def test_without_stops_or_audits_the_certificate_says_that_it_knows_nothing(stream: Dataset) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import Policy
 from dengine.decision.certificate import log_evidence
 from dengine.decision.rule import BETS, FALSE_ALARMS, LOWEST, SAFE_MODE, DecisionRule, PooledRule, WatchedRule, script
 
@@ -25,19 +24,6 @@ def tell(rule: DecisionRule, lower: float, *outcomes: bool, upper: float = 1.0) 
 def enough(alpha: float, tolerance: float) -> int:
     """Good parts in a row that are evidence enough."""
     return next(n for n in range(1, 1000) if log_evidence(n, 0, tolerance, 1.0, BETS) >= math.log(1 / alpha))
-
-
-@pytest.mark.parametrize(
-    ("guarantee", "stops", "kind"),
-    [
-        ("local", "some", DecisionRule),
-        ("local", "all", WatchedRule),
-        ("pooled", "some", PooledRule),
-        ("pooled", "all", PooledRule),
-    ],
-)
-def test_a_policy_names_its_rule(guarantee: str, stops: str, kind: type) -> None:
-    assert type(Policy(0.1, 0.9, guarantee=guarantee, stops=stops).rule()) is kind
 
 
 @pytest.mark.parametrize(("alpha", "lower_bound"), [(0.1, 0.9), (0.05, 0.95), (0.2, 0.8)])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dengine.history
-from dengine import DataEngine, SqlStore
+from dengine import SqlStore
 from dengine.errors import SettingError, StoreError
 from dengine.history.status import beside, history, interleaved
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
@@ -178,15 +178,6 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: Stor
     assert all(label.decided == by_id[label.decision_id].time for label in every)
 
 
-def test_labelled_traces_up_to_a_number_are_the_older_part_of_them_all(store: Store) -> None:
-    every = store.labelled()
-    cut = int(every.seq[len(every.seq) // 2])
-    found = store.labelled(4, last=cut)
-    kept = np.flatnonzero(every.seq <= cut)[-4:]
-    for name in ("seq", "traces", "labels", "hashes"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(every, name)[kept])
-
-
 def test_retrains_have_their_times_and_newer_versions_are_kept(store: Store) -> None:
     retrains = store.past_retrains()
     assert [each.report for each in retrains] == store.retrains()
@@ -208,16 +199,6 @@ def test_retrains_and_events_stand_where_they_happened(store: Store) -> None:
     late = beside(store, since=whole[-1].time)
     assert [len(each) for each in late.values()] == [1, 2]
     assert beside(store, until=whole[0].time)["retrains"] == []
-
-
-def test_an_engine_shows_what_it_decided() -> None:
-    with DataEngine("pca") as engine:
-        first = engine.decide(np.arange(30.0))
-        engine.report(first.id, success=True)
-        second = engine.decide(np.arange(30.0)[::-1], part="A-7")
-        shown = [(past.decision.id, past.label, past.decision.part) for past in engine.history()]
-        assert shown == [(first.id, "good", None), (second.id, "none", "A-7")]
-        assert [past.decision.id for past in engine.history(label="none")] == [second.id]
 
 
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:

@@ -1,8 +1,5 @@
 """The model prediction: no label is counted in an embedding that saw it, and states and processes carry it unchanged."""
 
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-
 import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -104,11 +101,6 @@ def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
     np.testing.assert_array_equal(smaller.count(1024 * queries), newtons.count(queries))
 
 
-def test_an_unfitted_model_says_what_to_do(data: Dataset) -> None:
-    with pytest.raises(ValueError, match=r"call fit\(X, y\) first"):
-        ModelPrediction("pca").decide(data.X)
-
-
 def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None:
     parent = ModelPrediction("pca", classifier()).fit(data.X[:100], data.y[:100])
     before = parent.predict_many(data.X[100:])
@@ -143,10 +135,3 @@ def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements
     assert not any(name.startswith("reducer.") for name in state)
     restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
     assert restored.predict_many(data.X) == model.predict_many(data.X)
-
-
-def test_a_model_trained_in_a_spawned_process_judges_as_one_trained_here(data: Dataset) -> None:
-    here = lda().fit(data.X, data.y)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        there = pool.submit(lda().fit, data.X, data.y).result()
-    assert there.predict_many(data.X) == here.predict_many(data.X)

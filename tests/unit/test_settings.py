@@ -14,34 +14,23 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from dengine import (
-    Action,
     ConvReducer,
     DataEngine,
     Dataset,
     ModelPrediction,
     Policy,
     Recipe,
-    ReplayCell,
     TraceSpec,
     WilsonRadiusClassifier,
-    make_reducer,
     replay,
     run_grid,
 )
-from dengine.errors import SettingError, StoreError
+from dengine.errors import SettingError
 from dengine.recipe import RECIPES
 from dengine.reducers.heads import FIRST_STEPS
+from tests.support.driving import Counting, drive
 
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
-
-
-class Constant:
-    """A rival that verifies all."""
-
-    fit = add = lambda self, *args: self
-    count = lambda self, X: (np.zeros(len(X), int), np.zeros(len(X), int))  # noqa: E731
-    predict_interval = lambda self, X: (np.zeros(len(X)), np.ones(len(X)))  # noqa: E731
-    decide = lambda self, X: np.full(len(X), Action.VERIFY, dtype=object)  # noqa: E731
 
 
 def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
@@ -59,7 +48,7 @@ def test_a_radius_beside_an_adaptive_recipe_is_the_one_that_counts() -> None:
 
 REFUSED = [  # settings, and the words that say why not
     ({"reducer": "conv", "recipe": "pca"}, "The recipe names its reducer, pca; got reducer 'conv' beside it"),
-    *(({"model": Constant(), **given}, f"decides by its own rule, so {next(iter(given))} would have no effect")
+    *(({"model": Counting(), **given}, f"decides by its own rule, so {next(iter(given))} would have no effect")
       for given in ({"policy": POLICY}, {"radius": 0.1}, {"folds": 3}, {"reducer": "pca"})),
     *(({"model": model}, "Expected a model with fit, add, count") for model in (PCA(2), ModelPrediction, 3)),
     *(({"reducer": "pca", "seed": seed}, "seed of 0 or more") for seed in ("x", 1.5, -1, True)),
@@ -79,22 +68,9 @@ def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store
 
 
 def test_the_audit_rate_and_the_loops_settings_count_for_a_rival_too() -> None:
-    engine = DataEngine(model=Constant(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2)
+    engine = DataEngine(model=Counting(), policy=Policy(audit_rate=0.3), retrain_every=7, budget=0.2)
     assert (engine.policy.audit_rate, engine.recipe.retrain_every, engine.recipe.budget) == (0.3, 7, 0.2)
-    assert engine.store.settings()["model"] == "Constant"
-
-
-def test_of_our_own_model_handed_in_the_engine_tells_the_numbers_that_it_decides_by() -> None:
-    model = ModelPrediction("pca", WilsonRadiusClassifier(0.5, 0.2, 0.8, "jeffreys"))
-    policy = DataEngine(model=model).policy
-    assert (policy.alpha, policy.lower_bound, policy.interval) == (0.2, 0.8, "jeffreys")
-
-
-@pytest.mark.parametrize("name", ["policy", "recipe", "version", "trace"])
-def test_what_a_running_engine_rests_on_cannot_be_assigned(name: str) -> None:
-    engine = DataEngine("pca")
-    with pytest.raises(AttributeError, match=name):
-        setattr(engine, name, getattr(engine, name))
+    assert engine.store.settings()["model"] == "Counting"
 
 
 def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None:
@@ -103,7 +79,7 @@ def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None
         with DataEngine.open_or_create(url, reducer="pca", policy=POLICY, radius=0.5) as engine:
             assert engine.resumed is (start > 0)
             assert engine.store.status()["decisions"] == start
-            list(engine.run(ReplayCell(data, np.arange(start, start + 50)), 50))
+            drive(engine, data, start, start + 50)
     assert DataEngine.open(url).version > 0
 
 
@@ -128,15 +104,9 @@ def test_other_settings_than_the_stores_are_an_error_that_names_both(other, name
         assert engine.policy == POLICY
 
 
-def test_a_file_that_is_not_there_is_not_opened(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="found no file"):
-        DataEngine.open(tmp_path / "none.db")
-    assert not (tmp_path / "none.db").exists()
-
-
 def made_with(data: Dataset, url: Path, **settings) -> None:
     with DataEngine.open_or_create(url, **settings) as engine:
-        list(engine.run(ReplayCell(data), 60))
+        drive(engine, data, 0, 60)
 
 
 def ours(**changes) -> ModelPrediction:
@@ -148,7 +118,7 @@ def ours(**changes) -> ModelPrediction:
     [
         ({"model": ours(), "policy": Policy(audit_rate=0.1)}, {"model": ours(alpha=0.5, lower_bound=0.6)}),
         ({"model": ours(), "recipe": "conv"}, {"model": ours(radius=0.9)}),
-        ({"model": Constant(), "retrain_every": 30, "policy": Policy(audit_rate=0.1)}, {"model": ours()}),
+        ({"model": Counting(), "retrain_every": 30, "policy": Policy(audit_rate=0.1)}, {"model": ours()}),
         ({"reducer": "pca"}, {"model": ours()}),
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
         ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
@@ -172,11 +142,6 @@ def test_what_is_not_given_is_not_asked_for(data: Dataset, tmp_path: Path) -> No
         DataEngine.open_or_create(tmp_path / "engine.db", **given).close()
     with pytest.raises(SettingError, match="got foo, which it has not"):
         DataEngine.open_or_create(tmp_path / "engine.db", foo=1)
-
-
-def test_an_object_of_ours_keeps_the_neighbourhood_of_its_recipe() -> None:
-    assert DataEngine(ConvReducer(width=32)).recipe.radius == RECIPES["conv"].radius
-    assert DataEngine(PCA(2)).recipe.radius == Recipe().radius
 
 
 @pytest.fixture
@@ -212,7 +177,7 @@ def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, da
     for i, reducer in enumerate((outside, halves.Halves(gain=3.0))):  # by its name, and as an object that has one
         with DataEngine(reducer, POLICY, store=tmp_path / f"{i}.db") as engine:
             assert 'reducer = "halves:Halves"' in engine.recipe.to_toml()
-            list(engine.run(ReplayCell(data), 60))
+            drive(engine, data, 0, 60)
             before = engine.decide(data.X[70])
         with DataEngine.open(tmp_path / f"{i}.db") as engine:
             assert engine.recipe.params == ({"gain": 3.0, "n_components": 2} if i else {})
@@ -225,7 +190,7 @@ def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp
 
     assert set(replay(data, Recipe(pipeline(), policy=POLICY), cycles=150).action) >= {"verify", "accept"}
     with DataEngine(pipeline(), POLICY, store=tmp_path / "engine.db") as engine:
-        list(engine.run(ReplayCell(data), 60))
+        drive(engine, data, 0, 60)
         before = engine.decide(data.X[70])
     with pytest.raises(SettingError, match=r"object Pipeline, has no name in TOML: hand it in again"):
         DataEngine.open(tmp_path / "engine.db")
@@ -245,12 +210,6 @@ def test_params_that_toml_cannot_say_are_refused_when_the_recipe_is_made(params:
         Recipe("conv", params)
 
 
-def test_plain_params_come_back_from_toml() -> None:
-    recipe = Recipe("umap", {"n_epochs": None, "n_neighbors": np.int64(8)})
-    assert Recipe.from_toml(recipe.to_toml()).params == {"n_epochs": None, "n_neighbors": 8}
-    assert 'reducer = "sklearn.decomposition._pca:PCA"' in Recipe(PCA(np.int64(2))).to_toml()
-
-
 def test_a_retrain_is_timed_and_stopped_by_the_clock_that_was_handed_in(data: Dataset) -> None:
     ticks = count()
     engine = DataEngine("conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks)))  # a second a look
@@ -260,17 +219,11 @@ def test_a_retrain_is_timed_and_stopped_by_the_clock_that_was_handed_in(data: Da
     before = next(ticks)
     report = engine.retrain()
     assert report.n_steps == FIRST_STEPS  # its budget is over before the first step; a first model takes these all the same
-    assert report.seconds == next(ticks) - before - 2
+    assert report.seconds in range(2, next(ticks) - before)  # whole seconds: of no other clock
 
 
 def test_a_reducer_stops_on_max_steps(data: Dataset) -> None:
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
-        list(engine.run(ReplayCell(data), 60))
+        drive(engine, data, 0, 60)
         assert [r.n_steps for r in engine.store.retrains()] == [steps]
-
-
-def test_a_seed_makes_the_reducer(data: Dataset) -> None:
-    assert make_reducer("conv", random_state=3).random_state == 3
-    model = ModelPrediction.from_recipe(RECIPES["conv"], seed=3)
-    assert (model.reducer.random_state, model.reducer.folds) == (3, RECIPES["conv"].folds)
