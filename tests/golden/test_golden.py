@@ -1,30 +1,102 @@
-"""Decisions as they were before the modules became folders: replays, bit for bit."""
+"""Engines and exported files decide as they did before the modules were moved and merged, bit for bit."""
 
 import json
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from dengine import Action, Reason
+
 GOLDEN = Path(__file__).parent
 sys.path.insert(0, str(GOLDEN))
-from golden import REPLAYS, machine  # the very lines that made the fixtures
+from golden import STORIES, Arrays, Exported, Replayed, machine  # the very lines that made what is kept
 
-MADE_ON = json.loads((GOLDEN / "machine.json").read_text(encoding="utf-8"))
-# Another processor or another NumPy may add in another order: a reference on a ball's surface then falls on either side.
-SAME_MACHINE = machine() == MADE_ON
+KEPT = GOLDEN / "default"
+# Another processor or another NumPy may add in another order: one decision that differs moves the retrains after it.
+SAME_MACHINE = json.loads((KEPT / "machine.json").read_text(encoding="utf-8")) == machine()
 MOVED = 0.03  # share of decisions that another machine may take otherwise
+EXPORTED = [name for name, story in STORIES.items() if isinstance(story, Exported)]
 
 
-@pytest.mark.parametrize("name", REPLAYS)
-def test_a_replay_takes_every_decision_that_it_took(name: str) -> None:
-    found = REPLAYS[name].play()
-    with np.load(GOLDEN / f"replay-{name}.npz") as kept:
-        np.testing.assert_array_equal(found["retrains"][:, 0], kept["retrains"][:, 0])
-        if SAME_MACHINE:
-            assert set(found) == set(kept.files)
-            for key in kept.files:
-                np.testing.assert_array_equal(found[key], kept[key], err_msg=key)
-        else:
-            assert (found["action"] != kept["action"]).mean() <= MOVED
+def kept(name: str) -> Arrays:
+    with np.load(KEPT / f"{name}.npz") as file:
+        return dict(file)
+
+
+def assert_same(found: Arrays, expected: Arrays) -> None:
+    if not SAME_MACHINE:
+        assert (found["action"] != expected["action"]).mean() <= MOVED
+        return
+    assert set(found) == set(expected)
+    for key, values in expected.items():
+        np.testing.assert_array_equal(found[key], values, err_msg=key)
+        assert (found[key].dtype, found[key].tobytes()) == (values.dtype, values.tobytes()), key
+
+
+@pytest.mark.parametrize("name", [name for name in STORIES if name not in EXPORTED])
+def test_an_engine_takes_every_decision_that_it_took(name: str, tmp_path: Path) -> None:
+    assert_same(STORIES[name].play(tmp_path), kept(name))
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Finds the file of a story, exported once."""
+    files: dict[str, Path] = {}
+
+    def find(name: str) -> Path:
+        if name not in files:
+            story = STORIES[name]
+            assert isinstance(story, Exported)
+            files[name] = story.export(tmp_path_factory.mktemp(name))
+        return files[name]
+
+    return find
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_an_exported_file_takes_every_decision_that_it_took(name: str, exported: Callable[[str], Path]) -> None:
+    assert_same(STORIES[name].ask(exported(name)), kept(name))
+
+
+@pytest.mark.parametrize("name", EXPORTED)
+def test_the_cell_program_takes_the_same_decisions(
+    name: str, exported: Callable[[str], Path], programs: Path, tmp_path: Path
+) -> None:
+    data, labels = STORIES[name].told()
+    rows = zip(data.part, labels, data.X, strict=True)
+    said = "".join(f"{part},{label},{','.join(f'{v:.9g}' for v in x)}\n" for part, label, x in rows)
+    options = ["--parts", "--learn", "--journal", str(tmp_path / "cell.csv")]
+    command = [str(programs / "dengine-cell"), str(exported(name)), *options]
+    done = subprocess.run(command, input=said, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    words = np.array([line.split(",")[:-1] for line in done.stdout.splitlines()])  # without the time that it took
+    expected = kept(name)
+    if not SAME_MACHINE:
+        assert (words[:, 0] != expected["action"]).mean() <= MOVED
+        return
+    for column, key in enumerate(("action", "reason")):
+        assert words[:, column].tolist() == expected[key].tolist()
+    for column, key in enumerate(("lower", "upper", "n_success", "n_failure"), start=2):
+        np.testing.assert_allclose(words[:, column].astype(float), expected[key], atol=1e-6, err_msg=key)
+    points = expected["embedding"].reshape(len(words), -1)
+    np.testing.assert_allclose(words[:, 6:].astype(float), points, rtol=1e-5, atol=1e-5)
+
+
+def test_a_restart_changes_no_decision() -> None:
+    whole, restarted = kept("parts"), kept("restarted")
+    for key in whole:
+        np.testing.assert_array_equal(restarted[key], whole[key], err_msg=key)
+
+
+def test_what_is_kept_has_met_everything_that_it_stands_for() -> None:
+    stories = {name: kept(name) for name, story in STORIES.items() if not isinstance(story, Replayed)}
+    reasons = set(np.concatenate([each["reason"] for each in stories.values()]))
+    never = {Reason.SATURATED, Reason.MODEL_ERROR, Reason.NO_STORE, Reason.LATE}
+    assert reasons == {str(each) for each in set(Reason) - never}
+    assert all(set(each["action"]) == {str(each) for each in Action} for each in stories.values())
+    assert all(each["action"].shape == each["lower"].shape for each in stories.values())
+    assert all(len(each["retrains"]) >= 2 for name, each in stories.items() if name not in EXPORTED)
