@@ -74,6 +74,12 @@ class TraceConflictError(TraceError):
     """Another trace under the id of a recorded decision."""
 
 
+def expect(held: bool, wanted: str, got: Any, do: str = "", error: type[DengineError] = SettingError) -> None:
+    """An error that says what was expected, what came and what to do, unless it held."""
+    if not held:
+        raise error(f"Expected {wanted}, got {shortened(got)}{'; ' if do else ''}{do}.")
+
+
 class StoreError(DengineError, RuntimeError):
     """A store that cannot be opened, belongs to something else, or lost its writer."""
 

@@ -8,6 +8,7 @@ A run is its recipe, its data and its seed; nothing else changes what it decides
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tomllib
@@ -20,13 +21,12 @@ from typing import Any
 import numpy as np
 
 from .decision.policy import Neighbourhood, Policy
-from .errors import SettingError, listed, shortened
+from .errors import SettingError, expect, listed
 from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
-ESCAPED = re.compile(r'[\\"\x00-\x1f\x7f]')
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
 NOVELTY = 1.5
 LARGEST = 2**20  # bytes of a recipe's file
@@ -72,29 +72,21 @@ class Recipe:
     def __post_init__(self) -> None:
         for name, (least, most) in WHOLE.items():
             value = getattr(self, name)
-            if not (is_whole(value, least, most) or (name == "max_steps" and value is None)):
-                got = shortened(value)
-                raise SettingError(f"Expected {name} to be an integer of at least {least}, got {got}; at most {most:,}.")
-        if not (is_number(self.budget) and self.budget > 0.0):
-            raise SettingError(f"Expected budget > 0 seconds, got {shortened(self.budget)}.")
-        if not (is_number(self.novelty) and 0.0 <= self.novelty < float("inf")):
-            raise SettingError(f"Expected a finite novelty of 0 or more, got {shortened(self.novelty)}; 0 turns it off.")
-        self._check_params()
-        if not isinstance(self.reducer, str) and not callable(getattr(self.reducer, "fit", None)):
-            raise SettingError(f"Expected a reducer's name, or a scikit-learn transformer, got {shortened(self.reducer)}.")
-        if not isinstance(self.policy, Policy):
-            raise SettingError(f"Expected policy to be a Policy, got {shortened(self.policy)}.")
+            held = is_whole(value, least, most) or (name == "max_steps" and value is None)
+            expect(held, f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
+        expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
+        novelty = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
+        expect(novelty, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
+        expect(isinstance(self.params, Mapping), "params to be a table of the reducer's settings", self.params)
+        for name, value in self.params.items():
+            held = (value is None or isinstance(value, PLAIN)) and BARE.fullmatch(str(name)) is not None
+            expect(held, "params of plain names and values", {name: value}, "hand an object in")
+        named = isinstance(self.reducer, str) or callable(getattr(self.reducer, "fit", None))
+        expect(named, "a reducer's name, or a scikit-learn transformer", self.reducer)
+        expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
         Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
         if self.reject_fraction is not None and self.policy.guarantee == "pooled":
             raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
-
-    def _check_params(self) -> None:
-        if not isinstance(self.params, Mapping):
-            raise SettingError(f"Expected params to be a table of the reducer's settings, got {shortened(self.params)}.")
-        for name, value in self.params.items():
-            if not (value is None or isinstance(value, PLAIN)) or not BARE.fullmatch(str(name)):
-                got = f"{shortened(name)}: {shortened(value)}"
-                raise SettingError(f"Expected params of plain names and values, got {got}; hand an object in.")
 
     @property
     def name(self) -> str:
@@ -136,10 +128,8 @@ class Recipe:
             raise SettingError(f"{where} is not TOML: {error}.") from error
         _must_be_known(table, cls, where)
         reducer, policy = table.get("reducer", "conv"), table.pop("policy", {})
-        if not isinstance(reducer, str):
-            raise SettingError(f"{where}: expected reducer to be a name, or module:Class, got {shortened(reducer)}.")
-        if not isinstance(policy, Mapping):
-            raise SettingError(f"{where}: expected policy to be a table, [policy], got {shortened(policy)}.")
+        expect(isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer)
+        expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
         _must_be_known(policy, Policy, f"{where}, policy,")
         base = RECIPES.get(reducer, cls())
         if isinstance(table.get("params"), Mapping):
@@ -228,14 +218,10 @@ def _table(name: str, values: Mapping[str, Any]) -> str:
 
 
 def _value(value: Any) -> str:
-    if value is None:
-        return '"none"'
-    if isinstance(value, bool | np.bool_):
-        return str(bool(value)).lower()
-    if isinstance(value, str):
-        return '"' + ESCAPED.sub(lambda found: f"\\u{ord(found[0]):04X}", value) + '"'
-    # A NumPy number's repr names its type, which is not TOML.
-    return repr(int(value)) if isinstance(value, int | np.integer) else repr(float(value))
+    if value is None or isinstance(value, str):  # a string is written as in JSON, but for one character
+        return json.dumps("none" if value is None else value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    plain = value.item() if isinstance(value, np.generic) else value  # NumPy's repr names its type, which is not TOML
+    return str(plain).lower() if isinstance(plain, bool) else repr(plain)
 
 
 RECIPES: dict[str, Recipe] = {

@@ -14,7 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import DataError, ReportConflictError, ReportError, SettingError, StoreError, shortened, without_password
+from .errors import (
+    DataError,
+    ReportConflictError,
+    ReportError,
+    SettingError,
+    StoreError,
+    expect,
+    shortened,
+    without_password,
+)
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -108,20 +117,17 @@ class TraceSpec:
         except TypeError as error:
             raise SettingError(f"Expected the names of columns, got {shortened(self.columns)}.") from error
         object.__setattr__(self, "columns", columns)
-        whole = all(is_whole(n, 1, MOST) for n in (self.samples, self.channels))
-        if not (whole and is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")):
-            raise SettingError(
-                f"Expected a trace of at least 1 sample and 1 channel at a rate above 0, got {shortened(self.samples)} "
-                f"samples, {shortened(self.channels)} channels, {shortened(self.rate_hz)} Hz."
-            )
-        if not (isinstance(self.unit, str) and all(isinstance(name, str) for name in self.columns)):
-            raise SettingError(f"Expected unit and columns of text, got {shortened(self.unit)}, {shortened(self.columns)}.")
-        if self.limit is not None and not (is_number(self.limit) and self.limit > 0):
-            raise SettingError(f"Expected a limit above 0 in the trace's unit, or None, got {shortened(self.limit)}.")
-        if self.fit not in FITS:
-            raise SettingError(f"Expected fit to be one of {', '.join(FITS)}, got {shortened(self.fit)}.")
-        if self.columns and len(set(self.columns)) != self.channels:
-            raise SettingError(f"Expected {self.channels} different columns, one a channel, got {', '.join(self.columns)}.")
+        rated = is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")
+        form = (self.samples, self.channels, self.rate_hz)
+        held = is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated
+        expect(held, "a trace of at least 1 sample and 1 channel at a rate above 0 Hz", form)
+        texts = all(isinstance(text, str) for text in (self.unit, *self.columns))
+        expect(texts, "unit and columns of text", (self.unit, self.columns))
+        limited = self.limit is None or (is_number(self.limit) and self.limit > 0)
+        expect(limited, "a limit above 0 in the trace's unit, or None", self.limit)
+        expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
+        different = not self.columns or len(set(self.columns)) == self.channels
+        expect(different, f"{self.channels} different columns, one a channel", self.columns)
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
@@ -256,11 +262,8 @@ def is_name(value: Any) -> bool:
 
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
-    if not is_name(value):
-        raise ReportError(
-            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
-            "report the `Decision.id` that `decide` returned."
-        )
+    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
+    expect(is_name(value), wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
     return str(value)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError
+from ..errors import DataError, expect
 from ..records import FITS, TraceSpec
 from ..traces import fits, fitted
 
@@ -178,14 +178,10 @@ class Asked:
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
             raise DataError("Expected a pattern of the labels (label) or a file of them (labels), got both; leave one out.")
-        if self.fit is not None and self.fit not in FITS:
-            raise DataError(f"Expected fit to be one of {', '.join(FITS)}, got {self.fit!r}.")
-        if self.rate_hz is not None and not self.rate_hz > 0:
-            raise DataError(f"Expected a rate above 0 Hz, got {self.rate_hz}.")
-        if self.samples is not None and self.samples < 1:
-            raise DataError(f"Expected 1 or more samples, got {self.samples}.")
-        if len(set(self.channels)) != len(self.channels):
-            raise DataError(f"Expected each channel once, got {', '.join(self.channels)}.")
+        expect(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit, error=DataError)
+        expect(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz, error=DataError)
+        expect(self.samples is None or self.samples >= 1, "1 or more samples", self.samples, error=DataError)
+        expect(len(set(self.channels)) == len(self.channels), "each channel once", self.channels, error=DataError)
 
 
 def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:
