@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +16,7 @@ from .output import Out, as_json, json_option
 
 if TYPE_CHECKING:
     from ..datasets import Dataset
+    from ..experiments.replay import Contender
     from ..recipe import Recipe
 
 Command = Callable[..., Any]
@@ -24,7 +25,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
 ALPHA = click.FloatRange(0.0, 1.0, min_open=True, max_open=True)
 LOWER_BOUND = click.FloatRange(0.5, 1.0, min_open=True, max_open=True)
-OWN = "module:Class"
+RULE, OWN = "module:Class", "FILE.toml|module:Class"
 
 
 def ends_in(example: str) -> str:
@@ -53,7 +54,7 @@ def names_of(kind: str) -> tuple[str, ...]:
 
 
 class Known(click.ParamType[Any]):
-    """A name of a kind, see `names_of`; own : what else may be given, which has a dot or a colon in it."""
+    """A name of a kind, see `names_of`; own : what else may be given, which has a dot, colon or slash in it."""
 
     name = "name"
 
@@ -67,7 +68,7 @@ class Known(click.ParamType[Any]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """The name; what is in no table is a usage error."""
         names = names_of(self.kind)
-        if value not in names and not (self.own and {".", ":"} & set(value)):
+        if value not in names and not (self.own and {".", ":", "/"} & set(value)):
             own = f", or {self.own} of your own" if self.own else ""
             self.fail(f"{value!r} is not one of {', '.join(map(repr, names))}{own}.", param, ctx)
         return str(value)
@@ -159,22 +160,16 @@ def short_name(name: str) -> str:
 class RecipeChoice:
     """Which recipe was asked for, if any; settings : those that were given, of a policy or `novelty`."""
 
-    reducer: str | None = None
-    recipe: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    asked: str | None
+    settings: Mapping[str, Any]
 
-    @property
-    def name(self) -> str:
-        """What to call it in a table."""
-        return short_name(self.recipe or self.reducer or "conv")
-
-    def load(self, name: str | None = None) -> Recipe:
-        """The recipe, or the one of another name with these settings. SettingError where its reducer cannot be found."""
+    def load(self) -> Recipe:
+        """The recipe with these settings. SettingError where its reducer cannot be found."""
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
 
         policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = Recipe.load(name or self.recipe or self.reducer or "conv").with_policy(**policy)
+        recipe = Recipe.load(self.asked or "conv").with_policy(**policy)
         recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)  # now, and not when a store was made for it
@@ -182,7 +177,15 @@ class RecipeChoice:
 
     def if_asked(self) -> Recipe | None:
         """The recipe, where any of it was given; else the store's counts."""
-        return self.load() if self.reducer or self.recipe or self.settings else None
+        return self.load() if self.asked or self.settings else None
+
+    def contender(self) -> Contender:
+        """Who plays by it: dengine, or the rival of that name in the same loop."""
+        from ..experiments.replay import Contender
+
+        if self.asked in names_of("rival"):
+            return replace(Contender.load(self.asked), recipe=RecipeChoice(None, self.settings).load())
+        return Contender(short_name(self.asked or "conv"), self.load())
 
 
 # What a policy is by default is the recipe's affair, or the store's.
@@ -199,26 +202,17 @@ _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
-    "guarantee": click.option("--guarantee", type=Known("guarantee", OWN), help=_GUARANTEE),
+    "guarantee": click.option("--guarantee", type=Known("guarantee", RULE), help=_GUARANTEE),
     "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
 }
 SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}
-_REDUCER = "One of your own is looked for in this folder too.  [default: conv]"
-RECIPE = {
-    "reducer": click.option("--reducer", type=Known("recipe", f"FILE.toml|{OWN}"), help=_REDUCER),
-    "recipe": click.option("--recipe", metavar="FILE", help="Every setting, from a TOML file."),
-}
-
-
-def _choice(reducer: str | None, recipe: str | None, **settings: Any) -> RecipeChoice:
-    if reducer and recipe:
-        raise click.UsageError("--reducer and --recipe exclude each other; a recipe names its reducer.")
-    return RecipeChoice(reducer, recipe, given(**settings))
+_REDUCER = "Every setting: by a reducer's name, from a TOML file, or with a reducer of your own.  [default: conv]"
+RECIPE = {"asked": click.option("--reducer", "--recipe", "asked", type=Known("recipe", OWN), help=_REDUCER)}
 
 
 policy_options = gathered("settings", given, SETTINGS)
-recipe_options = gathered("choice", _choice, RECIPE | SETTINGS)
+recipe_options = gathered("choice", lambda asked, **settings: RecipeChoice(asked, given(**settings)), RECIPE | SETTINGS)
 
 
 @dataclass(frozen=True)
@@ -285,14 +279,9 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> C
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
-    """`--n-jobs`, processes as joblib counts them."""
-
-    def checked(context: click.Context, option: click.Parameter, n_jobs: int) -> int:
-        if n_jobs == 0:
-            raise click.BadParameter("expected 1 or more, or -1 for one a core, got 0.")
-        return n_jobs
-
-    return click.option("--n-jobs", type=int, default=default, show_default=True, callback=checked, help=text)
+    """`--n-jobs`, processes as joblib counts them; 0, which it does not know, is one a core too."""
+    one_a_core = lambda context, option, n_jobs: n_jobs or -1  # noqa: E731
+    return click.option("--n-jobs", type=int, default=default, show_default=True, callback=one_a_core, help=text)
 
 
 def must_have(what: str, extra: str, *needed: str) -> None:
@@ -301,7 +290,6 @@ def must_have(what: str, extra: str, *needed: str) -> None:
         raise SettingError(f'Expected {missing} for {what}, not installed: pip install "dengine[{extra}]".')
 
 
-_KEEP = "Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once."
 _SCENARIO = "What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump."
 _SEED = "An integer; the same seed, the same run."
 _NEW_SEED = "An integer, of a new store's engine.  [default: 0]"
@@ -315,7 +303,6 @@ def _out_option(kind: click.Path, text: str) -> Callable[[Command], Command]:
 
 out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; made if need be.")
 picture_option = _out_option(FILE, "A picture, .png, .pdf or .svg, drawn into this file.")
-keep_option = click.option("--keep", type=FOLDER, metavar="FOLDER", help=_KEEP)
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED)
 new_seed_option = click.option("--seed", type=click.IntRange(0), help=_NEW_SEED)
 scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)

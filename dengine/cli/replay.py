@@ -9,15 +9,16 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
+from click.core import ParameterSource
 
 from ..errors import SettingError, percent
 from . import options
-from .options import ALPHA, COUNT, LOWER_BOUND, OWN, DataChoice, Known, Listed, RecipeChoice, short_name, verb
+from .options import ALPHA, COUNT, LOWER_BOUND, OWN, RULE, DataChoice, Known, Listed, RecipeChoice, short_name, verb
 from .output import Out, duration, end_interrupted, figures, progress, tell
 
 if TYPE_CHECKING:
@@ -47,14 +48,13 @@ class Stream:
     scheduler: str | None = None
 
 
-@dataclass(frozen=True)
-class Finished:
-    """The replays that were finished, in the order in which they were asked for; interrupted: how many, where some are not.
+class Finished(NamedTuple):
+    """The replays that were finished, in their tasks' order.  interrupted : how many, where some are missing.
 
     found : how many had been kept from an earlier run.  seconds : wall time.
     """
 
-    replays: Sequence[Replay]
+    replays: list[Replay]
     interrupted: str
     found: int
     seconds: float
@@ -104,54 +104,54 @@ def _cluster(stream: Stream, dataset: Dataset) -> Iterator[int]:
         yield -1
 
 
-def _stream(repeats: int | None, in_order: bool, seed: int, **how: Any) -> Stream:
-    if in_order and repeats not in (None, 1):
-        raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
-    return Stream(range(seed, seed + (1 if in_order else repeats or 30)), shuffle=not in_order, **how)
+def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
+    """How streams are played, handed on as one `Stream`."""
+
+    def stream(repeats: int, in_order: bool, seed: int, **how: Any) -> Stream:
+        if in_order and click.get_current_context().get_parameter_source("repeats") is not ParameterSource.DEFAULT:
+            raise click.UsageError("--in-order plays the one stream once; leave --repeats out.")
+        return Stream(range(seed, seed + (1 if in_order else repeats)), shuffle=not in_order, **how)
+
+    shuffles = click.option("--repeats", type=click.IntRange(least), default=repeats, show_default=True, help=text)
+    return options.gathered(
+        "stream",
+        stream,
+        {
+            "repeats": shuffles,
+            "seed": options.seed_option,
+            "cycles": click.option("--cycles", type=COUNT, help="Only so many parts of each stream.  [default: all]"),
+            "in_order": click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
+            "n_jobs": options.n_jobs_option(n_jobs, "Replays at a time; -1: one a core. Timings are honest with 1 only."),
+            "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=KEEP),
+            "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
+        },
+    )
 
 
-_TIMED = "Replays at a time, each in a process; -1: one a core. Timings are honest with 1 only."
-stream_options = options.gathered(
-    "stream",
-    _stream,
-    {
-        "repeats": click.option("--repeats", type=COUNT, help="Shuffled replays of each recipe.  [default: 30]"),
-        "seed": options.seed_option,
-        "cycles": click.option("--cycles", type=COUNT, help="Only so many parts of each stream.  [default: all]"),
-        "in_order": click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
-        "n_jobs": options.n_jobs_option(1, _TIMED),
-        "keep": options.keep_option,
-        "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
-    },
-)
+KEEP = "Finished replays are kept here, and not played again: an interrupted run goes on, other costs come at once."
+SHUFFLES = "Shuffled replays of each recipe."
+LISTS = {
+    "alphas": click.option("--alphas", type=Listed(ALPHA), help="To be tried, as in 0.5,0.1,0.05."),
+    "lower_bounds": click.option("--lower-bounds", type=Listed(LOWER_BOUND), help="To be tried, as in 0.8,0.9,0.95."),
+}
+POLICIES = LISTS | {
+    "intervals": click.option("--intervals", type=Listed(Known("interval")), help="To be tried."),
+    "guarantees": click.option("--guarantees", type=Listed(Known("guarantee", RULE)), help="To be tried."),
+}
 
 
 @verb("dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3 --out out/")
 @options.data_options()
 @options.recipe_options
 @click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
-@stream_options
+@stream_options(30, 1, 1, SHUFFLES)
 @options.out_option
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
     Ctrl-C shows the replays that were finished.
     """
-    from ..experiments.replay import Contender
-
-    _replay([Contender(choice.name, choice.load())], {"confirms": [confirm]}, **played)
-
-
-def _list(name: str, of: click.ParamType[Any], text: str = "To be tried.") -> Callable[[Any], Any]:
-    return click.option(f"--{name}", type=Listed(of), help=text)
-
-
-LISTS = {
-    "alphas": _list("alphas", ALPHA, "As in 0.5,0.1,0.05."),
-    "lower_bounds": _list("lower-bounds", LOWER_BOUND, "As in 0.8,0.9,0.95."),
-    "intervals": _list("intervals", Known("interval")),
-    "guarantees": _list("guarantees", Known("guarantee", OWN)),
-}
+    _replay([choice.contender()], {"confirms": [confirm]}, **played)
 
 
 @verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
@@ -161,12 +161,12 @@ LISTS = {
     "asked",
     default="conv,umap,pca",
     show_default=True,
-    type=Listed(Known("method", f"FILE.toml|{OWN}")),
+    type=Listed(Known("method", OWN)),
     help="With commas between; those that are not dengine's are rivals in the same loop.",
 )
 @options.policy_options
 @click.option("--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals.")
-@options.gathered("lists", lambda **lists: {name: values for name, values in lists.items() if values}, LISTS)
+@options.gathered("lists", options.given, POLICIES)
 @click.option(
     "--feedback",
     type=Listed(click.Choice(list(FEEDBACKS))),
@@ -175,7 +175,7 @@ LISTS = {
     metavar="LIST",
     help=f"What is known of accepted parts, of {','.join(FEEDBACKS)}: their stops alone, or of good ones too.",
 )
-@stream_options
+@stream_options(30, 1, 1, SHUFFLES)
 @options.out_option
 def compare(
     asked: Sequence[str],
@@ -193,17 +193,10 @@ def compare(
     if len({short_name(one) for one in asked}) < len(asked):
         raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
     from ..experiments.paper import GRID
-    from ..experiments.replay import Contender
 
     grid: dict[str, Any] = {**(GRID if paper else {}), **lists}
     _must_be_listed(settings, grid)
-    choice, rivals = RecipeChoice(settings=settings), options.names_of("rival")
-    who = [
-        replace(Contender.load(one), recipe=choice.load())
-        if one in rivals
-        else Contender(short_name(one), choice.load(one))
-        for one in asked
-    ]
+    who = [RecipeChoice(one, settings).contender() for one in asked]
     _replay(who, grid | {"confirms": [FEEDBACKS[name] for name in feedback]}, **played)
 
 
@@ -227,12 +220,7 @@ def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoic
     if not (replays := finished.replays):
         end_interrupted(f"{finished.interrupted}; there is nothing to show.")
     frame = tables.frame_of(replays)
-    dropped = frame.assign(dropped=[sum(not each.accepted for each in one.retrains) for one in replays])
-    sums = dropped.groupby(tables.CONDITION, sort=False)["dropped"].sum()
-    rows = [
-        row | {"promise_kept": tables.promise_kept(row), "retrains_dropped": int(n)}
-        for row, n in zip(tables.pool(frame, replays), sums, strict=True)
-    ]
+    rows = tables.pool(frame, replays)
     by_name = _grouped(replays, lambda each: each.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
     # The paper's findings are of a grid under one guarantee and one feedback.
@@ -330,27 +318,17 @@ PRICES = {
 @options.gathered("prices", dict, PRICES)
 @click.option("--unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @options.recipe_options
-@_list("alphas", ALPHA, "To be tried.  [default: 0.5,0.1,0.05]")
-@_list("lower-bounds", LOWER_BOUND, "To be tried.  [default: 0.8 to 0.99]")
-@click.option(
-    "--repeats", type=click.IntRange(2), default=10, show_default=True, help="Shuffles of each policy; half choose."
-)
-@options.seed_option
-@click.option("--cycles", type=COUNT, help="Only so many parts of each shuffle.  [default: all]")
-@options.n_jobs_option(-1, "Replays at a time, each in a process; -1: one a core.")
-@options.keep_option
+@options.gathered("lists", options.given, LISTS)
+@stream_options(10, 2, -1, "Shuffles of each policy; half choose.")
 @options.out_option
 def costs(
     choice: RecipeChoice,
     prices: dict[str, float],
     unit: str,
-    alphas: Sequence[float] | None,
-    lower_bounds: Sequence[float] | None,
+    lists: Mapping[str, Any],
     source: DataChoice,
-    repeats: int,
-    seed: int,
+    stream: Stream,
     out: Out | None,
-    **how: Any,
 ) -> None:
     """Say which alpha and LB pay.
 
@@ -361,14 +339,12 @@ def costs(
     from ..experiments.costs import ALPHAS, LOWER_BOUNDS, cost_tasks, curve_of
     from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
-    from ..experiments.replay import Contender
 
-    priced, stream = Costs(**prices), Stream(range(seed, seed + repeats), **how)
-    who, tried = Contender(choice.name, choice.load()), (alphas or ALPHAS, lower_bounds or LOWER_BOUNDS)
-    tasks = cost_tasks(who, *tried, stream.seeds, stream.cycles)
+    priced, tried = Costs(**prices), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
+    tasks = cost_tasks(choice.contender(), **tried, seeds=stream.seeds, cycles=stream.cycles)
     finished = _played(source.load(), tasks, stream)
     seeds = [each.seed for each in finished.replays]
-    if finished.interrupted and sum(seeds.count(seed) == len(tasks) / repeats for seed in set(seeds)) < 2:
+    if finished.interrupted and sum(seeds.count(seed) == len(tasks) / len(stream.seeds) for seed in set(seeds)) < 2:
         end_interrupted("Interrupted: fewer than two shuffles were finished under every policy; there is nothing to show.")
     curve = curve_of(finished.replays, priced)
     frame, every = curve.to_frame(), f"{curve.baseline:.3g}"

@@ -68,7 +68,7 @@ def frame_of(replays: Sequence[Replay]) -> pd.DataFrame:
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
     """A row for each recipe, interval, alpha, LB, guarantee and feedback, in the frame's order.
 
-    replays : of the frame's rows; with them a row has the interval of the pooled error, as `pooled_error` has it.
+    replays : of the frame's rows; with them a row has the interval of the pooled error, and retrains that were dropped.
 
     precision, npv : over the sums of all replays, not the mean of their ratios, which would weigh a replay that accepted
         three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
@@ -92,7 +92,8 @@ def _pooled(condition: dict[str, Any], part: pd.DataFrame, replays: Sequence[Rep
         row[name] = 1.0 - total[wrong] / total[decided] if total[decided] else math.nan
     row |= {name: float(part[name].agg(how)) for name, how in TIMES.items()}
     ends = (error.lower, error.upper) if error.decided else (math.nan, math.nan)
-    return row | dict(zip(("error_lower", "error_upper"), ends, strict=True))
+    row["retrains_dropped"] = sum(not each.accepted for one in replays for each in one.retrains)
+    return row | {"error_lower": ends[0], "error_upper": ends[1], "promise_kept": promise_kept(row)}
 
 
 def promise_kept(row: Mapping[str, Any]) -> bool | None:

@@ -359,7 +359,6 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(
         (["replay", "--stops", "most"], "'most' is not one of 'all', 'some'"),
         (["replay", "--audit-rate", "1"], "1.0 is not in the range 0.0<=x<1.0"),
         (["replay", "--novelty", "-1"], "-1.0 is not in the range x>=0.0"),
-        (["replay", "--reducer", "pca", "--recipe", "x.toml"], "exclude each other"),
         (["compare", "--reducers", ","], "at least one value"),
         (["run", "--cell", "elsewhere"], "'elsewhere' is not one of"),
         (["train"], "Missing option"),
