@@ -45,7 +45,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/compare_reducers.py report --data screw_driving.npz": f"{ONE_REPLAY} --reducers conv,pca",
     "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1",
-    "python -m tests.slow.proof.noise": "--data screw_driving.npz --samples 100 --seeds 100:101",
+    "python -m tests.slow.proof --only null": "--repeats 2",
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
     "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",

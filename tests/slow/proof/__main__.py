@@ -16,42 +16,40 @@ from pathlib import Path
 from typing import Any
 
 from .certificate import PROPENSITIES, STREAMS
-from .pieces import Piece, Row, finish
-from .replays import Case, noise_cases, planted_cases
+from .pieces import Piece, finish
+from .replays import noise_cases, planted_cases
 from .report import write_report
 
 CHUNK = 10  # seeds a piece
 QUICK = ("conv", "pca", "rocket")
-PARTS = ("counts", "certificate", "planted", "noise", "collapse", "garbage")
+CASES = {"planted": planted_cases, "noise": noise_cases}
+PARTS = ("null", "counts", "certificate", "planted", "noise", "collapse", "garbage")
 
 
-def seeds_in_pieces(kind: str, settings: Row, repeats: int, chunk: int = CHUNK) -> list[Piece]:
+def in_pieces(kind: str, settings: dict[str, Any], repeats: int, chunk: int = CHUNK) -> list[Piece]:
     """The seeds 0 .. repeats - 1 of one configuration."""
     return [Piece(kind, settings, tuple(range(a, min(a + chunk, repeats)))) for a in range(0, repeats, chunk)]
 
 
-def _cases(kind: str, cases: list[Case], repeats: int) -> list[Piece]:
-    pieces = []
-    for case in cases:
-        chunk = {"umap": 1, "rocket": 2}.get(case.reducer, CHUNK)
-        pieces += seeds_in_pieces(kind, case.plain(), max(2, round(case.share * repeats)), chunk)
-    return pieces
-
-
 def pieces_of(part: str, repeats: int) -> list[Piece]:
     """All pieces of one part."""
-    if part == "noise":
-        return _cases(part, noise_cases(), repeats)
-    if part == "planted":
-        return _cases(part, planted_cases(), repeats)
-    count, chunk, cases = {
+    if part in CASES:
+        return [
+            piece
+            for case in CASES[part]()
+            for piece in in_pieces(
+                part, {"case": case}, max(2, round(case.share * repeats)), {"umap": 1, "rocket": 2}.get(case.reducer, CHUNK)
+            )
+        ]
+    count, chunk, settings = {
+        "null": (max(2, repeats // 20), 1, [{"reducer": "conv", "data": "insertion"}]),
         "counts": (max(2, repeats // 5), CHUNK, _product(reducer=QUICK, data=("white noise", "insertion"), p=(0.8,))),
         "certificate": (max(2, repeats // 10), CHUNK, _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
         "garbage": (max(1, repeats // 40), 1, _product(reducer=QUICK)),
         "collapse": (min(30, max(2, repeats // 4)), 5, _product(guarantee=("local", "pooled"), stops=("some", "all"))),
     }[part]
-    pieces = [piece for case in cases for piece in seeds_in_pieces(part, case, count, chunk)]
-    return pieces + (seeds_in_pieces(part, {"reducer": "umap"}, 1) if part == "garbage" else [])
+    pieces = [piece for each in settings for piece in in_pieces(part, each, count, chunk)]
+    return pieces + (in_pieces(part, {"reducer": "umap"}, 1) if part == "garbage" else [])
 
 
 def _product(**axes: Iterable[Any]) -> list[dict[str, Any]]:

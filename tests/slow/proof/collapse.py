@@ -26,7 +26,7 @@ def stream(seed: int) -> Dataset:
     return Dataset(X.astype(np.float32), (rng.random(CYCLES) < p).astype(np.int8), name="collapse")
 
 
-def collapse(guarantee: str, stops: str, seed: int) -> dict[str, Any]:
+def collapse(seed: int, guarantee: str, stops: str) -> dict[str, Any]:
     """Bad accepts in the collapse; cycles until nothing is accepted for good; cycles after it until half as much as before.
 
     NaN where that never happened.
@@ -39,10 +39,8 @@ def collapse(guarantee: str, stops: str, seed: int) -> dict[str, Any]:
     quiet = float(within[-1] + 1) if len(within) else 0.0
     back = [i for i in range(END, CYCLES - CALM) if accepted[i : i + CALM].mean() >= 0.5 * usual]
     return {
-        "seed": seed,
         "usual": float(usual),
         "bad_accepts": int(log.false_positive[BEGIN:END].sum()),
         "quiet_after": quiet if quiet <= END - BEGIN - CALM else float("nan"),
         "back_after": float(back[0] - END) if back and usual > 0 else float("nan"),
-        "safe_mode": guarantee == "pooled" or stops == "all",
     }

@@ -1,6 +1,6 @@
 """Garbage: what no gripper ever felt, shown to a model that learned insertions. How much of it is accepted?
 
->>> garbage("conv", seed=0)[0]
+>>> garbage(0, "conv")[0]
 """
 
 from collections.abc import Callable
@@ -67,7 +67,7 @@ def screws(samples: int, rng: np.random.Generator) -> Traces | None:
     return np.array([np.interp(grid, np.arange(X.shape[1]), x) for x in X], dtype=np.float32)
 
 
-def garbage(reducer: str, seed: int) -> list[dict[str, Any]]:
+def garbage(seed: int, reducer: str) -> list[dict[str, Any]]:
     """A row a kind: the share accepted with the novelty gate and without; last, certain decisions on clean parts."""
     rng, data = np.random.default_rng([seed, 13]), load_dataset("insertion")
     order = rng.permutation(len(data))
@@ -94,7 +94,7 @@ def _rows(
     share = [(name, *(_share(m, x, [Action.ACCEPT]) for m in (gated, open_))) for name, x in kinds.items()]
     if clean is not None:
         share.append(("clean, certain", *(_share(m, clean, [Action.ACCEPT, Action.REJECT]) for m in (gated, open_))))
-    return [{"seed": seed, "kind": name, "gated": on, "open": off} for name, on, off in share]
+    return [{"kind": name, "gated": on, "open": off} for name, on, off in share]
 
 
 def _share(model: ModelPrediction, X: Traces, actions: list[Action]) -> float:

@@ -1,23 +1,20 @@
 """Replays of planted truths, judged by true probabilities: how often is what was accepted worse than the tolerance?
 
->>> row = judge(Case("conv, soft", truth="soft", guarantee="pooled", stops="all"), seed=0)
+>>> row = judge(seed=0, case=Case("conv, soft", truth="soft", guarantee="pooled", stops="all"))
 >>> row["accepted"], row["accepted_failure"]         # how many, and their mean true probability of failure
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dengine import Recipe, replay
-from dengine.experiments.replay import Replay
 from dengine.recipe import RECIPES
 
-from .truths import Stream, planted
+from .truths import planted
 
 Row = dict[str, Any]
 MOVING = ("drifting", "jumping")
+POLICY = ("alpha", "lower_bound", "interval", "guarantee", "stops", "audit_rate")
 
 
 @dataclass(frozen=True)
@@ -53,44 +50,24 @@ class Case:
         """Rejected parts tell nothing of themselves: only audits do."""
         return self.claims_accepts and self.audit_rate > 0.0
 
+    @property
     def recipe(self) -> Recipe:
         """The engine's."""
-        return RECIPES[self.reducer].with_policy(
-            alpha=self.alpha,
-            lower_bound=self.lower_bound,
-            interval=self.interval,
-            guarantee=self.guarantee,
-            stops=self.stops,
-            audit_rate=self.audit_rate,
-        )
-
-    def stream(self, seed: int) -> Stream:
-        """What is played."""
-        stream = planted(self.truth, self.cycles, self.lower_bound, seed, self.rate)
-        return stream.mirrored() if self.mirrored else stream
-
-    def plain(self) -> Row:
-        """Its settings."""
-        return asdict(self)
+        return RECIPES[self.reducer].with_policy(**{name: getattr(self, name) for name in POLICY})
 
 
-def played(case: Case, seed: int) -> tuple[Replay, Stream]:
-    """The case's stream of that seed, through its engine."""
-    stream = case.stream(seed)
-    return replay(stream.data, case.recipe(), seed=seed, shuffle=False), stream
-
-
-def judge(case: Case, seed: int) -> Row:
+def judge(seed: int, case: Case) -> Row:
     """Counts, and the mean true probability of a wrong decision, NaN where nothing was decided, among each side."""
-    log, stream = played(case, seed)
-    accepted, rejected = log.accepted, log.rejected
-    return {
-        "seed": seed,
-        "accepted": int(accepted.sum()),
-        "accepted_failure": _mean(1.0 - stream.p[accepted]),
-        "rejected": int(rejected.sum()),
-        "rejected_success": _mean(stream.p[rejected]),
-    }
+    stream = planted(case.truth, case.cycles, case.lower_bound, seed, case.rate)
+    stream = stream.mirrored() if case.mirrored else stream
+    log = replay(stream.data, case.recipe, seed=seed, shuffle=False)
+    row: Row = {}
+    for side, of, wrong in (
+        ("accepted", log.accepted, ("accepted_failure", 1.0 - stream.p)),
+        ("rejected", log.rejected, ("rejected_success", stream.p)),
+    ):
+        row |= {side: int(of.sum()), wrong[0]: float(wrong[1][of].mean()) if of.any() else float("nan")}
+    return row
 
 
 def broken(rows: list[Row], side: str, tolerance: float) -> int:
@@ -98,57 +75,49 @@ def broken(rows: list[Row], side: str, tolerance: float) -> int:
     return sum(row[side] > tolerance + 1e-9 for row in rows)
 
 
-def _mean(values: NDArray[np.float64]) -> float:
-    return float(values.mean()) if len(values) else float("nan")
-
-
 LEVELS = {"10 %": (0.1, 0.9), "5 %": (0.05, 0.95), "20 %": (0.2, 0.8)}  # alpha and LB
 FEW, HALF = 0.15, 0.5  # of the repeats: for comparison, and beside a main row
+RATES = (0.5, 0.8, 0.88)  # at chance, at the paper's, and just beyond the tolerance
 PAPER: Row = {"guarantee": "local", "stops": "some"}
 
 
+def beside_the_paper(name: str, truth: str = "soft", share: float = HALF, few: float = FEW, **about: Any) -> list[Case]:
+    """A case under the pooled guarantee, and for comparison under the paper's local rule."""
+    return [Case(name, truth, share=share, **about), Case(f"{name}, local", truth, share=few, **about, **PAPER)]
+
+
 def noise_cases() -> list[Case]:
-    """Labels independent of the trace: at chance, at the paper's rate, and just beyond the tolerance."""
-    cases = []
+    """Labels independent of the trace."""
+    cases = [Case("noise 0.8, conv, local, 1503", "noise", 0.8, cycles=1503, share=0.05, **PAPER)]
     for reducer, cycles, share in (("conv", 500, 0.4), ("pca", 500, 0.2), ("rocket", 300, 0.05), ("umap", 250, 0.02)):
-        for rate in (0.5, 0.8, 0.88):
-            about: Row = {"truth": "noise", "rate": rate, "reducer": reducer, "cycles": cycles}
-            cases.append(Case(f"noise {rate:g}, {reducer}", share=share, **about))
-            cases.append(Case(f"noise {rate:g}, {reducer}, local", share=share / 2, **about, **PAPER))
-    return [*cases, Case("noise 0.8, conv, local, 1503", "noise", 0.8, cycles=1503, share=0.05, **PAPER)]
+        for rate in RATES:
+            about: Row = {"rate": rate, "reducer": reducer, "cycles": cycles}
+            cases += beside_the_paper(f"noise {rate:g}, {reducer}", "noise", share, share / 2, **about)
+    return cases
 
 
 def planted_cases() -> list[Case]:
-    """Truths under the pooled guarantee, and under the paper's local rule for comparison."""
-    cases: list[Case] = []
-    for level, (alpha, lb) in LEVELS.items():
-        at: Row = {"alpha": alpha, "lower_bound": lb}
-        for truth in ("soft", "step", "just beyond"):
-            cases.append(Case(f"{truth}, {level}", truth, share=1.0 if level == "10 %" else HALF, **at))
-            cases.append(Case(f"{truth}, {level}, local", truth, share=FEW, **at, **PAPER))
-    for truth in ("moderate", "drifting", "jumping", "bad few"):
-        cases.append(Case(truth, truth, share=HALF))
-        cases.append(Case(f"{truth}, local", truth, share=FEW, **PAPER))
-    cases += [
+    """Truths, by level, interval, reducer, and what is known of accepted and rejected parts."""
+    hard, audited = ("soft", "step", "just beyond"), {"audit_rate": 0.1, "share": HALF}
+    cases = [
         Case("soft, local, all stops", guarantee="local", share=FEW),
         Case("soft, some stops", stops="some", share=HALF),
-        Case("soft, some stops, audits", stops="some", audit_rate=0.1, share=HALF),
-        Case("soft, audits", audit_rate=0.1, share=HALF),
-        Case("jumping, some stops, audits", "jumping", stops="some", audit_rate=0.1, share=HALF),
-        Case("soft, mirrored", mirrored=True, share=FEW),
-        Case("soft, mirrored, local", mirrored=True, share=FEW, **PAPER),
+        Case("soft, some stops, audits", stops="some", **audited),
+        Case("soft, audits", **audited),
+        Case("jumping, some stops, audits", "jumping", stops="some", **audited),
+        *beside_the_paper("soft, mirrored", share=FEW, mirrored=True),
+        *(Case(f"{truth}, mirrored, audits", truth, mirrored=True, **audited) for truth in hard),
     ]
-    cases += [
-        Case(f"{t}, mirrored, audits", t, mirrored=True, audit_rate=0.1, share=HALF)
-        for t in ("soft", "step", "just beyond")
-    ]
+    for level, (alpha, lb) in LEVELS.items():
+        for truth in hard:
+            share = 1.0 if level == "10 %" else HALF
+            cases += beside_the_paper(f"{truth}, {level}", truth, share, alpha=alpha, lower_bound=lb)
+    for truth in ("moderate", "drifting", "jumping", "bad few"):
+        cases += beside_the_paper(truth, truth)
     for interval in ("binomial", "clopper_pearson", "jeffreys"):
-        cases.append(Case(f"soft, {interval}", interval=interval, share=HALF))
-        cases.append(Case(f"soft, {interval}, local", interval=interval, share=FEW, **PAPER))
-    for rate in (0.5, 0.8, 0.88):
-        cases.append(Case(f"parts {rate:g}", "parts", rate, share=HALF if rate == 0.88 else FEW))
-        cases.append(Case(f"parts {rate:g}, local", "parts", rate, share=FEW, **PAPER))
+        cases += beside_the_paper(f"soft, {interval}", interval=interval)
+    for rate in RATES:
+        cases += beside_the_paper(f"parts {rate:g}", "parts", HALF if rate == 0.88 else FEW, rate=rate)
     for truth in ("soft", "step"):
-        cases.append(Case(f"{truth}, pca", truth, reducer="pca", share=HALF))
-        cases.append(Case(f"{truth}, pca, local", truth, reducer="pca", share=FEW, **PAPER))
+        cases += beside_the_paper(f"{truth}, pca", truth, reducer="pca")
     return cases

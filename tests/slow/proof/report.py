@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.stats import binomtest
 
-from .replays import Case, broken
+from .replays import broken
 
 if TYPE_CHECKING:
     from .pieces import Piece, Row
@@ -19,12 +19,16 @@ HEADS = {
     "planted": (
         "Planted truths: replays that broke the tolerance",
         "A replay broke it where the true failure probability of what it accepted (the true success probability of what "
-        "it rejected), on average, exceeds 1 - LB. A guarantee may be broken in a share alpha of replays; the interval "
-        "is Clopper and Pearson's, 95 %, of that share. Rows whose truth moves (drifting, jumping) are not called a "
+        "it rejected), on average, exceeds 1 - LB. A guarantee may be broken in a share alpha of replays; low and high "
+        "are Clopper and Pearson's 95 % interval of that share. Rows whose truth moves (drifting, jumping) are no "
         "guarantee: they were taken out of the claim after they were seen to break it, since members from before then pay "
-        "for parts after.",
+        "for parts after. Verdicts in brackets are of rows that promise nothing.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
+    "null": (
+        "The null test",
+        "Labels independent of the trace, four in five good: certain decisions of a replay.",
+    ),
     "counts": ("Count-only statistic", "Mean z^2 of the balls' counts under labels of noise; honest counting: 0.8 to 1.3."),
     "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
     "garbage": ("Garbage accepted", "Share accepted with the novelty gate, and without it; last, certain of clean parts."),
@@ -35,75 +39,63 @@ HEADS = {
 }
 
 
-def clopper_pearson(k: int, n: int) -> tuple[float, float]:
-    """95 % interval of a share."""
-    low = float(stats.beta.ppf(0.025, k, n - k + 1)) if k else 0.0
-    return low, float(stats.beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-
-
-def verdict(k: int, n: int, alpha: float, claimed: bool = True) -> str:
-    """Kept or BROKEN by the whole interval, or within error; in brackets where nothing was promised."""
-    low, high = clopper_pearson(k, n)
-    word = "BROKEN" if low > alpha else "kept" if high <= alpha else "within error"
-    return word if claimed else f"({word.lower()})"
+def share_row(k: int, n: int, alpha: float, claimed: bool = True) -> Row:
+    """How often a promise was broken, and what its whole interval says; in brackets where nothing was promised."""
+    ends = binomtest(k, n).proportion_ci(0.95)
+    word = "BROKEN" if ends.low > alpha else "kept" if ends.high <= alpha else "within error"
+    return {"broke": k / n, "low": ends.low, "high": ends.high, "verdict": word if claimed else f"({word.lower()})"}
 
 
 def replay_row(settings: Row, rows: list[Row]) -> Row:
     """One configuration of replays."""
-    case = Case(**settings)
-    out: Row = {"configuration": case.name, "alpha": case.alpha, "LB": case.lower_bound, "replays": len(rows)}
-    out |= {
-        "cycles": case.cycles,
-        "certain per 1503": 1503 / case.cycles * _mean(r["accepted"] + r["rejected"] for r in rows),
-    }
+    case = settings["case"]
+    certain = 1503 / case.cycles * _mean(r["accepted"] + r["rejected"] for r in rows)
+    out: Row = {"alpha": case.alpha, "LB": case.lower_bound, "replays": len(rows), "certain per 1503": certain}
     for verb, wrong, claimed in (
         ("accepted", "accepted_failure", case.claims_accepts),
         ("rejected", "rejected_success", case.claims_rejects),
     ):
-        k, n = broken(rows, wrong, case.tolerance), len(rows)
-        low, high = clopper_pearson(k, n)
         out |= {verb: _mean(r[verb] for r in rows), f"{verb}, mean wrong": _mean(r[wrong] for r in rows)}
-        out |= {f"{verb}, broke": k / n, f"{verb}, low": low, f"{verb}, high": high}
-        out |= {f"{verb}, guarantee": claimed, f"{verb}, verdict": verdict(k, n, case.alpha, claimed)}
+        broke = share_row(broken(rows, wrong, case.tolerance), len(rows), case.alpha, claimed)
+        out |= {f"{verb}, {name}": value for name, value in broke.items()}
     return out
+
+
+def null_row(settings: Row, rows: list[Row]) -> Row:
+    """Each replay's, and their mean."""
+    certain = [r["certain"] for r in rows]
+    return {"replays": len(rows), "cycles": rows[0]["cycles"], "certain": str(certain), "mean": _mean(certain)}
 
 
 def counts_row(settings: Row, rows: list[Row]) -> Row:
     """Mean z^2 over all balls."""
-    balls, about = sum(r["balls"] for r in rows), f"{settings['reducer']}, {settings['data']}"
-    z2 = sum(r["sum_z2"] for r in rows) / max(1, balls)
-    return {"configuration": about, "runs": len(rows), "balls": balls, "mean z^2": z2}
+    balls = sum(r["balls"] for r in rows)
+    return {"runs": len(rows), "balls": balls, "mean z^2": sum(r["sum_z2"] for r in rows) / max(1, balls)}
 
 
 def certificate_row(settings: Row, rows: list[Row]) -> Row:
     """Share of streams in which the bound was ever wrong."""
-    n, k = sum(r["streams"] for r in rows), sum(r["wrong"] for r in rows)
-    low, high = clopper_pearson(k, n)
-    name = f"{settings['stream']}, propensity {settings['propensity']:g}"
-    said = verdict(k, n, settings["alpha"])
-    return {"configuration": name, "streams": n, "ever wrong": k / n, "low": low, "high": high, "verdict": said}
+    n = sum(r["streams"] for r in rows)
+    return {"streams": n, **share_row(sum(r["wrong"] for r in rows), n, settings["alpha"])}
 
 
 def collapse_row(settings: Row, rows: list[Row]) -> Row:
     """Means, and in how many runs either never happened."""
-    out: Row = {"configuration": f"{settings['guarantee']}, stops {settings['stops']}", "runs": len(rows)}
-    out |= {key: _mean(r[key] for r in rows) for key in ("usual", "bad_accepts", "quiet_after", "back_after")}
-    out |= {"worst bad_accepts": max(r["bad_accepts"] for r in rows)}
+    out: Row = {key: _mean(r[key] for r in rows) for key in ("usual", "bad_accepts", "quiet_after", "back_after")}
+    out |= {"runs": len(rows), "worst bad_accepts": max(r["bad_accepts"] for r in rows)}
     return out | {f"never {key}": sum(np.isnan(r[f"{key}_after"]) for r in rows) for key in ("quiet", "back")}
 
 
 def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
     """A row a kind."""
     means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "open"]].mean()
-    return [
-        {"configuration": f"{settings['reducer']}, {kind}", "with the gate": gated, "without": open_}
-        for kind, gated, open_ in means.itertuples()
-    ]
+    return [{"kind": kind, "with the gate": gated, "without": open_} for kind, gated, open_ in means.itertuples()]
 
 
 ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
     "planted": replay_row,
     "noise": replay_row,
+    "null": null_row,
     "counts": counts_row,
     "certificate": certificate_row,
     "collapse": collapse_row,
@@ -117,54 +109,32 @@ def tables(done: Iterable[tuple[Piece, list[Row]]]) -> dict[str, pd.DataFrame]:
     for piece, rows in done:
         gathered.setdefault((piece.kind, piece.name), (piece.settings, []))[1].extend(rows)
     found: dict[str, list[Row]] = {}
-    for (kind, _), (settings, rows) in gathered.items():
+    for (kind, name), (settings, rows) in gathered.items():
         made = ROWS[kind](settings, rows)
-        found.setdefault(kind, []).extend(made if isinstance(made, list) else [made])
+        named = [{"configuration": name} | row for row in (made if isinstance(made, list) else [made])]
+        found.setdefault(kind, []).extend(named)
     return {kind: pd.DataFrame(rows) for kind, rows in found.items()}
 
 
 def write_report(done: Iterable[tuple[Piece, list[Row]]], docs: Path) -> str:
-    """Write both files; returns what they come to, in a few lines."""
+    """Write both files; returns what became of everything that is called a guarantee, in a few lines."""
     docs.mkdir(parents=True, exist_ok=True)
     found = tables(done)
     whole = pd.concat([frame.assign(part=kind) for kind, frame in found.items()], ignore_index=True)
     whole.to_csv(docs / "proof.csv", index=False, float_format="%.6g")
-    (docs / "proof.md").write_text(markdown(found), encoding="utf-8")
-    replays = [found[kind] for kind in ("planted", "noise") if kind in found]
-    if not replays:
-        return f"Written to {docs}."
-    return f"{summary(pd.concat(replays, ignore_index=True))}\nWritten to {docs}."
-
-
-def summary(frame: pd.DataFrame) -> str:
-    """What became of everything that is called a guarantee."""
+    blocks = ["# The proof", "`make proof` writes this page."]
+    for kind in (kind for kind in HEADS if kind in found):
+        title, text = HEADS[kind]
+        blocks += [f"## {title}", text, _table(found[kind])]
+    (docs / "proof.md").write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     lines = []
-    for verb in ("accepted", "rejected"):
-        claimed = frame[frame[f"{verb}, guarantee"]]
-        bad = claimed[claimed[f"{verb}, verdict"] == "BROKEN"]
+    for verb in ("accepted", "rejected") if {"planted", "noise"} & set(found) else ():
+        said = whole[f"{verb}, verdict"].dropna()
+        claimed = said[~said.str.startswith("(")]
+        bad = whole.loc[claimed.index[claimed == "BROKEN"]]
         names = "; ".join(f"{r['configuration']} {r[f'{verb}, broke']:.0%}" for _, r in bad.iterrows()) or "none"
         lines.append(f"Guarantees on {verb} parts: {len(claimed)}, broken beyond sampling error: {names}.")
-    return "\n".join(lines)
-
-
-def markdown(found: dict[str, pd.DataFrame]) -> str:
-    """The tables, each under its heading."""
-    blocks = ["# The proof", "`make proof` writes this page. Verdicts in brackets are of rows that promise nothing."]
-    for kind in (k for k in HEADS if k in found):
-        title, text = HEADS[kind]
-        blocks += [f"## {title}", text, _table(_short(found[kind]) if kind in ("planted", "noise") else found[kind])]
-    return "\n\n".join(blocks) + "\n"
-
-
-def _short(frame: pd.DataFrame) -> pd.DataFrame:
-    short = frame[["configuration", "alpha", "LB", "replays", "certain per 1503"]].copy()
-    for verb in ("accepted", "rejected"):
-        short[verb] = frame[verb]
-        short[f"{verb}: mean wrong"] = frame[f"{verb}, mean wrong"]
-        limits = zip(frame[f"{verb}, broke"], frame[f"{verb}, low"], frame[f"{verb}, high"], strict=True)
-        short[f"{verb}: broke"] = [f"{b:.1%} ({low:.1%} to {high:.1%})" for b, low, high in limits]
-        short[f"{verb}: verdict"] = frame[f"{verb}, verdict"]
-    return short
+    return "\n".join([*lines, f"Written to {docs}."])
 
 
 def _table(frame: pd.DataFrame) -> str:

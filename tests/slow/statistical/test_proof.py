@@ -30,7 +30,7 @@ def test_a_mirrored_stream_swaps_good_and_bad() -> None:
 
 
 def test_the_pooled_guarantee_accepts_and_keeps_the_tolerance(proof_repeats: int) -> None:
-    rows = [judge(SOFT, seed) for seed in range(proof_repeats)]
+    rows = [judge(seed, SOFT) for seed in range(proof_repeats)]
     assert np.mean([row["accepted"] for row in rows]) > 30
     k = broken(rows, "accepted_failure", SOFT.tolerance)
     assert stats.binomtest(k, len(rows), SOFT.alpha, alternative="greater").pvalue > 1e-3
@@ -38,13 +38,13 @@ def test_the_pooled_guarantee_accepts_and_keeps_the_tolerance(proof_repeats: int
 
 
 def test_a_collapse_ends_accepting_soon() -> None:
-    row = collapse("pooled", "all", seed=0)
+    row = collapse(0, "pooled", "all")
     assert row["usual"] > 0.3
     assert row["bad_accepts"] <= 15
 
 
 def test_the_gate_keeps_garbage_out_and_lets_parts_in() -> None:
-    rows = {row["kind"]: row for row in garbage("conv", seed=0)}
+    rows = {row["kind"]: row for row in garbage(0, "conv")}
     clean = rows.pop("clean, certain")
     assert len(rows) >= 12
     assert clean["open"] - clean["gated"] <= 0.05
@@ -54,7 +54,7 @@ def test_the_gate_keeps_garbage_out_and_lets_parts_in() -> None:
 
 
 def test_what_is_finished_is_not_done_again(tmp_path: Path) -> None:
-    case = Case("short", "moderate", reducer="pca", cycles=80).plain()
+    case = {"case": Case("short", "moderate", reducer="pca", cycles=80)}
     pieces = [Piece("planted", case, (0,)), Piece("planted", case, (1,))]
     said: list[str] = []
     first = finish(pieces[:1], tmp_path, 1, said.append)
