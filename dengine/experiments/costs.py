@@ -15,7 +15,6 @@ are a clean test.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -43,7 +42,7 @@ class PolicyCost:
     """What a part costs under one policy; all but `chosen_by` over the shuffles that report.
 
     chosen_by : expected cost a part over the shuffles that choose: every share of wrong decisions with half an error added.
-    cost : mean cost a part.  sd : standard deviation of the shuffles' means; NaN of one.
+    cost : mean cost a part.
     lower, upper : the cost with both shares of wrong decisions at the ends of their intervals, together 95 %.
     late : mean cost a part over the last third of each shuffle, once something was learned.
     verified, accepted, rejected : shares of all parts.  bad : bad parts among the accepted.  good : good ones among the
@@ -53,7 +52,6 @@ class PolicyCost:
     policy: Policy
     chosen_by: float
     cost: float
-    sd: float
     lower: float
     upper: float
     late: float
@@ -135,14 +133,10 @@ class CostCurve:
         """A row a policy; shares from 0 to 1, costs in the user's unit."""
         import pandas as pd
 
-        rows = []
-        for row in self.rows:
-            told = asdict(row)
-            wrong = {f"{side}_{name}": value for side in ("bad", "good") for name, value in told.pop(side).items()}
-            policy = told.pop("policy")
-            about = {"alpha": policy["alpha"], "lower_bound": policy["lower_bound"]}
-            rows.append(about | told | wrong | {"chosen": row.policy == self.policy})
-        return pd.DataFrame(rows)
+        frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")  # policy_alpha, bad_rate …
+        about = frame[["policy_alpha", "policy_lower_bound"]].rename(columns=lambda name: name.removeprefix("policy_"))
+        frame = about.join(frame[[name for name in frame if not name.startswith("policy_")]])
+        return frame.assign(chosen=[row.policy == self.policy for row in self.rows])
 
 
 def cost_curve(
@@ -216,7 +210,6 @@ def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
 
 
 def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs) -> PolicyCost:
-    means = [cost_a_part(each, costs) for each in reporting]
     shares = {
         name: float(np.mean([getattr(each, name) for each in reporting])) for name in ("verified", "accepted", "rejected")
     }
@@ -230,9 +223,8 @@ def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay]
     )
     return PolicyCost(
         policy=policy,
-        chosen_by=_expected(choosing, costs),
-        cost=float(np.mean(means)),
-        sd=float(np.std(means, ddof=1)) if len(means) > 1 else math.nan,
+        chosen_by=_expected_cost(choosing, costs),
+        cost=float(np.mean([cost_a_part(each, costs) for each in reporting])),
         lower=lower,
         upper=upper,
         late=float(np.mean([cost_a_part(each, costs, slice(2 * len(each) // 3, None)) for each in reporting])),
@@ -242,7 +234,7 @@ def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay]
     )
 
 
-def _expected(replays: Sequence[Replay], costs: Costs) -> float:
+def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
     """Cost a part with each share of wrong decisions at its Jeffreys mean, (wrong + 1/2) / (decided + 1) in one shuffle.
 
     No error among 25 accepted parts is not no error ever: by the plain mean the few would look free, whatever one costs.
@@ -256,7 +248,5 @@ def _expected(replays: Sequence[Replay], costs: Costs) -> float:
 def cost_a_part(replay: Replay, costs: Costs, part: slice = slice(None)) -> float:
     """Mean cost a part over some cycles of a replay."""
     counts = replay.stretch(part)
-    certain = counts["accepted"] + counts["rejected"]
-    n = counts["verified"] + certain
-    saved = costs.saved(certain, counts["false_positive"], counts["false_negative"])
-    return float(costs.check - saved / n)
+    saved = costs.saved(counts["accepted"] + counts["rejected"], counts["false_positive"], counts["false_negative"])
+    return float(costs.check - saved / (counts["last_cycle"] - counts["first_cycle"] + 1))

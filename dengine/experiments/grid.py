@@ -31,7 +31,7 @@ import numpy as np
 from ..datasets import Dataset, load_dataset
 from ..engine.settings import flat
 from ..errors import SettingError
-from ..recipe import PLAIN, described
+from ..recipe import described
 from ..records import RetrainReport
 from ..reducers import reducer_class
 from .replay import Contender, Replay, replay
@@ -165,26 +165,19 @@ def contenders(asked: Sequence[Any]) -> list[Contender]:
 def _told_apart(one: Contender, others: Sequence[Contender]) -> Contender:
     """Named by the settings in which it differs from others of its name."""
     own, theirs = _flat(one), [_flat(other) for other in others]
-    policies = [each.recipe.policy for each in (one, *others)]
-    differing = [key for key in own if any(other.get(key) != own[key] for other in theirs)]
-    if any(other == own and policy == policies[0] for other, policy in zip(theirs, policies[1:], strict=True)):
+    if (own, one.recipe.policy) in zip(theirs, (other.recipe.policy for other in others), strict=True):
         raise SettingError(
             f"Expected each to be asked for once, got {one.name} twice with the same settings; tell them apart by "
             "Contender(name, recipe)."
         )
+    differing = [key for key in own if any(other.get(key) != own[key] for other in theirs)]
     return replace(one, name=" ".join([one.name, *(f"{key}={own[key]}" for key in differing)]))
 
 
 def _flat(one: Contender) -> dict[str, Any]:
-    """Every setting by its name, without those that have columns of their own."""
+    """Every setting by its name, without those that have columns of their own; a transformer as it reads."""
     plain = {key: value for key, value in flat(one.recipe).items() if key not in (*TOLD_APART, "params")}
-    own = plain["reducer"]
-    if not isinstance(own, str):  # of a transformer's settings, a part or a function by what it is called
-        short = {
-            key: value if isinstance(value, PLAIN) or value is None else getattr(value, "__name__", type(value).__name__)
-            for key, value in own.get_params().items()
-        }
-        plain |= {"reducer": type(own).__name__} | short
+    plain["reducer"] = " ".join(str(plain["reducer"]).split())
     return {**plain, **one.recipe.params, **one.params}
 
 
@@ -212,20 +205,19 @@ def iterate_replays(
     kept = None if keep is None else KeptReplays(keep, data)
     found = {i: one for i, task in enumerate(tasks) if kept and (one := kept.get(task)) is not None}
     yield from (Played(i, one, True) for i, one in found.items())
-    rivals = {task.contender.rival for i, task in enumerate(tasks) if i not in found}
-    for name in sorted(rivals - {None}, key=str):
-        require(str(name))  # now, and not when the others have been played
-    left = sorted(((i, task) for i, task in enumerate(tasks) if i not in found), key=lambda each: each[1].seed)
-    parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
-    for i, one in parallel(delayed(_play)(data, i, task, on_cycle if n_jobs == 1 else None) for i, task in left):
+    left = sorted((i for i in range(len(tasks)) if i not in found), key=lambda i: tasks[i].seed)
+    for name in sorted({tasks[i].contender.rival or "" for i in left} - {""}):
+        require(name)  # now, and not when the others have been played
+    parallel, told = Parallel(n_jobs=n_jobs, return_as="generator_unordered"), on_cycle if n_jobs == 1 else None
+    for i, one in parallel(delayed(_play)(data, i, tasks[i], told) for i in left):
         if kept is not None:
             kept.put(tasks[i], one)
         yield Played(i, one, False)
 
 
 def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-    options: dict[str, Any] = {"shuffle": task.shuffle, "confirm": task.confirm, "on_cycle": on_cycle}
-    return i, replay(data, task.contender, task.seed, task.cycles, **options)
+    how: dict[str, Any] = {"shuffle": task.shuffle, "confirm": task.confirm, "on_cycle": on_cycle}
+    return i, replay(data, task.contender, task.seed, task.cycles, **how)
 
 
 def run_grid(
@@ -284,8 +276,8 @@ def play_tasks(
 ) -> list[Replay]:
     """Each task's replay, in the tasks' order. on_done : called with each as it ends. The rest as in `iterate_replays`."""
     found: dict[int, Replay] = {}
-    for played in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep):
-        found[played.position] = played.replay
+    for i, one, _ in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep):
+        found[i] = one
         if on_done is not None:
-            on_done(played.replay)
+            on_done(one)
     return [found[i] for i in range(len(tasks))]

@@ -61,10 +61,9 @@ def paper_table(frame: pd.DataFrame, recipe: str, interval: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One of the paper's findings in one cell of the grid, or over it.
+    """One of the paper's findings in one cell of the grid, or over it, and whether it holds here.
 
-    claim : the paper's.  who : recipe and interval.  cell : alpha and LB, or "" for the grid as a whole.
-    measured : in words.  holds : here.
+    claim : the paper's.  who : recipe and interval.  cell : alpha and LB, or "" for the grid.  measured : in words.
     """
 
     claim: str
@@ -88,10 +87,14 @@ def findings(frame: pd.DataFrame) -> list[Finding]:
     """
     found: list[Finding] = []
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
-        where, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in RIVALS
-        found += _answers(rows, where, str(interval)) if ours else []
-        found += _tolerances(rows, where)
-        found += _delays(rows, where) if ours and interval == "wilson" else []
+        who, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in RIVALS
+        means = rows.groupby(["alpha", "lower_bound"], sort=False)[["certain", "false_positive"]].mean()
+        found += _answers(means["certain"], who, str(interval)) if ours else []
+        for (alpha, bound), (certain, wrong) in zip(means.index, means.to_numpy(), strict=True):
+            said = f"{100 * wrong / certain:.1f} % of {certain:.1f} certain" if certain else "nothing was certain"
+            cell, claim = f"alpha {alpha:g}, LB {100 * bound:g} %", "the mean share of false positives stays below 1 - LB"
+            found.append(Finding(claim, who, cell, said, bool(wrong < (1.0 - bound) * certain or not certain)))
+        found += _delays(rows, who) if ours and interval == "wilson" else []
     for name, rows in frame.groupby("recipe", sort=False):
         worst = float(rows["retrain_max_s"].max())
         if not math.isnan(worst):
@@ -101,44 +104,31 @@ def findings(frame: pd.DataFrame) -> list[Finding]:
     return found
 
 
-def _answers(rows: pd.DataFrame, where: str, interval: str) -> list[Finding]:
-    certain = rows.groupby(["alpha", "lower_bound"])["certain"].mean()
-    if len(certain) < 2 or interval not in INTERVALS or not certain.any():
-        return []
-    spread = float((certain.max() - certain.min()) / certain.mean())
-    said = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells, {100 * spread:.0f} % of the mean"
-    claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
-    return [Finding(f"{claim} to alpha and LB", where, "", said, (spread > ANSWERS) == (interval == "wilson"))]
+def _answers(certain: pd.Series[float], who: str, interval: str) -> Iterator[Finding]:
+    if len(certain) > 1 and interval in INTERVALS and certain.any():
+        spread = float((certain.max() - certain.min()) / certain.mean())
+        said = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells, {100 * spread:.0f} % of the mean"
+        claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
+        yield Finding(f"{claim} to alpha and LB", who, "", said, (spread > ANSWERS) == (interval == "wilson"))
 
 
-def _tolerances(rows: pd.DataFrame, where: str) -> Iterator[Finding]:
-    claim = "the mean share of false positives stays below 1 - LB"
-    cells = rows.groupby(["alpha", "lower_bound"], sort=False)[["certain", "false_positive"]].mean()
-    for (alpha, bound), means in cells.iterrows():
-        share = means["false_positive"] / means["certain"] if means["certain"] else 0.0
-        said = f"{100 * share:.1f} % of {means['certain']:.1f} certain" if means["certain"] else "nothing was certain"
-        yield Finding(claim, where, f"alpha {alpha:g}, LB {100 * bound:g} %", said, bool(share < 1.0 - bound))
-
-
-def _delays(rows: pd.DataFrame, where: str) -> Iterator[Finding]:
+def _delays(rows: pd.DataFrame, who: str) -> Iterator[Finding]:
     for bound, column in rows.groupby("lower_bound", sort=False):
         first = column.groupby("alpha")["first_certain"].mean().dropna().sort_index(ascending=False)
         if len(first) >= 2:
             said = ", ".join(f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items())
             later = bool(first.is_monotonic_increasing and first.iloc[0] < first.iloc[-1])
-            yield Finding("lower alpha delays the first certain prediction", where, f"LB {100 * bound:g} %", said, later)
+            yield Finding("lower alpha delays the first certain prediction", who, f"LB {100 * bound:g} %", said, later)
 
 
 def finding_lines(found: Sequence[Finding]) -> list[str]:
     """A line a claim and recipe: what was measured, or in how many cells it holds and where it does not."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
-    for each in found:
-        groups.setdefault((each.claim, each.who), []).append(each)
     lines = []
-    for (claim, who), some in groups.items():
+    for claim, who in dict.fromkeys((each.claim, each.who) for each in found):
+        some = [each for each in found if (each.claim, each.who) == (claim, who)]
         against = [f"{each.cell}: {each.measured}" for each in some if not each.holds]
-        but = f"; not at {'; '.join(against)}" if against else ""
-        many = f"holds in {len(some) - len(against)} of {len(some)} cells: {claim}; {who}{but}"
+        many = f"holds in {len(some) - len(against)} of {len(some)} cells: {claim}; {who}"
+        many += f"; not at {'; '.join(against)}" if against else ""
         lines.append(some[0].sentence if len(some) == 1 else many)
     return lines
 

@@ -226,11 +226,6 @@ class Replay:
 class RunRecorder:
     """Gathers a run while it happens, so that one that is broken off can still be shown.
 
-        recorder = RunRecorder(cell)
-        with suppress(KeyboardInterrupt):
-            recorder.follow(engine, cycles=600)
-        recorder.log()
-
     `truth` and `clock` are read off a cell that has them.
     """
 

@@ -90,20 +90,14 @@ def survey(data: Dataset) -> Survey:
     names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
     means = np.where(usable[:, None], levels(np.where(np.isfinite(X), X, 0)), np.nan).T
     return Survey(
-        name=data.name,
-        traces=len(data),
-        channels=X.shape[1],
+        **{name: getattr(data, name) for name in ("name", "rate_hz", "unit", "fit", "faults")},
+        **dict(zip(("traces", "channels", "samples"), X.shape, strict=True)),
         names=data.channels,
-        samples=X.shape[2],
         seconds=X.shape[2] / data.rate_hz,
-        rate_hz=data.rate_hz,
-        unit=data.unit,
-        fit=data.fit,
         lengths=_spread(data.lengths),
         rates=_spread(data.rates),
         good=good,
         bad=len(data) - good,
-        faults=data.faults,
         not_finite=int((~finite).sum()),
         constant=int(constant.sum()),
         duplicates=len(again) - len(first),
@@ -122,7 +116,7 @@ def levels(X: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def _spread(values: NDArray[Any] | None) -> Spread | None:
     known = np.empty(0) if values is None else values[np.isfinite(values)]
-    return Spread(*(float(f(known)) for f in (np.min, np.median, np.max))) if len(known) else None
+    return Spread(*np.quantile(known, (0.0, 0.5, 1.0)).tolist()) if len(known) else None
 
 
 def _drift(name: str, values: NDArray[np.float64]) -> Drift:

@@ -1,11 +1,7 @@
 """Replays as tables: a row a replay in the CSV, a pooled row a recipe on the screen.
 
-    frame = frame_of(replays)
-    Console().print(pooled_table(pool(frame, replays)))   # and promise_lines(rows)
-
-Which promise is shown: the one about all parts together. Among all parts accepted in all replays the share of bad ones
-should be at most 1 - LB, and likewise the share of good ones among the rejected. Each row names its guarantee: under
-"pooled" the rule itself keeps the accepted parts to it, under "local" it is only measured.
+frame = frame_of(replays)
+Console().print(pooled_table(pool(frame, replays)))   # and promise_lines(rows)
 """
 
 from __future__ import annotations
@@ -37,25 +33,12 @@ TIMES = {  # of a pooled row, and how the replays' are put together
     "net_s": "mean",
 }
 ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate breaks 1 - LB in every fifth run
-PROMISE = (
-    "certain: cycles decided without a check, a mean a replay ± its standard deviation over the replays, and their "
-    "share of all cycles. accept, reject: such decisions; below them "
-    "the wrong ones, FP (bad parts accepted) and FN (good parts rejected). precision: the share of accepted parts that "
-    "were good; NPV, below it: the share of rejected parts that were bad. retrain: median and worst; decide: median and "
-    "99th percentile. saved: seconds of checks left out, at {check:g} s each; net: less {stop:g} s for every bad part "
-    "accepted, which stops the system, and {again:g} s for every good part rejected. Counts and seconds "
-    "are means a replay; shares are pooled, that is, counted over the parts of all replays together. The pooled "
-    "precision is compared with LB. {guarantees} Rejected parts get no feedback but audits."
+LEGEND = (
+    "Means a replay ± the standard deviation over the replays; shares are of the parts of all replays. FP: bad parts "
+    "accepted, FN: good ones rejected; NPV: of the rejected the share that was bad. retrain: median and worst; decide: "
+    f"median and 99th percentile. saved: {VERIFY_SECONDS:g} s a check left out; net: less {STOP_SECONDS:g} s an FP and "
+    f"{CYCLE_SECONDS:g} s an FN."
 )
-SHOWN = {  # by guarantee
-    "local": "Guarantee local: the rule speaks of the ball around each part; the pooled precision is only measured.",
-    "pooled": "Guarantee pooled: the rule itself keeps all accepted parts together to LB, at level alpha.",
-}
-KNOWN = {  # by what is known of accepted parts
-    "some": "Beside it, some: of accepted parts only stops are known.",
-    "all": "Beside it, all: an accepted part that no stop follows counts as good, and is learned from.",
-    "confirmed": "Beside it, confirmed: the cell tells of every accepted part whether it was good.",
-}
 
 
 def frame_of(replays: Sequence[Replay]) -> pd.DataFrame:
@@ -76,24 +59,21 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
     error_lower, error_upper : 95 % interval of the share of bad ones among the accepted parts; NaN without replays.
     retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, decide_p99_us : the worst replay's.
     """
-    groups = frame.reset_index(drop=True).groupby(CONDITION, sort=False)
-    return [
-        _pooled(dict(zip(CONDITION, key, strict=True)), part, [replays[i] for i in part.index] if replays else [])
-        for key, part in groups
-    ]
-
-
-def _pooled(condition: dict[str, Any], part: pd.DataFrame, replays: Sequence[Replay]) -> dict[str, Any]:
-    total, error = {name: int(part[name].sum()) for name in COUNTS}, pooled_error(replays)
-    row = condition | {"replays": len(part), "cycles": int(part["cycles"].sum())}
-    row |= {name: float(part[name].mean()) for name in COUNTS} | {f"total_{name}": n for name, n in total.items()}
-    row |= {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
-    for name, wrong, decided in (("precision", "false_positive", "accepted"), ("npv", "false_negative", "rejected")):
-        row[name] = 1.0 - total[wrong] / total[decided] if total[decided] else math.nan
-    row |= {name: float(part[name].agg(how)) for name, how in TIMES.items()}
-    ends = (error.lower, error.upper) if error.decided else (math.nan, math.nan)
-    row["retrains_dropped"] = sum(not each.accepted for one in replays for each in one.retrains)
-    return row | {"error_lower": ends[0], "error_upper": ends[1], "promise_kept": promise_kept(row)}
+    rows = []
+    for key, part in frame.reset_index(drop=True).groupby(CONDITION, sort=False):
+        total = {name: int(part[name].sum()) for name in COUNTS}
+        row = dict(zip(CONDITION, key, strict=True)) | {"replays": len(part), "cycles": int(part["cycles"].sum())}
+        row |= {name: float(part[name].mean()) for name in COUNTS} | {f"total_{name}": n for name, n in total.items()}
+        row |= {f"{name}_sd": float(part[name].std()) for name in ("certain", "false_positive")}
+        for name, wrong, decided in (("precision", "false_positive", "accepted"), ("npv", "false_negative", "rejected")):
+            row[name] = 1.0 - total[wrong] / total[decided] if total[decided] else math.nan
+        row |= {name: float(part[name].agg(how)) for name, how in TIMES.items()}
+        own = [replays[i] for i in part.index] if replays else []
+        error = pooled_error(own)
+        ends = (error.lower, error.upper) if error.decided else (math.nan, math.nan)
+        row |= {"retrains_dropped": sum(not each.accepted for one in own for each in one.retrains)}
+        rows.append(row | {"error_lower": ends[0], "error_upper": ends[1], "promise_kept": promise_kept(row)})
+    return rows
 
 
 def promise_kept(row: Mapping[str, Any]) -> bool | None:
@@ -125,17 +105,14 @@ def promise_line(row: Mapping[str, Any], telling: Sequence[str] = ()) -> str:
 
 
 def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> Table:
-    """The pooled rows for a screen; the caption says which promise they show, and what is known of stops."""
+    """The pooled rows for a screen, each with its guarantee, and what is known of stops."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     known = ["confirmed" if row["confirm"] else str(row["stops"]) for row in rows]
-    asked = dict.fromkeys(str(row["guarantee"]) for row in rows)  # one that a user wrote is not explained
-    meant = " ".join([*(SHOWN[name] for name in asked if name in SHOWN), *(KNOWN[name] for name in dict.fromkeys(known))])
-    said = PROMISE.format(check=VERIFY_SECONDS, stop=STOP_SECONDS, again=CYCLE_SECONDS, guarantees=meant)
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
     look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
-    table = Table(title=f"\n{title}\n", caption=f"\n{said}\n", **look)
+    table = Table(title=f"\n{title}\n", caption=f"\n{LEGEND}\n", **look)
     # The one that gives way: 80 columns are enough for every number.
     table.add_column("recipe\nguarantee", overflow="fold")
     for name in CELLS:

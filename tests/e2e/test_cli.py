@@ -162,14 +162,7 @@ def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_e
 
 def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data: Path, tmp_path: Path) -> None:
     shown = said("replay", "--data", data, "--reducer", "pca", *POLICY, "--repeats", 2, "--out", tmp_path)
-    for words in (
-        "retrains, the worst in",
-        "FP (bad parts accepted)",
-        "FN (good parts rejected)",
-        "precision: the share of accepted parts that were good",
-        "pooled, that is, counted over the parts of all replays together",
-        "Guarantee local",
-    ):
+    for words in ("retrains, the worst in", "FP: bad parts accepted", "pca (local)"):
         assert words in shown
     assert len((tmp_path / "replays.csv").read_text().splitlines()) == 3
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}

@@ -74,7 +74,7 @@ def test_every_row_of_a_grid_can_be_told_from_the_others() -> None:
         for alpha in ("0.1", "0.5"):
             for known in ("stops alone", "good ones confirmed"):
                 assert f"never (local, {interval}, alpha {alpha}, {known}): " in lines
-    table = shown[: shown.index("certain: cycles")]
+    table = shown[: shown.index("Means a replay")]
     assert (table.count("wilson"), table.count("binomial")) == (4, 4)
 
 

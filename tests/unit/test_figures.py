@@ -63,8 +63,6 @@ def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
     assert [(row["guarantee"], row["stops"]) for row in rows] == [("local", "some"), ("pooled", "all")]
     table = pooled_table(rows)
     assert list(table.columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
-    for said in ("is only measured", "keeps all accepted parts together", "no stop follows"):
-        assert said in str(table.caption)
     assert promise_line(rows[1]).startswith("pca (pooled): 100.0 % of 300")
 
 

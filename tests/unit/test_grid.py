@@ -229,7 +229,7 @@ def test_two_recipes_are_named_by_the_settings_in_which_they_differ_and_have_no_
 
 
 def test_transformers_are_named_by_their_settings_and_refused_where_these_read_alike() -> None:
-    assert names([PCA(1), PCA(2)]) == ["PCA n_components=1", "PCA n_components=2"]
+    assert names([PCA(1), PCA(2)]) == ["PCA reducer=PCA(n_components=1)", "PCA reducer=PCA(n_components=2)"]
     absolute, root = (make_pipeline(FunctionTransformer(f), PCA(2)) for f in (np.abs, np.sqrt))
     assert len(set(names([absolute, root]))) == 2
     with pytest.raises(SettingError, match=r"PCA twice .*by Contender\(name, recipe\)"):

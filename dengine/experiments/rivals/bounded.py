@@ -42,10 +42,9 @@ class WilsonKernelDensity(Rival):
     bandwidth : h, in deviations of each principal component; None: chosen at each training, among `BANDWIDTHS`, by the
         leave-one-out likelihood of the labels.
 
-    With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is the kernel regression m = sum w_i y_i / sum w_i, and
-    the number of trials n = sum K_H(z - z_i) |H| / R(K), K the normal density, R(K) = (4 pi)^(-d/2): n = 2^(d/2) sum w_i,
-    here 2 sum w_i. It is no count: a lone label at the place of the query counts as two, and a kernel wider than the data
-    counts every label twice. So the bound holds only where the kernel is narrow and many labels lie within.
+    With weights w_i = exp(-|z - z_i|^2 / (2 h^2)) the success rate is m = sum w_i y_i / sum w_i, and the number of trials
+    n = sum K_H(z - z_i) |H| / R(K), K the normal density, R(K) = (4 pi)^(-d/2): here 2 sum w_i. It is no count: a kernel
+    wider than the data counts every label twice. So the bound holds only where it is narrow and many labels lie within.
 
     Source: Iversen, Duan and Hagelskjær (2026), "Estimation of Confidence Bounds in Binary Classification using Wilson
     Score Kernel Density Estimation", arXiv:2602.20947; n and H as in github.com/SDU-Robotics/wilson-score-kde. Our reading:
