@@ -12,21 +12,12 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-from dengine import (  # after the skips
-    Dataset,
-    ModelPrediction,
-    Policy,
-    Recipe,
-    TraceSpec,
-    WilsonRadiusClassifier,
-    export_torchscript,
-)
+from dengine import Dataset, ModelPrediction, Policy, TraceSpec, export_torchscript, load_exported  # after the skips
 from dengine.decision.rule import DecisionRule
-from dengine.engine.engine import DataEngine
 from dengine.errors import ExportError, TraceError
-from dengine.export.onnx import export_onnx, load_onnx
-from dengine.export.torchscript import load_exported
+from dengine.export import export_onnx, load_onnx
 from dengine.records import Action, Reason
+from tests.support.exports import fitted, trained
 
 SPEC = TraceSpec(100, limit=500.0)
 BALLS: list[dict[str, Any]] = [
@@ -34,11 +25,6 @@ BALLS: list[dict[str, Any]] = [
     {"interval": "binomial", "fraction": 0.3},
     {"fraction": 0.3, "reject_fraction": 0.08},
 ]
-
-
-def fitted(data: Dataset, **settings: Any) -> ModelPrediction:
-    classifier = WilsonRadiusClassifier(**{"alpha": 0.1, "lower_bound": 0.9} | settings)
-    return ModelPrediction("pca", classifier).fit(data.X, data.y)
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +52,8 @@ def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: 
 
 
 def test_audits_are_refused_with_the_reason(data: Dataset, tmp_path: Path) -> None:
-    recipe = Recipe(reducer="pca", policy=Policy(audit_rate=0.1), retrain_every=1000)
-    with DataEngine.from_recipe(recipe, replaying=True) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
-        with pytest.raises(ExportError, match="ONNX carries no audits"):
-            export_onnx(engine, tmp_path / "model.onnx")
+    with trained(data, audit_rate=0.1) as engine, pytest.raises(ExportError, match="ONNX carries no audits"):
+        export_onnx(engine, tmp_path / "model.onnx")
 
 
 class OwnRule(DecisionRule):

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from dengine import Dataset, Policy, Recipe, TraceSpec, load_exported
+from dengine import DataEngine, Dataset, TraceSpec, load_exported
 from dengine.cli.export import export
 from dengine.cli.store import import_labels
-from dengine.engine.engine import DataEngine
 from dengine.errors import DataError
 from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.folds import part_hash
 from dengine.records import Reason
+from tests.support.exports import trained
 
 HEAD = "# dengine 3 0123"
 DECIDED = "verify,verify,uncertain,0,1,0,0"
@@ -26,11 +26,7 @@ DECIDED = "verify,verify,uncertain,0,1,0,0"
 
 def new_store(data: Dataset, path: Path, **policy: Any) -> str:
     """An engine's store, after its first retrain."""
-    recipe = Recipe(reducer="pca", retrain_every=1000, policy=Policy(alpha=0.1, lower_bound=0.9, **policy))
-    with DataEngine.from_recipe(recipe, str(path), replaying=True) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
+    trained(data, path, **policy).close()
     return str(path)
 
 

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 import dengine
-from dengine import Dataset, Policy, Recipe, TraceSpec, export_torchscript, load_exported
+from dengine import Dataset, export_torchscript, load_exported
 from dengine.cli import main
-from dengine.engine.engine import DataEngine
 from dengine.errors import ExportError
 from dengine.export import export_sources, import_journal
 from dengine.records import ACTIONS, Action
+from tests.support.exports import trained
 
 SAMPLES = 80
 
@@ -45,15 +45,9 @@ def consumer(repo: Path, installed: Path, tmp_path_factory: pytest.TempPathFacto
 def test_a_controller_in_c_decides_as_python_does_and_its_labels_come_back(
     consumer: Path, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
-    data, store, key = make_data(400, SAMPLES), str(tmp_path / "engine.db"), tmp_path / "cell.key"
+    store, key = tmp_path / "engine.db", tmp_path / "cell.key"
     assert CliRunner().invoke(main, ["export", "--make-key", str(key)]).exit_code == 0
-    recipe = Recipe(
-        reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.3, reject_fraction=0.08
-    )
-    with DataEngine.from_recipe(recipe, store, trace=TraceSpec(SAMPLES, limit=500.0)) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
+    with trained(make_data(400, SAMPLES), store, fraction=0.3, reject_fraction=0.08) as engine:
         file = export_torchscript(engine, tmp_path / "model.ts", key=key)
     X = make_data(120, SAMPLES, seed=9).X
     X[3, 4], X[5] = np.nan, 1.5

@@ -17,32 +17,17 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import (
-    DataEngine,
-    Dataset,
-    ModelPrediction,
-    Policy,
-    Recipe,
-    TraceSpec,
-    WilsonRadiusClassifier,
-    export_torchscript,
-    load_exported,
-)
+from dengine import DataEngine, Dataset, TraceSpec, export_torchscript, load_exported
 from dengine.export import ExportedModel, import_journal, read_metadata
 from dengine.records import Action, Reason
+from tests.support.exports import SAMPLES, fitted, trained, wild_traces
 
-SAMPLES = 100
+BALLS = {"fraction": 0.3, "reject_fraction": 0.08}
 
 
 @pytest.fixture(scope="module")
 def engine(make_data: Callable[..., Dataset]) -> Iterator[DataEngine]:
-    data = make_data(400, SAMPLES)
-    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.3)
-    recipe = Recipe(reducer="pca", policy=policy, retrain_every=1000, window=2000, fraction=0.3, reject_fraction=0.08)
-    with DataEngine.from_recipe(recipe, trace=TraceSpec(SAMPLES, limit=500.0), seed=3, replaying=True) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
+    with trained(make_data(400, SAMPLES), audit_rate=0.3, **BALLS) as engine:
         yield engine
 
 
@@ -53,12 +38,7 @@ def file(engine: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def many(make_data: Callable[..., Dataset]) -> np.ndarray:
-    rng = np.random.default_rng(5)
-    known = make_data(300, SAMPLES, seed=9).X
-    wild = rng.normal(size=(200, SAMPLES)) * 10.0 ** rng.uniform(-3, 6, (200, 1))
-    bad = known[:4].copy()
-    bad[0, 3], bad[1, 5], bad[2, 0], bad[3] = np.nan, -np.inf, 1e30, 2.5
-    return np.concatenate([known, wild, bad]).astype(np.float32)
+    return wild_traces(make_data(300, SAMPLES, seed=9).X)
 
 
 def cell(programs: Path, *arguments: Any, stdin: bytes = b"", fails: bool = False) -> tuple[list[list[str]], str]:
@@ -104,29 +84,25 @@ def test_the_sum_is_that_of_the_standard(programs: Path) -> None:
         assert done.stdout.decode().strip() == hmac.new(key.encode(), content, hashlib.sha256).hexdigest()
 
 
-def test_csv_lines_get_the_engines_decisions(programs: Path, engine: DataEngine, file: Path, many: np.ndarray) -> None:
-    lines, _ = cell(programs, file, stdin=csv(many))
+def test_lines_and_blocks_get_the_engines_decisions(
+    programs: Path, engine: DataEngine, file: Path, many: np.ndarray
+) -> None:
     decisions = [engine.decide(x) for x in many]
-    assert_equal(lines, decisions, 2)
-    assert {d.action for d in decisions} == set(Action)
-    assert {d.reason for d in decisions} >= {Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
-
-
-def test_binary_blocks_get_what_python_says(programs: Path, file: Path, many: np.ndarray) -> None:
+    assert_equal(cell(programs, file, stdin=csv(many))[0], decisions, 2)
     lines, _ = cell(programs, file, "--binary", stdin=many.tobytes())
-    decisions = load_exported(file).decide_many(many)
     assert_equal(lines, decisions, 2)
     found = np.array([line[6:8] for line in lines], dtype=np.float32)
-    expected = np.array([d.embedding[0] for d in decisions])
+    expected = np.array([d.embedding[0] for d in load_exported(file).decide_many(many)])
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    assert {d.action for d in decisions} == set(Action)
+    assert {d.reason for d in decisions} >= {Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
 
 
 def test_several_channels_come_one_after_the_other(
     programs: Path, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
     data = make_data(150, 40, 3)
-    model = ModelPrediction("pca", WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9)).fit(data.X, data.y)
-    path = export_torchscript(model, tmp_path / "model.ts")
+    path = export_torchscript(fitted(data), tmp_path / "model.ts")
     lines, _ = cell(programs, path, stdin=csv(data.X))
     assert_equal(lines, load_exported(path).decide_many(data.X), 2)
 
@@ -135,12 +111,8 @@ def test_several_channels_come_one_after_the_other(
 def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_the_journal(
     programs: Path, make_data: Callable[..., Dataset], tmp_path: Path, fit: str
 ) -> None:
-    data, store, journal = make_data(200, SAMPLES), tmp_path / "engine.db", tmp_path / "cell.csv"
-    recipe = Recipe(reducer="pca", policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=10**6, fraction=0.1)
-    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, fit=fit)) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
+    store, journal = tmp_path / "engine.db", tmp_path / "cell.csv"
+    with trained(make_data(200, SAMPLES), store, TraceSpec(SAMPLES, fit=fit), fraction=0.1) as engine:
         path = export_torchscript(engine, tmp_path / "model.ts")
     lengths = [98, 100, 103, 60, 150, 30, 230, 1] * 5
     grown = make_data(40, 240, seed=4).X
@@ -204,13 +176,8 @@ def learning(
     """A store after its engine's first retrain, and the exported file."""
     guarantee, stops = request.param.split("-")
     folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=3.0)
-    policy = Policy(alpha=0.1, lower_bound=0.9, audit_rate=0.2, guarantee=guarantee, stops=stops)
-    recipe = Recipe(reducer="pca", policy=policy, retrain_every=10**6, window=2000, fraction=0.1)
-    store = folder / "engine.db"
-    with DataEngine.from_recipe(recipe, str(store), trace=TraceSpec(SAMPLES, limit=500.0), seed=3) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-        engine.retrain()
+    store, settings = folder / "engine.db", {"audit_rate": 0.2, "guarantee": guarantee, "stops": stops}
+    with trained(data, store, fraction=0.1, **settings) as engine:
         return store, export_torchscript(engine, folder / "model.ts")
 
 
@@ -269,12 +236,7 @@ def with_crc(line: str) -> str:
     return f"{line},{zlib.crc32(line.encode()):08x}"
 
 
-@pytest.mark.parametrize(
-    "kind", ["shorter", "a flipped digit", "no label", "another action", "another reason", "a NUL", "plain"]
-)
-def test_a_journal_line_that_cannot_be_read_is_named(
-    programs: Path, file: Path, written: str, tmp_path: Path, kind: str
-) -> None:
+def test_a_journal_line_that_cannot_be_read_is_named(programs: Path, file: Path, written: str, tmp_path: Path) -> None:
     journal = tmp_path / "cell.csv"
     head, first, second = written.splitlines()
     words = second.rsplit(",", 1)[0].split(",")
@@ -287,9 +249,10 @@ def test_a_journal_line_that_cannot_be_read_is_named(
         "a NUL": second[:-30] + "\0" + second[-29:],
         "plain": second.split(",", 2)[2].rsplit(",", 1)[0],  # without id and checksum
     }
-    journal.write_text("\n".join([head, first, wrong[kind], second, ""]))
-    _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
-    assert "is damaged in line 3; take its earlier lines in" in said
+    for line in wrong.values():
+        journal.write_text("\n".join([head, first, line, second, ""]))
+        _, said = cell(programs, file, "--learn", "--journal", journal, fails=True)
+        assert "is damaged in line 3; take its earlier lines in" in said, line
 
 
 def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
@@ -348,33 +311,29 @@ def test_a_malformed_line_label_or_block_is_verified(programs: Path, file: Path,
     assert "expected 400 bytes, got 395" in said
 
 
-@pytest.mark.parametrize("kind", ["flip", "truncated", "empty", "no sum", "not a sum", "missing", "garbage", "foreign"])
-def test_a_file_that_must_not_be_used_is_refused(programs: Path, file: Path, tmp_path: Path, kind: str) -> None:
-    path, content = tmp_path / "model.ts", file.read_bytes()
-    middle = len(content) // 2
-    flipped = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-    spoilt = {"flip": flipped, "truncated": content[:middle], "empty": b"", "garbage": b"garbage" * 1000}
-    path.write_bytes(spoilt.get(kind, content))
-    if kind == "foreign":
-        torch.jit.save(torch.jit.script(torch.nn.ReLU()), str(path))
-    signed = path if kind in ("garbage", "foreign") else file
-    digest = "nothing" if kind == "not a sum" else hashlib.sha256(signed.read_bytes()).hexdigest()
-    path.with_name("model.ts.sha256").write_text(digest)
-    if kind in ("no sum", "missing"):
-        (path.with_name("model.ts.sha256") if kind == "no sum" else path).unlink()
+@pytest.mark.parametrize(
+    ("spoil", "summed", "message"),
+    [
+        (lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:], False, "is damaged or truncated"),
+        (lambda content: content[:5000], False, "is damaged or truncated"),
+        (lambda content: b"", False, "is damaged or truncated"),
+        (lambda content: b"garbage" * 1000, True, "no loadable TorchScript"),
+        (lambda content: content, None, "holds no SHA-256 sum"),
+    ],
+    ids=["flip", "truncated", "empty", "garbage", "not a sum"],
+)
+def test_a_file_that_must_not_be_used_is_refused(
+    programs: Path, file: Path, tmp_path: Path, spoil: Callable[[bytes], bytes], summed: bool | None, message: str
+) -> None:
+    path, total = tmp_path / "model.ts", tmp_path / "model.ts.sha256"
+    path.write_bytes(spoil(file.read_bytes()))
+    of = path if summed else file
+    total.write_text("nothing" if summed is None else hashlib.sha256(of.read_bytes()).hexdigest())
     lines, said = cell(programs, path, stdin=csv(np.ones((1, SAMPLES))), fails=True)
-    expected = {
-        "flip": "it is damaged or truncated",
-        "truncated": "it is damaged or truncated",
-        "empty": "it is damaged or truncated",
-        "no sum": "cannot read",
-        "missing": "cannot read",
-        "not a sum": "holds no SHA-256 sum",
-        "garbage": "no loadable TorchScript",
-        "foreign": "it is not a dengine export",
-    }
     assert lines == []
-    assert expected[kind] in said
+    assert message in said
+    total.unlink()
+    assert "cannot read" in cell(programs, path, fails=True)[1]
 
 
 def test_wrong_arguments_show_the_usage(programs: Path, file: Path) -> None:

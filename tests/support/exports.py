@@ -1,0 +1,54 @@
+"""Engines and models to be exported, and traces of every kind for what was exported of them."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, TraceSpec, WilsonRadiusClassifier
+from tests.support.driving import learn
+
+SAMPLES, LIMIT = 100, 500.0
+OF_POLICY = {each.name for each in fields(Policy)}
+
+
+def recipe(**settings: Any) -> Recipe:
+    """pca at (0.1, 90 %), which retrains when it is told to; settings of the policy too."""
+    policy = {"alpha": 0.1, "lower_bound": 0.9} | {name: settings.pop(name) for name in OF_POLICY & settings.keys()}
+    return Recipe(**{"reducer": "pca", "policy": Policy(**policy), "retrain_every": 10**6, "window": 2000} | settings)
+
+
+def trained(data: Dataset, store: Path | None = None, trace: TraceSpec | None = None, **settings: Any) -> DataEngine:
+    """An engine that saw every label and retrained on all of them."""
+    spec, place = trace or TraceSpec(data.X.shape[-1], limit=LIMIT), None if store is None else str(store)
+    engine = DataEngine.from_recipe(recipe(**settings), place, trace=spec, seed=3, replaying=True)
+    learn(engine, data, range(len(data)))
+    engine.retrain()
+    return engine
+
+
+def fitted(data: Dataset, reducer: Any = "pca", **settings: Any) -> ModelPrediction:
+    """A model of all labels, as a script makes it."""
+    classifier = WilsonRadiusClassifier(**{"alpha": 0.1, "lower_bound": 0.9} | settings)
+    return ModelPrediction(reducer, classifier).fit(data.X, data.y)
+
+
+def bad_traces(x: np.ndarray) -> list[np.ndarray]:
+    """Not finite, dead and saturated, each in more than one way."""
+    nan, inf, both, beyond = x.copy(), x.copy(), x.copy(), x.copy()
+    nan[3], inf[5], both[7], both[8], beyond[0] = np.nan, -np.inf, np.inf, np.nan, 1e30
+    return [nan, inf, both, beyond, np.full_like(x, 2.5), np.zeros_like(x), np.full_like(x, np.nan)]
+
+
+def wild_traces(known: np.ndarray) -> np.ndarray:
+    """(n + 207, T): known ones, random ones of every size, and bad ones."""
+    rng = np.random.default_rng(5)
+    wild = rng.normal(size=(200, known.shape[1])) * 10.0 ** rng.uniform(-3, 6, (200, 1))
+    return np.concatenate([known, wild, np.array(bad_traces(known[0]))]).astype(np.float32)
+
+
+def row(decision: Any) -> tuple[Any, ...]:
+    """What an engine and an exported file must agree on."""
+    names = ("action", "reason", "lower", "upper", "n_success", "n_failure")
+    return tuple(getattr(decision, name) for name in names)
