@@ -1,7 +1,7 @@
 """Tables: a folder of CSV files, one an insertion; or a wide one, a row an insertion, as CSV, Parquet or a DataFrame.
 
 Columns `FZ_0 … FZ_999` of a wide table are a channel FZ, `0 … 999` or `x1 … x1000` one without need of a name; further
-channels have as many. Or a column a channel, whose cells are lists of numbers, as Parquet keeps them.
+channels have as many.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,8 +126,7 @@ def from_frame(
     An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
     a shorter trace. A row with text in it, or no label, is a fault.
     """
-    levels = [each if isinstance(each, tuple) else (each,) for each in frame.columns]  # FZ and 0 are FZ_0
-    frame = frame.set_axis(["_".join(str(word) for word in words if word != "") for words in levels], axis=1)
+    frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
         raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
@@ -150,10 +149,6 @@ def from_frame(
 
 def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[tuple[str, ...], list[NDArray[np.float32]]]:
     """The channels' names, and of each row (C, T): a row whose last cells are empty is a shorter trace."""
-    lists = {c: [c] for c in frame.columns if any(isinstance(cell, list | np.ndarray) for cell in frame[c])}
-    if lists:
-        chosen = _chosen(lists, asked)
-        return chosen, [_of_lists(row, i, wrong) for i, row in enumerate(frame[list(chosen)].to_numpy())]
     columns = _sample_columns(list(frame.columns), asked)
     found = [numbers(frame[names]) for names in columns.values()]
     for what in (what for _, faults in found for what in faults.items()):
@@ -162,17 +157,6 @@ def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[t
     known: NDArray[np.bool_] = np.asarray(~np.isnan(block).all(axis=1))
     ends = np.where(known.any(axis=1), block.shape[2] - np.argmax(known[:, ::-1], axis=1), block.shape[2])
     return tuple(columns), [row[:, :end] for row, end in zip(block, ends.tolist(), strict=True)]
-
-
-def _of_lists(cells: NDArray[Any], place: int, wrong: dict[int, str]) -> NDArray[np.float32]:
-    """A row's channels, a list each, as (C, T)."""
-    try:
-        trace = np.stack([np.asarray(cell, dtype=np.float32) for cell in cells])
-    except (TypeError, ValueError):
-        trace = np.empty(0, dtype=np.float32)
-    if trace.ndim != 2 or not trace.size:
-        wrong[place] = "Expected a list of numbers in each channel, all of one length, got something else"
-    return trace
 
 
 def _parts(frame: pd.DataFrame, column: str) -> list[str | None]:
@@ -212,17 +196,14 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
         for i in np.flatnonzero(steps != np.median(steps))[:1].tolist():
             after = f"after {those[i][1]} comes {those[i + 1][1]}"
             raise DataError(f"Expected columns that are numbered one by one, {after}.")
-    chosen = _chosen(several, asked)
+    missing = [name for name in asked.channels if name not in several]
+    if missing:
+        raise DataError(f"Expected the channel {missing[0]}, in columns {missing[0]}_0 and so on, found {listed(several)}.")
+    if not asked.channels and FORCE not in several and len(several) > 1:
+        one = next(iter(several))
+        raise DataError(f"Expected the channel to be named, as in channel={one!r}; there are {listed(several)}.")
+    chosen = asked.channels or ((FORCE,) if FORCE in several else tuple(several))
     if len({len(several[name]) for name in chosen}) > 1:
         each = ", ".join(f"{name} {len(several[name])}" for name in chosen)
         raise DataError(f"Expected as many samples of each channel, got {each}.")
     return {name: [column for _, column in several[name]] for name in chosen}
-
-
-def _chosen(have: Mapping[str, Any], asked: Asked) -> tuple[str, ...]:
-    missing = [name for name in asked.channels if name not in have]
-    if missing:
-        raise DataError(f"Expected the channel {missing[0]}, in columns {missing[0]}_0 and so on, found {listed(have)}.")
-    if not asked.channels and FORCE not in have and len(have) > 1:
-        raise DataError(f"Expected the channel to be named, as in channel={next(iter(have))!r}; there are {listed(have)}.")
-    return asked.channels or ((FORCE,) if FORCE in have else tuple(have))

@@ -24,7 +24,6 @@ NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan")  # a cell without a n
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
 DECIMAL = re.compile(r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$")
 GAP = 5.0  # median steps: a pause that a late message does not explain
-EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))  # a time of day as a number: above this, in units of so many seconds
 SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
 UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 
@@ -164,7 +163,7 @@ def place_of(name: str, header: Sequence[str]) -> int:
 
 
 def seconds_of(column: Any, name: str) -> NDArray[np.float64]:
-    """Timestamps as seconds from the first: numbers, in the unit that name or size tell, or times of day as text."""
+    """Timestamps as seconds from the first: numbers, in the unit that name or steps tell, or times of day as text."""
     import pandas as pd
 
     if pd.api.types.is_numeric_dtype(column):
@@ -184,13 +183,12 @@ def seconds_of(column: Any, name: str) -> NDArray[np.float64]:
 
 
 def _unit_of(times: NDArray[np.float64], name: str) -> float:
-    """Seconds in one of a clock: by its name, by an epoch's size, or so that its steps are a recorder's."""
+    """Seconds in one of a clock: by its name, or so that its steps are a recorder's."""
     ending = re.search(r"[_ \[(](ms|us|µs|ns)[\])]?$", name.lower())
     if ending:
         return UNITS[ending[1]]
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-    slow = next((unit for unit in (1.0, 1e-3, 1e-6) if step * unit < SLOW), 1e-9)
-    return next((unit for above, unit in EPOCHS if np.nan_to_num(times[0]) > above), slow)
+    return next((unit for unit in (1.0, 1e-3, 1e-6) if step * unit < SLOW), 1e-9)
 
 
 def rate_of(seconds: NDArray[np.float64]) -> float | None:

@@ -35,7 +35,7 @@ def write_folder(folder: Path, data: Dataset, **how: Any) -> Path:
 
 def wide(data: Dataset) -> pd.DataFrame:
     names = [f"FZ_{i}" for i in range(data.X.shape[1])]
-    return pd.DataFrame(data.X.astype(np.float64), columns=names).assign(label=np.where(data.y == 1, "OK", "NOK"))
+    return pd.DataFrame(data.X.astype(np.float64), columns=names).assign(label=words(data))
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +48,10 @@ def as_hdf5(data: Dataset, tmp: Path) -> Any:
     with h5py.File(tmp / "data.h5", "w") as file:
         file["X"], file["y"], file["unit"] = data.X, data.y, "N"
     return tmp / "data.h5"
+
+
+def words(data: Dataset) -> np.ndarray:
+    return np.where(data.y == 1, "OK", "NOK")
 
 
 def written(path: Path, write: Callable[[Path], Any]) -> Path:
@@ -66,6 +70,8 @@ FORMS: dict[str, Callable[[Dataset, Path], Any]] = {
     "frame": lambda data, tmp: wide(data),
     "npz": lambda data, tmp: written(tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=data.y)),
     "hdf5": as_hdf5,
+    "words": lambda data, tmp: (data.X.astype(object), words(data)),
+    "npz of words": lambda data, tmp: written(tmp / "data.npz", lambda path: np.savez(path, X=data.X, y=words(data))),
     "list": lambda data, tmp: (list(data.X), [bool(y) for y in data.y]),
     "series": lambda data, tmp: ([pd.Series(x) for x in data.X], data.y),
     "frames": lambda data, tmp: (
@@ -302,13 +308,6 @@ def test_rows_of_a_table_that_cannot_be_read_are_named(small: Dataset, tmp_path:
     assert data.source[kept.index(11)] == "wide.csv, line 13"
 
 
-def test_a_tables_label_and_part_columns_can_be_named(small: Dataset) -> None:
-    table = wide(small).rename(columns={"label": "Height check"}).assign(workpiece=[f"W{i // 2}" for i in range(24)])
-    data = load_dataset(table, part="workpiece", label="Height check")
-    np.testing.assert_array_equal(data.X, small.X)
-    assert data.part.tolist() == [f"W{i // 2}" for i in range(24)]
-
-
 @pytest.fixture
 def few(small: Dataset, tmp_path: Path) -> Path:
     """Four recordings of one channel."""
@@ -378,19 +377,12 @@ def test_where_a_folders_labels_are_not_is_said(small: Dataset, tmp_path: Path, 
         load_dataset(tmp_path / "cell", **(asked | ({"labels": tmp_path / "labels.csv"} if "labels" in asked else {})))
 
 
-def test_of_two_rates_the_one_of_more_recordings_is_kept(small: Dataset, tmp_path: Path) -> None:
-    for i, x in enumerate(small.X[:7]):
-        write_csv(tmp_path / f"{i}_OK.csv", x, rate_hz=500.0 if i < 4 else 125.0)
-    data = load_dataset(tmp_path)
-    assert (len(data), data.rate_hz, len(data.faults)) == (4, 500.0, 3)
-    (tmp_path / "3_OK.csv").unlink()
-    assert len(load_dataset(tmp_path)) == 3  # half of each: no rate lies between them
-
-
 def test_parts_keep_their_whole_names_and_a_row_without_one_is_a_part_of_its_own(small: Dataset) -> None:
     names = [None, *(f"P{i // 2}" for i in range(1, 24))]
-    part = load_dataset(wide(small).assign(part=names)).part.tolist()
-    assert part == ["row, line 1", *names[1:]]
+    table = wide(small).rename(columns={"label": "Height check"}).assign(workpiece=names)
+    data = load_dataset(table, part="workpiece", label="Height check")
+    np.testing.assert_array_equal(data.X, small.X)
+    assert data.part.tolist() == ["row, line 1", *names[1:]]
     numbers = [np.nan, *(float(i) for i in range(1, 24))]
     assert load_dataset(wide(small).assign(part=numbers)).part.tolist() == ["row, line 1", *map(str, range(1, 24))]
 
@@ -408,19 +400,6 @@ def test_a_row_whose_last_cells_are_empty_is_a_shorter_trace(small: Dataset, tmp
         np.testing.assert_array_equal(
             data.X, load_dataset(([x[:n] for x, n in zip(small.X, lengths, strict=True)], small.y)).X
         )
-
-
-def test_columns_of_lists_are_channels(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    data = make_data(6, samples=40, channels=2)
-    cells = {name: [x.tolist() for x in data.X[:, c]] for c, name in enumerate(("FX_Base", "FZ_Base"))}
-    table = pd.DataFrame(cells).assign(label=data.y)
-    table.to_parquet(tmp_path / "lists.parquet")
-    for source in (table, tmp_path / "lists.parquet"):
-        np.testing.assert_array_equal(load_dataset(source, channel="FX_Base,FZ_Base").X, data.X)
-        np.testing.assert_array_equal(load_dataset(source).X, data.X[:, 1])
-    table["FX_Base"] = [cell[:2] if i == 2 else cell for i, cell in enumerate(table["FX_Base"])]
-    (fault,) = load_dataset(table, channel="FX_Base,FZ_Base").faults
-    assert (fault.line, fault.what[:40]) == (3, "Expected a list of numbers in each chann")
 
 
 def written_text(path: Path) -> Path:
@@ -455,15 +434,6 @@ def test_what_would_be_misread_is_refused(what: str, small: Dataset, tmp_path: P
     source, words = REFUSED[what]
     with pytest.raises(DataError, match=words):
         load_dataset(source(small, tmp_path))
-
-
-def test_labels_of_an_array_may_be_words(small: Dataset, tmp_path: Path) -> None:
-    words = np.where(small.y == 1, "OK", "NOK")
-    np.savez(tmp_path / "words.npz", X=small.X, y=words)
-    for source in ((small.X, words), (small.X, pd.Series(words)), (small.X.astype(object), words), tmp_path / "words.npz"):
-        data = load_dataset(source)
-        np.testing.assert_array_equal(data.X, small.X)
-        np.testing.assert_array_equal(data.y, small.y)
 
 
 def test_frames_tell_their_rate_and_give_the_force(small: Dataset) -> None:
