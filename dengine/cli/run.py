@@ -158,7 +158,7 @@ def _robot(source: DataChoice, host: str | None, **others: Any) -> tuple[Cell, s
     if "channel" in source.how:
         how["channels"] = names_of(source.how["channel"])
     name, port = host_and_port(host)
-    return UrCell(name, port=port, **how).open(), f"robot at {host}"
+    return UrCell(name, port=port, **how), f"robot at {host}"
 
 
 def host_and_port(address: str) -> tuple[str, int]:

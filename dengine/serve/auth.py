@@ -20,7 +20,7 @@ from http import HTTPStatus
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -31,7 +31,7 @@ from .api import Refusal, problem
 log = logging.getLogger("dengine")
 SHORTEST = 16  # characters of a token
 CLIENTS = 4096  # whose rate is remembered
-RPC = "/RPC2"  # where a robot that cannot send headers may have its token in the path or the query
+RPC = "/RPC2"  # below which a robot that cannot send headers may have its token
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,18 +144,6 @@ def is_same(token: str, said: str) -> bool:
     return hmac.compare_digest(token.encode(), said.encode("utf-8", "surrogatepass"))
 
 
-def split_rpc(path: str, query: bytes) -> tuple[str, bytes, str | None]:
-    """The path and the query of a robot's request without the token in them, and that token; None where there is none."""
-    if path.startswith(f"{RPC}/"):
-        return RPC, query, path.removeprefix(f"{RPC}/")
-    if path != RPC or b"token=" not in query:
-        return path, query, None
-    pairs = parse_qsl(query.decode("latin-1"), keep_blank_values=True)
-    said = [value for name, value in pairs if name == "token"]
-    rest = urlencode([pair for pair in pairs if pair[0] != "token"])
-    return path, rest.encode("ascii"), said[0] if len(said) == 1 else ""
-
-
 CLOSE = {"Connection": "close"}  # what was not read is not to be taken for the next request
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -221,13 +209,13 @@ class Guard:
             raise _too_large(access.largest)
 
     def _must_have_token(self, scope: MutableMapping[str, Any], authorization: str | None, client: str) -> None:
-        path, query, said = split_rpc(scope["path"], scope["query_string"])
-        if said is not None:  # it is nobody's business from here on, with a token or without
-            scope.update(path=path, raw_path=RPC.encode("ascii"), query_string=query)
-        token = self.access.token
-        if not token or path == "/healthz" or (said is not None and is_same(token, said)) or may_ask(token, authorization):
+        token, said = self.access.token, ""
+        if scope["path"].startswith(f"{RPC}/"):  # it is nobody's business from here on, with a token or without
+            said = scope["path"].removeprefix(f"{RPC}/")
+            scope.update(path=RPC, raw_path=RPC.encode("ascii"))
+        if not token or scope["path"] == "/healthz" or is_same(token, said) or may_ask(token, authorization):
             return
-        if (authorization or said is not None) and self.lines.take(client):
+        if (authorization or said) and self.lines.take(client):
             log.warning("a wrong token came from %s", client)
         how = "Authorization: Bearer TOKEN, or any user name with it as the password"
         ask = {"WWW-Authenticate": 'Bearer realm="dengine", Basic realm="dengine", charset="UTF-8"'}

@@ -16,7 +16,8 @@ class Metrics:
     """Counts what a service answers over every interface, from now on, and reads how it stands when it is asked."""
 
     def __init__(self, service: CellService) -> None:
-        self._registry = registry = CollectorRegistry()
+        self._service, self._registry = service, CollectorRegistry()
+        registry = self._registry
         self._decisions = Counter("dengine_decisions", "Decisions answered.", ("action", "reason"), registry=registry)
         self._reports = Counter("dengine_reports", "Labels taken.", ("success", "repeated"), registry=registry)
         self._retrains = Counter("dengine_retrains", "Retrains that ended.", ("accepted",), registry=registry)
@@ -30,7 +31,7 @@ class Metrics:
                 (RetrainReport, "retrain", "From the data to the new version answering.", slow),
             )
         }
-        registry.register(Gauges(service))
+        registry.register(self)
         service.observers.append(self.observe)
 
     def observe(self, news: Answer | Told | RetrainReport) -> None:
@@ -39,23 +40,16 @@ class Metrics:
         if isinstance(news, Answer):
             self._decisions.labels(news.decision.action.value, news.decision.reason.value).inc()
         elif isinstance(news, Told):
-            self._reports.labels(_word(news.success), _word(news.repeated)).inc()
+            self._reports.labels(str(news.success).lower(), str(news.repeated).lower()).inc()
         else:
-            self._retrains.labels(_word(news.accepted)).inc()
+            self._retrains.labels(str(news.accepted).lower()).inc()
 
     def text(self) -> tuple[bytes, str]:
         """All of it, and its content type."""
         return generate_latest(self._registry), CONTENT_TYPE_LATEST
 
-
-class Gauges:
-    """How a service stands, read at the moment it is asked, also while its store is away."""
-
-    def __init__(self, service: CellService) -> None:
-        self._service = service
-
     def collect(self) -> Iterator[Metric]:
-        """What Prometheus's registry asks for."""
+        """How the service stands, at the moment that Prometheus's registry asks, also while its store is away."""
         service, engine = self._service, self._service.engine
         for name, about, value in (
             ("model_version", "Of the model that answers; 0 before the first retrain.", engine.version),
@@ -69,7 +63,3 @@ class Gauges:
             yield GaugeMetricFamily(f"dengine_{name}", about, value=float(value))
         yield CounterMetricFamily("dengine_late", "Decisions verified since a deadline was exceeded.", value=service.late)
         yield CounterMetricFamily("dengine_busy", "Requests refused since too many waited.", value=service.busy)
-
-
-def _word(value: bool) -> str:
-    return "true" if value else "false"

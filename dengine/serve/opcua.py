@@ -86,8 +86,8 @@ VARIABLES: Mapping[str, tuple[VariantType, str, str]] = {  # its type, its name 
     "Waiting": (VariantType.UInt32, "waiting", "requests in line"),
     "Late": (VariantType.UInt32, "late", "answers that came too late, since the server's start"),
     "Busy": (VariantType.UInt32, "busy", "requests that were refused since the line was full, since the start"),
+    "LastRefused": (VariantType.String, "", "why the newest call was refused"),  # for who sets a PLC up
 }
-REFUSED = "LastRefused"  # a variable too: why the newest call was refused, for who sets a PLC up
 
 Argument = tuple[str, VariantType, bool, str]  # name, type, an array, what it is
 DECIDE: tuple[list[Argument], list[Argument]] = (
@@ -170,8 +170,7 @@ class AddressSpace:
         """Make the object, its variables and methods, and what tells of alarms."""
         self._index = await self._server.register_namespace(NAMESPACE)
         cell = await self._server.nodes.objects.add_object(self._id(CELL), self._name(CELL))
-        refused = {REFUSED: (VariantType.String, "", "why the newest call was refused")}
-        for name, (type_, _, text) in {**VARIABLES, **refused}.items():
+        for name, (type_, _, text) in VARIABLES.items():
             first = ua.get_default_value(type_) if type_ is not VariantType.String else ""
             node = await cell.add_variable(self._id(f"{CELL}.{name}"), self._name(name), first, type_)
             await node.write_attribute(AttributeIds.Description, ua.DataValue(ua.Variant(ua.LocalizedText(text))))
@@ -215,7 +214,7 @@ class AddressSpace:
             await self.update(await self._calls.status())
         except Exception as error:  # the store is away, or the line is full
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
-            for name in VARIABLES:
+            for name in [name for name, (_, key, _) in VARIABLES.items() if key]:
                 old = await self._nodes[name].read_data_value(raise_on_bad_status=False)
                 status = _status(StatusCodes.UncertainLastUsableValue)
                 await self._nodes[name].write_value(ua.DataValue(old.Value, status))
@@ -223,8 +222,9 @@ class AddressSpace:
     async def update(self, now: Mapping[str, Any]) -> None:
         """Write how the cell is doing into the variables; an alarm that begins or ends is an event."""
         for name, (type_, key, _) in VARIABLES.items():
-            value = bool(now[key]) if type_ is VariantType.Boolean else now[key]
-            await self._nodes[name].write_value(ua.DataValue(ua.Variant(value, type_)))
+            if key:
+                value = bool(now[key]) if type_ is VariantType.Boolean else now[key]
+                await self._nodes[name].write_value(ua.DataValue(ua.Variant(value, type_)))
         if now["alarm"] != self._alarm:
             self._events.event.Severity = ALARM if now["alarm"] else ALARM_ENDED
             await self._events.trigger(message=now["alarm"] or f"Over: {self._alarm}")
@@ -250,7 +250,7 @@ class AddressSpace:
                 except Exception:  # ours: the log has it, the caller verifies
                     log.exception("a call over OPC UA failed")
                     wrong, said = _status(StatusCodes.BadInternalError), "The server failed on this call."
-            await self._nodes[REFUSED].write_value(ua.DataValue(ua.Variant(one_line(said), VariantType.String)))
+            await self._nodes["LastRefused"].write_value(ua.DataValue(ua.Variant(one_line(said), VariantType.String)))
             return wrong
 
         return method

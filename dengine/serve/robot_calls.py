@@ -31,6 +31,7 @@ OPEN = 8  # parts whose pieces are on their way; one more gives up the oldest
 SAMPLES = 200_000  # of all pieces of a part
 BUSY, NOT_RECORDED = "busy", "not_recorded"  # beside the names in `Reason`: nothing of the part is known
 
+CALLS = "begin", "add", "decide", "decide_added", "decide_recorded", "action", "action_added", "action_recorded"
 Answered = dict[str, Any]
 Call = Callable[..., Awaitable[Any]]
 
@@ -57,20 +58,9 @@ class RobotCalls:
         self._armed: str | None = None
         self._recording = asyncio.Lock()  # one insertion at a time
 
-    def table(self) -> dict[str, tuple[Call, int, int]]:
-        """Each call by its name, with the fewest and the most arguments that it takes."""
-        return {
-            "begin": (self.begin, 0, 1),
-            "add": (self.add, 2, 2),
-            "decide": (self.decide, 1, 3),
-            "decide_added": (self.decide_added, 1, 2),
-            "decide_recorded": (self.decide_recorded, 0, 2),
-            "action": (_as_action(self.decide), 2, 3),
-            "action_added": (_as_action(self.decide_added), 1, 2),
-            "action_recorded": (_as_action(self.decide_recorded), 1, 2),
-            "report": (self.report, 2, 2),
-            "status": (self.status, 0, 0),
-        }
+    def table(self) -> dict[str, Call]:
+        """Each call by its name; its signature says which arguments it takes."""
+        return {name: getattr(self, name) for name in (*CALLS, "report", "status")}
 
     async def begin(self, request: Any = "") -> str:
         """A new part: its id, a new one or the caller's. The recorder waits for its insertion from now on."""
@@ -143,6 +133,18 @@ class RobotCalls:
                 self._armed = None
             return await self.decide_on(recording.trace, id_, part)
 
+    async def action(self, trace: Any, request: Any, part: Any = "") -> int:
+        """`decide`, answered by its action alone, for a controller that knows no structs; so are the next two."""
+        return int((await self.decide(trace, request, part))["action"])
+
+    async def action_added(self, request: Any, part: Any = "") -> int:
+        """`decide_added`, answered by its action alone."""
+        return int((await self.decide_added(request, part))["action"])
+
+    async def action_recorded(self, request: Any, part: Any = "") -> int:
+        """`decide_recorded`, answered by its action alone."""
+        return int((await self.decide_recorded(request, part))["action"])
+
     async def decide_on(self, trace: ArrayLike, request: Any, part: Any) -> Answered:
         """Decide on a trace as an array; an empty request or part is none."""
         id_ = as_id(request) if request != "" else None
@@ -207,17 +209,6 @@ def as_samples(value: Any) -> NDArray[np.float32]:
     if not x.size:
         raise TraceError("Expected at least one sample, got none.")
     return x
-
-
-def _as_action(call: Call) -> Call:
-    """The same call, answered by its action alone, for a controller that knows no structs."""
-
-    async def action(*arguments: Any) -> int:
-        answer: Answered = await call(*arguments)
-        number: int = answer["action"]
-        return number
-
-    return action
 
 
 def _answered(decision: Decision) -> Answered:

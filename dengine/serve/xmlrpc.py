@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import xmlrpc.client
-from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
@@ -20,7 +20,7 @@ from starlette.routing import Route
 from ..errors import DengineError, ReportError
 from .api import media_type, read_body
 from .auth import RPC
-from .robot_calls import PATIENCE, Recorder, RobotCalls, one_line
+from .robot_calls import PATIENCE, Call, Recorder, RobotCalls, one_line
 from .service import CellService
 
 log = logging.getLogger("dengine")
@@ -82,7 +82,7 @@ def routes(
     return [Route(RPC, rpc, methods=["POST"])]
 
 
-async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: bytes) -> bytes:
+async def answered(calls: dict[str, Call], body: bytes) -> bytes:
     """The answer to a call, as XML; what goes wrong is a fault."""
     try:
         name, arguments = parsed(body) if len(body) <= SMALL else await asyncio.to_thread(parsed, body)
@@ -90,9 +90,11 @@ async def answered(calls: dict[str, tuple[Callable[..., Any], int, int]], body: 
         return fault(NOT_XML, str(error))
     if name not in calls:
         return fault(NO_METHOD, f"Expected one of {', '.join(calls)}.")
-    call, fewest, most = calls[name]
-    if not fewest <= len(arguments) <= most:
-        return fault(WRONG_ARGUMENTS, f"Expected {fewest} to {most} arguments of {name}, got {len(arguments)}.")
+    call = calls[name]
+    try:
+        signature(call).bind(*arguments)
+    except TypeError as error:
+        return fault(WRONG_ARGUMENTS, f"Expected the arguments that {name} takes, got {len(arguments)}: {error}.")
     try:
         return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
     except DengineError as error:

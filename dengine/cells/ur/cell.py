@@ -12,8 +12,8 @@ trigger. A program that starts answers an old order with VOID. `training/ur_cell
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from enum import IntEnum
 
 import numpy as np
@@ -23,7 +23,7 @@ from ...datasets.triggers import Trigger
 from ...errors import CellError
 from ...records import Outcome
 from .protocol import PORT
-from .recorder import BAR_S, InsertionRecord, RtdeRecorder
+from .recorder import InsertionRecord, RtdeRecorder
 from .stream import Row
 
 ORDER = "input_int_register_24"
@@ -85,7 +85,7 @@ def after(number: int) -> int:
 REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED): "it says that it failed"}
 
 
-class UrCell:
+class UrCell(AbstractContextManager["UrCell"]):
     """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot.
 
     host, trigger, samples, channels, rate_hz, before, port : as in `RtdeRecorder`; the trace is recorded while the robot
@@ -113,25 +113,16 @@ class UrCell:
         self.order_timeout, self.start_timeout = order_timeout, start_timeout
         self.last: InsertionRecord | None = None
         self.incomplete = 0
-        self._number = 0
-
-    def open(self) -> UrCell:
-        """Connect, and wait until the robot's program runs and owes no answer."""
-        self.recorder.open()
+        columns = self.recorder.stream.columns
+        self._at = {name: columns.index(name) for name in also}
         try:
-            columns = self.recorder.stream.columns
-            self._at = {name: columns.index(name) for name in (ANSWER, ORDER, RUNTIME)}
             self._number = self._take_over()
         except BaseException:
             self.close()
             raise
-        return self
 
     def close(self) -> None:
         self.recorder.close()
-
-    def __enter__(self) -> UrCell:
-        return self.open()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
@@ -140,8 +131,8 @@ class UrCell:
         """Pick a part, push it in, and give the force: (T,) or (C, T), NaN where a sample never came."""
         self._ask(Verb.INSERT)
         if self.last is None:  # answered, and no start was seen: the trigger fell into a gap, or is the wrong one
-            self.last = self.recorder.cutter.cut()
-        self.incomplete += not self.last.complete
+            self.last = self.recorder.cut()
+        self.incomplete += self.last.missing > 0
         return self.last.trace
 
     def verify(self) -> bool:
@@ -163,32 +154,22 @@ class UrCell:
         self.last = None if verb is Verb.INSERT else self.last
         self.recorder.stream.write((word(self._number, verb),))
         answer: Answer | None = None
-        end = time.monotonic() + self.order_timeout
-        while answer is None or (verb is Verb.INSERT and self.last is None and self.recorder.cutter.begun):
-            rows = self._rows(end, f"to answer order {self._number} ({verb.name.lower()})", answer is not None)
-            if not rows:
-                break
-            n = len(rows)
+        for row in self.recorder.rows(self.order_timeout):
             if verb is Verb.INSERT and self.last is None:
-                self.last, n = self.recorder.cutter.feed(rows)
-            answer = answer or next((found for row in rows[:n] if (found := self._answered(row, verb))), None)
-            self.recorder.seen(n)
+                self.last = self.recorder.feed(row)
+            answer = answer or self._answered(row, verb)
+            if answer and not (verb is Verb.INSERT and self.last is None and self.recorder.begun):
+                break
+        if answer is None:
+            raise self._silence(f"to answer order {self._number} ({verb.name.lower()})")
         self.recorder.stream.write(None)
-        assert answer is not None  # `_rows` has raised
         return answer
 
-    def _rows(self, end: float, what: str, spare: bool = False) -> list[Row]:
-        """The next packages; none, where that is no fault, or else CellError once `end` is past."""
-        while (left := end - time.monotonic()) > 0:
-            rows = self.recorder.rows(min(left, BAR_S))
-            if rows:
-                return rows
-        if spare:
-            return []
+    def _silence(self, what: str) -> CellError:
         why = "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
         if self.recorder.stream.trouble:
             why = f"there is no connection: {self.recorder.stream.trouble}"
-        raise CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {why}.")
+        return CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {why}.")
 
     def _answered(self, row: Row, verb: Verb) -> Answer | None:
         """The answer to the order under way, if this package holds it; CellError for one that is no success."""
@@ -206,17 +187,16 @@ class UrCell:
 
     def _take_over(self) -> int:
         """The number of the last order there was, once it is answered and the program runs."""
-        end = time.monotonic() + self.start_timeout
-        while True:
-            rows = self._rows(time.monotonic() + self.start_timeout, "to send its state")
-            self.recorder.seen(len(rows))
-            ordered, answered, state = (int(rows[-1].values[self._at[name]]) for name in (ORDER, ANSWER, RUNTIME))
+        what = ""
+        for row in self.recorder.rows(self.start_timeout):
+            ordered, answered, state = (int(row.values[self._at[name]]) for name in (ORDER, ANSWER, RUNTIME))
             if state == Runtime.PLAYING and ordered // 10 == answered // 10:
                 return ordered // 10
-            if time.monotonic() > end:
-                owing = f"it owes an answer to order {ordered // 10}"
-                what = owing if state == Runtime.PLAYING else "its program does not run"
-                raise CellError(
-                    f"Expected the robot at {self.recorder.stream.where} to be ready within {self.start_timeout:g} s, "
-                    f"{what}; start training/ur_cell.script, or your own program of the same handshake, on it."
-                )
+            owing = f"it owes an answer to order {ordered // 10}"
+            what = owing if state == Runtime.PLAYING else "its program does not run"
+        if not what:
+            raise self._silence("to send its state")
+        raise CellError(
+            f"Expected the robot at {self.recorder.stream.where} to be ready within {self.start_timeout:g} s, "
+            f"{what}; start training/ur_cell.script, or your own program of the same handshake, on it."
+        )

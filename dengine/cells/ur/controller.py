@@ -14,7 +14,7 @@ import struct
 import threading
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from itertools import repeat
 from typing import Any, Protocol
@@ -25,34 +25,7 @@ from numpy.typing import NDArray
 from ...datasets import load_dataset
 from ...errors import CellError, SettingError
 from .cell import ANSWER, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, word
-from .protocol import CHANNELS, IN_USE, NOT_FOUND, TYPES, VERSION, Kind, Package, Packages, Recipe, column_of, type_of
-
-
-class Connection:
-    """One client: its recipes, and what is held back of it."""
-
-    def __init__(self, sock: socket.socket) -> None:
-        self.socket = sock
-        self.output: Recipe | None = None
-        self.every = 1  # cycles
-        self.inputs: dict[int, Recipe] = {}
-        self.started = False
-        self.held: list[bytes] = []
-
-    def send(self, data: bytes) -> bool:
-        """Whether the socket took it."""
-        try:
-            self.socket.sendall(data)
-        except OSError:  # gone, or it does not read
-            self.hang_up()
-        return self.started
-
-    def hang_up(self) -> None:
-        """In good order: what was sent arrives."""
-        self.started = False
-        with suppress(OSError):
-            self.socket.shutdown(socket.SHUT_WR)
-
+from .protocol import CHANNELS, IN_USE, NOT_FOUND, VERSION, Kind, Package, Packages, Recipe, column_of, type_of
 
 CHECK, REST = 5, 2  # control cycles of a height check, and of standstill before an insertion is answered
 Values = dict[str, float]
@@ -168,13 +141,41 @@ class Trouble:
             raise SettingError(f"Expected a trouble among {', '.join(TROUBLES)} of 1 or more cycles, got {self}.")
 
 
-class FakeController:
-    """Listens on host and port (0: any that is free) and plays a program. Opened by `with`, or `open`.
+class Client:
+    """One that is connected: its recipes, and what is held back of it."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, PATIENCE)
+        self.socket = sock
+        self.output: Recipe | None = None
+        self.every = 1  # cycles
+        self.inputs: dict[int, Recipe] = {}
+        self.started = False
+        self.held: list[bytes] = []
+
+    def send(self, data: bytes) -> bool:
+        """Whether the socket took it."""
+        try:
+            self.socket.sendall(data)
+        except OSError:  # gone, or it does not read
+            self.hang_up()
+        return self.started
+
+    def hang_up(self, how: int = socket.SHUT_WR) -> None:
+        """In good order, as a rule: what was sent arrives."""
+        self.started = False
+        with suppress(OSError):
+            self.socket.shutdown(how)
+
+
+class FakeController(AbstractContextManager["FakeController"]):
+    """Listens on host and port (0: any that is free) and plays a program, until it is closed.
 
     speed : cycles against real time; None: as fast as clients read.  troubles : what goes wrong, and when.
-    held : input fields that another client holds.  unknown : output fields that it does not have.
-    refuses : requests that it says no to, Kind.VERSION or Kind.START.
-    `lost` : part and sample of every package of an insertion that no client was sent.  `said` : texts that clients sent.
+    refuses : requests that it says no to, Kind.VERSION or Kind.START; names of outputs that it does not have, and of inputs
+    that another client holds.  `lost` : part and sample of every package of an insertion that no client was sent.
+    `inputs` : registers as clients have written them.
     """
 
     def __init__(
@@ -184,31 +185,21 @@ class FakeController:
         port: int = 0,
         speed: float | None = 1.0,
         troubles: Iterable[Trouble] = (),
-        held: Collection[str] = (),
-        unknown: Collection[str] = (),
-        refuses: Collection[Kind] = (),
+        refuses: Collection[Kind | str] = (),
     ) -> None:
-        self.program, self.host, self.speed = program, host, speed
-        self.held, self.unknown, self.refuses = set(held), set(unknown), set(refuses)
+        self.program, self.host, self.speed, self.refuses = program, host, speed, refuses
         self.lost: set[tuple[int, int]] = set()
-        self.said: list[str] = []
-        self.runtime: int | None = None  # another state than the program's, if any
         self._troubles = {(each.part, each.sample): each for each in troubles}
         self._server = socket.create_server((host, port))
         self.port: int = self._server.getsockname()[1]
-        self._inputs: dict[str, float] = {}
-        self._connections: list[Connection] = []
+        self.inputs: dict[str, float] = {}
+        self._clients: list[Client] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._begin = self._cycle = 0
-        self._drop = self._hold = 0
+        self._begin = self._cycle = self._drop = self._hold = 0
         self._threads = [threading.Thread(target=each, daemon=True) for each in (self._accept, self._run)]
-
-    def open(self) -> FakeController:
-        """Begin to listen, and to count cycles."""
-        for thread in self._threads:
+        for thread in self._threads[:]:
             thread.start()
-        return self
 
     def close(self) -> None:
         """End all connections and threads."""
@@ -216,100 +207,80 @@ class FakeController:
         with suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        self.hang_up(abruptly=True)
+        with self._lock:
+            for each in self._clients:
+                each.hang_up(socket.SHUT_RDWR)  # what was sent may never arrive
         for thread in list(self._threads):
             thread.join()
-
-    def __enter__(self) -> FakeController:
-        return self.open()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def hang_up(self, abruptly: bool = False) -> None:
-        """Close every connection; abruptly: what was sent may never arrive."""
+    def hang_up(self, anew: bool = False) -> None:
+        """Close every connection. anew : as it is switched off and on: its clock begins anew, and nothing is written."""
         with self._lock:
-            for each in self._connections:
+            if anew:
+                self.inputs.clear()
+                self._begin = self._cycle
+            for each in self._clients:
                 each.hang_up()
-                if abruptly:
-                    with suppress(OSError):
-                        each.socket.shutdown(socket.SHUT_RDWR)
-
-    def say(self, text: str) -> None:
-        """Send every client a text message, as of an error."""
-        words = text.encode()
-        with self._lock:
-            for each in self._connections:
-                each.send(Package(Kind.TEXT, bytes([len(words)]) + words + b"\x04fake\x01").bytes)
-
-    # The server's side of a connection.
 
     def _accept(self) -> None:
-        while not self._closing.is_set():
-            try:
+        with suppress(OSError):  # until it is closed
+            while True:
                 sock, _ = self._server.accept()
-            except OSError:  # closed
-                return
-            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, PATIENCE)
-            thread = threading.Thread(target=self._serve, args=(Connection(sock),), daemon=True)
-            self._threads.append(thread)
-            thread.start()
+                self._threads.append(threading.Thread(target=self._serve, args=(Client(sock),), daemon=True))
+                self._threads[-1].start()
 
-    def _serve(self, connection: Connection) -> None:
+    def _serve(self, client: Client) -> None:
         with self._lock:
-            self._connections.append(connection)
+            self._clients.append(client)
         packages = Packages()
-        with connection.socket, suppress(*FOREIGN):
-            while piece := connection.socket.recv(65536):
+        with client.socket, suppress(*FOREIGN):
+            while piece := client.socket.recv(65536):
                 for package in packages.feed(piece):
-                    self._answer(connection, package)
+                    with self._lock:
+                        self._answer(client, package.kind, package.payload)
         with self._lock:
-            connection.started = False
-            self._connections.remove(connection)
+            client.started = False
+            self._clients.remove(client)
 
-    def _answer(self, connection: Connection, package: Package) -> None:
-        with self._lock:
-            if package.kind is Kind.DATA:
-                recipe = connection.inputs[package.payload[0]]
-                self._inputs.update(zip(recipe.columns, recipe.unpack(package.payload), strict=True))
-            elif package.kind is Kind.TEXT:
-                self.said.append(package.payload[1 : 1 + package.payload[0]].decode())
-            else:
-                answer = self._reply(connection, package.kind, package.payload)
-                connection.socket.sendall(Package(package.kind, answer).bytes)
-                connection.started = package.kind is Kind.START and answer == b"\1"
+    def _answer(self, client: Client, kind: Kind, payload: bytes) -> None:
+        yes = kind not in self.refuses
+        match kind:
+            case Kind.TEXT:
+                return
+            case Kind.DATA:
+                recipe = client.inputs[payload[0]]
+                self.inputs.update(zip(recipe.columns, recipe.unpack(payload), strict=True))
+                return
+            case Kind.OUTPUTS:
+                (rate,) = struct.unpack_from(">d", payload)
+                client.every = max(int(1 / (CYCLE_S * rate)), 1) if rate > 0 else 1
+                recipe = self._recipe(1, payload[8:], self.refuses, NOT_FOUND)
+                client.output = None if NOT_FOUND in recipe.types else recipe
+                answer = bytes([1]) + ",".join(recipe.types).encode()
+            case Kind.INPUTS:
+                others = [each.names for other in self._clients if other is not client for each in other.inputs.values()]
+                number = len(client.inputs) + 1
+                recipe = self._recipe(number, payload, {*self.refuses}.union(*others), IN_USE)
+                if {IN_USE, NOT_FOUND} & set(recipe.types):
+                    number = 0
+                else:
+                    client.inputs[number] = recipe
+                answer = bytes([number]) + ",".join(recipe.types).encode()
+            case Kind.CONTROLLER:
+                answer = struct.pack(">4I", 5, 11, 0, 0)  # of its software
+            case Kind.VERSION:
+                answer = bytes([yes and payload == struct.pack(">H", VERSION)])
+            case _:
+                answer = bytes([yes and (kind is not Kind.START or client.output is not None)])
+        client.socket.sendall(Package(kind, answer).bytes)
+        client.started = kind is Kind.START and answer == b"\1"
 
-    def _reply(self, connection: Connection, kind: Kind, payload: bytes) -> bytes:
-        if kind is Kind.OUTPUTS:
-            return self._set_outputs(connection, payload)
-        if kind is Kind.INPUTS:
-            return self._set_inputs(connection, payload)
-        if kind is Kind.CONTROLLER:
-            return struct.pack(">4I", 5, 11, 0, 0)  # of its software
-        agrees = {Kind.VERSION: payload == struct.pack(">H", VERSION), Kind.START: connection.output is not None}
-        return bytes([agrees.get(kind, True) and kind not in self.refuses])
-
-    def _set_outputs(self, connection: Connection, payload: bytes) -> bytes:
-        (rate,) = struct.unpack_from(">d", payload)
-        names = payload[8:].decode().rstrip(",").split(",")  # ur_rtde ends its list with a comma
-        types = [NOT_FOUND if name in self.unknown else type_of(name) for name in names]
-        if NOT_FOUND not in types:
-            connection.output = Recipe(1, tuple(names), tuple(types))
-        connection.every = max(int(1 / (CYCLE_S * rate)), 1) if rate > 0 else 1
-        return bytes([1]) + ",".join(types).encode()
-
-    def _set_inputs(self, connection: Connection, payload: bytes) -> bytes:
-        names = payload.decode().rstrip(",").split(",")
-        others = [recipe for each in self._connections if each is not connection for recipe in each.inputs.values()]
-        taken = self.held.union(*(recipe.names for recipe in others))
-        types = [IN_USE if name in taken else type_of(name) for name in names]
-        number = 0 if {IN_USE, NOT_FOUND} & set(types) else len(connection.inputs) + 1
-        if number:
-            connection.inputs[number] = Recipe(number, tuple(names), tuple(types))
-        return bytes([number]) + ",".join(types).encode()
-
-    # The control cycle.
+    def _recipe(self, number: int, names: bytes, refused: Collection[Kind | str], why: str) -> Recipe:
+        listed = names.decode().rstrip(",").split(",")  # ur_rtde ends its list with a comma
+        return Recipe(number, tuple(listed), tuple(why if name in refused else type_of(name) for name in listed))
 
     def _run(self) -> None:
         due = time.monotonic()
@@ -324,31 +295,27 @@ class FakeController:
 
     def _step(self) -> bool:
         """One cycle; whether anyone was listening."""
-        values = {**STATE, **self._inputs, **(self.program.step(dict(self._inputs)) if self.program else {})}
-        if self.runtime is not None:
-            values[RUNTIME] = self.runtime
+        values = {**STATE, **self.inputs, **(self.program.step(dict(self.inputs)) if self.program else {})}
         place = self.program.place if self.program else None
         trouble = self._troubles.pop(place, None) if place else None
         kind, cycles = (trouble.kind, trouble.cycles) if trouble else ("", 0)
         self._drop, self._hold = max(self._drop, cycles * (kind == "drop")), max(self._hold, cycles * (kind == "hold"))
         self._begin = self._cycle if kind == "reset" else self._begin
-        for each in self._connections if kind == "close" else ():
+        for each in self._clients if kind == "close" else ():
             each.hang_up()
         values["timestamp"] = (self._cycle - self._begin) * CYCLE_S
-        started = [each for each in self._connections if each.started and self._cycle % each.every == 0]
+        started = [each for each in self._clients if each.started and self._cycle % each.every == 0]
         sent = [self._send(each, values, kind) for each in started]
         if place is not None and not any(sent):
             self.lost.add(place)
         self._drop, self._hold, self._cycle = max(self._drop - 1, 0), max(self._hold - 1, 0), self._cycle + 1
         return bool(started)
 
-    def _send(self, each: Connection, values: Mapping[str, float], trouble: str) -> bool:
+    def _send(self, each: Client, values: Mapping[str, float], trouble: str) -> bool:
         """Whether the package of this cycle is on its way, now or later."""
         if self._drop or each.output is None:
             return False
-        row = [values.get(name, 0.0) for name in each.output.columns]
-        whole = [letter != "d" for letter, n in map(TYPES.__getitem__, each.output.types) for _ in range(n)]
-        data = each.output.pack([int(value) if is_whole else value for value, is_whole in zip(row, whole, strict=True)])
+        data = each.output.pack([values.get(name, 0.0) for name in each.output.columns])
         if trouble in ("half", "garbage"):
             each.send(data[: len(data) // 2] if trouble == "half" else GARBAGE)
             each.hang_up()

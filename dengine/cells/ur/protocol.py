@@ -95,19 +95,20 @@ class Recipe:
     @cached_property
     def layout(self) -> struct.Struct:
         """Of a data package: the recipe's number, and the values."""
-        return struct.Struct(">B" + "".join(f"{n}{letter}" for letter, n in (TYPES[each] for each in self.types)))
+        return struct.Struct(">B" + "".join(n * letter for letter, n in map(TYPES.__getitem__, self.types)))
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
         """A name for each number: `timestamp`, and `actual_TCP_force[2]` for one of a vector."""
         sizes = [TYPES[each][1] for each in self.types]
-        return tuple(
-            name if size == 1 else f"{name}[{i}]" for name, size in zip(self.names, sizes, strict=True) for i in range(size)
-        )
+        named = zip(self.names, sizes, strict=True)
+        return tuple(name if size == 1 else f"{name}[{i}]" for name, size in named for i in range(size))
 
     def pack(self, values: Sequence[float]) -> bytes:
-        """A data package, whole."""
-        return Package(Kind.DATA, self.layout.pack(self.number, *values)).bytes
+        """A data package, whole; where a field is no double, its value is cut to a whole number."""
+        letters = self.layout.format[2:]
+        held = [value if letter == "d" else int(value) for value, letter in zip(values, letters, strict=True)]
+        return Package(Kind.DATA, self.layout.pack(self.number, *held)).bytes
 
     def unpack(self, payload: bytes) -> tuple[float, ...]:
         """The values, one a column; CellError for a package of another size, or of another recipe."""

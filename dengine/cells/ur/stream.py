@@ -6,14 +6,15 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
+from itertools import chain
 
 from ...errors import CellError
-from .protocol import PORT, VERSION, HeldError, Kind, Package, Packages, Recipe, recipe_of
+from .protocol import PORT, VERSION, HeldError, Kind, Package, Packages, recipe_of
 
 PIECE = 65536  # bytes asked of the socket at once
 
@@ -36,10 +37,7 @@ class RtdeClient:
         timeout: float = 2.0,
     ) -> None:
         self.where = f"{host}:{port}"
-        self.said = ""  # the controller's last text message
-        self._packages = Packages()
-        self._waiting: list[Package] = []
-        self._lost: CellError | None = None
+        self._why = ""  # the controller's last text message, as an error ends with it
         try:
             self._socket = socket.create_connection((host, port), timeout)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -48,45 +46,31 @@ class RtdeClient:
                 f"Expected an RTDE controller at {self.where}, it cannot be reached: {error}; is the robot on, and "
                 "RTDE enabled under Settings, Security, Services?"
             ) from error
+        self._incoming = self._received()
         try:
-            self._set_up(outputs, inputs, rate_hz)
+            if self._ask(Kind.VERSION, struct.pack(">H", VERSION))[:1] != b"\1":
+                raise CellError(
+                    f"Expected RTDE protocol version {VERSION} at {self.where}, it says no; update the controller."
+                )
+            named = struct.pack(">d", rate_hz) + ",".join(outputs).encode()
+            self.outputs = recipe_of(self._ask(Kind.OUTPUTS, named), outputs, "output")
+            if inputs:
+                self._inputs = recipe_of(self._ask(Kind.INPUTS, ",".join(inputs).encode()), inputs, "input")
+            if self._ask(Kind.START, b"")[:1] != b"\1":
+                raise CellError(f"Expected {self.where} to start sending, it refuses to{self._why}.")
         except BaseException:
             self.close()
             raise
 
-    def _set_up(self, outputs: Sequence[str], inputs: Sequence[str], rate_hz: float) -> None:
-        accepted = self._ask(Kind.VERSION, struct.pack(">H", VERSION))
-        if accepted[:1] != b"\1":
-            raise CellError(f"Expected RTDE protocol version {VERSION} at {self.where}, it says no; update the controller.")
-        named = ",".join(outputs).encode()
-        self.outputs = recipe_of(self._ask(Kind.OUTPUTS, struct.pack(">d", rate_hz) + named), outputs, "output")
-        self.inputs: Recipe | None = None
-        if inputs:
-            self.inputs = recipe_of(self._ask(Kind.INPUTS, ",".join(inputs).encode()), inputs, "input")
-        if self._ask(Kind.START, b"")[:1] != b"\1":
-            raise CellError(f"Expected {self.where} to start sending, it refuses to{self._why()}.")
-
-    def rows(self) -> list[tuple[float, ...]]:
-        """The data packages that came, at least one, each as a value a column of `outputs`; blocks until then."""
-        while not any(package.kind is Kind.DATA for package in self._waiting):
-            if self._lost is not None:
-                raise self._lost
-            try:
-                self._receive()
-            except CellError as error:  # what came whole before it counts
-                self._lost = error
-        found = [self.outputs.unpack(package.payload) for package in self._waiting if package.kind is Kind.DATA]
-        self._waiting.clear()
-        return found
+    def rows(self) -> Iterator[tuple[float, ...]]:
+        """Every data package as it comes, a value a column of `outputs`; once, and for ever."""
+        for package in self._incoming:
+            if package.kind is Kind.DATA:
+                yield self.outputs.unpack(package.payload)
 
     def send(self, values: Sequence[float]) -> None:
         """Write the input fields, in one package."""
-        if self.inputs is None:
-            raise CellError("Expected input fields to write, this connection was set up without.")
-        try:
-            self._socket.sendall(self.inputs.pack(values))
-        except OSError as error:
-            raise CellError(f"Expected {self.where} to take its inputs, the connection is lost: {error}.") from error
+        self._send(self._inputs.pack(values))
 
     def close(self) -> None:
         with suppress(OSError):  # it may have hung up first
@@ -94,37 +78,37 @@ class RtdeClient:
         self._socket.close()
 
     def _ask(self, kind: Kind, payload: bytes) -> bytes:
-        """Send a request and wait for its answer; text messages and early data may come between."""
+        """Send a request and wait for its answer; text messages may come between."""
+        self._send(Package(kind, payload).bytes)
+        while (package := next(self._incoming)).kind is not kind:
+            if kind is Kind.START and package.kind is Kind.DATA:  # its first data can overtake its yes
+                self._incoming = chain([package], self._incoming)
+                return b"\1"
+        return package.payload
+
+    def _send(self, data: bytes) -> None:
         try:
-            self._socket.sendall(Package(kind, payload).bytes)
+            self._socket.sendall(data)
         except OSError as error:
-            raise CellError(f"Expected {self.where} to take a request, the connection is lost: {error}.") from error
+            raise CellError(f"Expected {self.where} to take what it is sent, the connection is lost: {error}.") from error
+
+    def _received(self) -> Iterator[Package]:
+        packages = Packages()
         while True:
-            for i, package in enumerate(self._waiting):
-                if package.kind is kind:
-                    return self._waiting.pop(i).payload
-                if kind is Kind.START and package.kind is Kind.DATA:  # its first data can overtake its yes
-                    return b"\1"
-            self._receive()
-
-    def _receive(self) -> None:
-        try:
-            piece = self._socket.recv(PIECE)
-        except OSError as error:
-            silent = isinstance(error, TimeoutError)
-            what = f"it was silent for {self._socket.gettimeout():g} s" if silent else f"the connection is lost: {error}"
-            raise CellError(f"Expected packages from {self.where}, {what}{self._why()}.") from error
-        if not piece:
-            raise CellError(f"Expected packages from {self.where}, it hung up{self._why()}.")
-        for package in self._packages.feed(piece):
-            if package.kind is Kind.TEXT:
-                length, words = int.from_bytes(package.payload[:1]), package.payload[1:]
-                self.said = words[:length].decode("utf-8", "replace")
-            elif package.kind is not Kind.PAUSE:
-                self._waiting.append(package)
-
-    def _why(self) -> str:
-        return f' (it said: "{self.said[:200]}")' if self.said else ""
+            try:
+                piece = self._socket.recv(PIECE)
+            except OSError as error:
+                silent = f"it was silent for {self._socket.gettimeout():g} s"
+                what = silent if isinstance(error, TimeoutError) else f"the connection is lost: {error}"
+                raise CellError(f"Expected packages from {self.where}, {what}{self._why}.") from error
+            if not piece:
+                raise CellError(f"Expected packages from {self.where}, it hung up{self._why}.")
+            for package in packages.feed(piece):
+                if package.kind is Kind.TEXT:
+                    said = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
+                    self._why = f' (it said: "{said[:200]}")'
+                else:
+                    yield package
 
 
 LATE_S = 0.02  # beyond the quickest package's way: ten packages
@@ -185,8 +169,8 @@ class Lateness:
         return way - self._quickest > LATE_S
 
 
-class RtdeStream:
-    """Reads in a thread of its own, so that no package waits for whoever uses them. Opened by `with`, or `open`.
+class RtdeStream(AbstractContextManager["RtdeStream"]):
+    """Reads in a thread of its own, so that no package waits for whoever uses them.
 
     Connecting for the first time raises CellError; a connection lost later is made again, for as long as it takes, and what
     was written last is written again, unless that was long ago, or the controller itself began anew: it knows nothing of
@@ -215,23 +199,21 @@ class RtdeStream:
         self._written: tuple[float, ...] | None = None
         self._written_at = 0.0
         self._client: RtdeClient | None = None
-        self._session = 0
+        self._session, self._again = 0, False  # connections before; whether this one has not told yet what was written
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._read, name=f"rtde {self.where}", daemon=True)
-        self._counts = dict.fromkeys(StreamReport.__dataclass_fields__, 0)
-
-    def open(self) -> RtdeStream:
+        self._counts = Counter[str]()
         for left in reversed(range(int(RELEASE_S / RETRY_S[0]) + 1)):
             try:
-                client = self._connect()
+                self._client = self._connect()
                 break
             except HeldError:  # an owner that has just gone is given time to be noticed as gone
                 if not left:
                     raise
                 self._closing.wait(RETRY_S[0])
-        self._client, self.columns = client, client.outputs.columns
+        assert self._client is not None  # it has raised
+        self.columns = self._client.outputs.columns
         self._thread.start()
-        return self
 
     def close(self) -> None:
         """Hang up, and end the thread."""
@@ -241,11 +223,7 @@ class RtdeStream:
             self._news.notify_all()
         if client is not None:
             client.close()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def __enter__(self) -> RtdeStream:
-        return self.open()
+        self._thread.join()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
@@ -260,8 +238,8 @@ class RtdeStream:
         with self._news:
             return StreamReport(**self._counts)
 
-    def after(self, position: int, timeout: float) -> tuple[list[Row], int]:
-        """The packages from a position on, at least one or, after `timeout` seconds, none; and the position after them.
+    def after(self, position: int, timeout: float) -> list[Row]:
+        """The packages from a position on, at least one or, after `timeout` seconds, none.
 
         CellError where they are no longer kept: nobody asked for a minute.
         """
@@ -269,7 +247,7 @@ class RtdeStream:
             self._news.wait_for(lambda: self._first + len(self._rows) > position or self._closing.is_set(), timeout)
             if (lost := self._first - position) > 0:
                 raise CellError(f"Expected to be asked within {KEPT_S:g} s, {lost} packages are lost; arm() begins anew.")
-            return self._rows[position - self._first :], self._first + len(self._rows)
+            return self._rows[position - self._first :]
 
     def write(self, values: Sequence[float] | None) -> None:
         """Set the inputs: now, or as soon as there is a connection again. None: what was written is not to be repeated."""
@@ -286,46 +264,39 @@ class RtdeStream:
                 self.trouble = str(error)
 
     def _read(self) -> None:
-        late, again = Lateness(), False
-        while not self._closing.is_set():
-            client = self._client
-            if client is None:
-                return
+        while (client := self._client) is not None:
+            late = Lateness()
             try:
-                rows = client.rows()
+                for values in client.rows():
+                    self._keep(Row(values, late.is_late(values[0], self._clock()), self._session))
             except CellError as error:
-                self._again(str(error))
-                late, again = Lateness(), True
-                continue
-            arrival = self._clock()
-            self._keep([Row(values, late.is_late(values[0], arrival), self._session) for values in rows])
-            with self._news:
-                if again and self._clock() - self._written_at < FRESH_S:
-                    self._send()
-            again = False
+                client.close()
+                self._connect_again(str(error))
 
-    def _keep(self, rows: list[Row]) -> None:
+    def _keep(self, row: Row) -> None:
         with self._news:
-            for one, next_ in pairwise([*self._rows[-1:], *rows]):
-                steps = round((next_.timestamp - one.timestamp) / self.step)
+            for last in self._rows[-1:]:
+                steps = round((row.timestamp - last.timestamp) / self.step)
                 self._counts["missing"] += max(steps - 1, 0)
                 self._counts["repeated"] += steps == 0
                 self._counts["restarts"] += steps < 0
                 self._written = None if steps < 0 else self._written  # it began anew: that was meant for before
-            self._counts["packages"] += len(rows)
-            self._counts["late"] += sum(row.late for row in rows)
-            self._rows += rows
+            self._counts["packages"] += 1
+            self._counts["late"] += row.late
+            self._rows.append(row)
             if len(self._rows) > 2 * self._most:
                 self._first += len(self._rows) - self._most
                 del self._rows[: -self._most]
+            if self._again and self._clock() - self._written_at < FRESH_S:
+                self._send()
+            self._again = False
             self._news.notify_all()
 
-    def _again(self, why: str) -> None:
+    def _connect_again(self, why: str) -> None:
+        """Connect, for as long as it takes; there is no connection where it is closed meanwhile."""
         wait, longest = RETRY_S
         with self._news:
-            lost, self._client, self.trouble = self._client, None, why
-        if lost is not None:
-            lost.close()
+            self._client, self.trouble = None, why
         while not self._closing.is_set():
             try:
                 client = self._connect()
@@ -335,9 +306,10 @@ class RtdeStream:
                 wait = min(2 * wait, longest)
                 continue
             with self._news:
-                self._client, self.trouble = client, ""
-                self._session += 1
-                self._counts["reconnects"] += 1
-            if self._closing.is_set():
-                client.close()
+                if self._closing.is_set():
+                    client.close()
+                else:
+                    self._client, self.trouble, self._again = client, "", True
+                    self._session += 1
+                    self._counts["reconnects"] += 1
             return
