@@ -4,8 +4,7 @@
 
 Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
 parity over every trace of the data set and random ones, bad ones and audits among them; parity while both learn from
-labels, stops and silence, under the pooled guarantee; damaged files, each of which must be refused. Ends with exit code 1
-where a decision differs or a damaged file is not refused.
+labels, stops and silence, under the pooled guarantee. Ends with exit code 1 where a decision differs.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ from rich.progress import track
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
 from dengine.datasets.importing import import_labelled, train_until_done
-from dengine.errors import ExportError
-from dengine.export import sum_file
 from dengine.export.onnx import export_onnx, load_onnx
 from dengine.records import Action
 from dengine.store import MemoryStore
@@ -133,37 +130,6 @@ def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path,
     return rows
 
 
-def damage(content: bytes, rng: np.random.Generator) -> bytes:
-    """A flipped bit, a cut end, or two different blocks of 512 bytes exchanged."""
-    kind = int(rng.integers(3))
-    at = int(rng.integers(len(content)))
-    if kind == 0:
-        return content[:at] + bytes([content[at] ^ (1 << int(rng.integers(8)))]) + content[at + 1 :]
-    if kind == 1:
-        return content[:at]
-    blocks = [content[i : i + 512] for i in range(0, len(content), 512)]
-    while b"".join(blocks) == content:
-        i, j = rng.integers(len(blocks), size=2)
-        blocks[i], blocks[j] = blocks[j], blocks[i]
-    return b"".join(blocks)
-
-
-def taken_damaged(file: Path, n: int, folder: Path, cell: Path | None) -> int:
-    """Damaged files, of n, that were not refused, by Python or by the cell program."""
-    rng, content, copy, taken = np.random.default_rng(2), file.read_bytes(), folder / file.name, 0
-    sum_file(copy).write_bytes(sum_file(file).read_bytes())
-    for _ in track(range(n), description="damaging"):
-        copy.write_bytes(damage(content, rng))
-        try:
-            load_exported(copy)
-            taken += 1
-        except ExportError:
-            pass
-        if cell is not None:
-            taken += subprocess.run([cell, copy], input=b"", capture_output=True, check=False).returncode != 1
-    return taken
-
-
 def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
     """Every row of the table."""
     data, rng = load_dataset(args.data), np.random.default_rng(1)
@@ -195,8 +161,7 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
         rows.append(finding("onnxruntime differs in", differing(found, model.decide_many(new))))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
     rows += compare_learning(data, Recipe.load(args.reducer), args.retrains, folder, args.cell)
-    not_refused = taken_damaged(file, args.damaged, folder / "damaged", args.cell)
-    return [*rows, finding(f"not refused of {args.damaged} damaged files", not_refused, "", "0")]
+    return rows
 
 
 def main() -> None:
@@ -206,12 +171,10 @@ def main() -> None:
     parser.add_argument("--retrains", type=int, default=3, help="at most, each within the recipe's budget")
     parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
     parser.add_argument("--calls", type=int, default=5000, help="calls timed")
-    parser.add_argument("--damaged", type=int, default=500, help="damaged files tried")
     parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")
     parser.add_argument("--no-onnx", dest="onnx", action="store_false", help="leave onnxruntime out")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "damaged").mkdir()
         rows = measure(args, Path(folder))
     tell(rows, f"Exported decision: {args.reducer} on {args.data}", args.out / "benchmark_export.csv", width=100)
     sys.exit(any(row["target"] == "0" and row["value"] > 0 for row in rows))

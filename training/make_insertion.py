@@ -6,6 +6,7 @@ python training/make_insertion.py --out dengine/data
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from collections.abc import Iterable
 from dataclasses import fields
@@ -29,6 +30,7 @@ from dengine.datasets import Dataset, load_dataset
 SUCCESSES, FAILURES = 803, 700  # as in the paper
 CYCLES = 2000  # simulated, of which the first of each label are kept
 SEED = 1503  # not 0: a cell run on the default seed must not meet the bundled parts again
+CARD = Path(__file__).parents[1] / "dengine" / "data" / "insertion.md"
 SHOWN = 30  # traces a cause
 NEAR_MM = 4.0
 BEFORE_CONTACT = 80  # samples; even the longest wrong part starts further from the rim than 0.16 s
@@ -197,125 +199,30 @@ def halved_step(n: int, seed: int, n_jobs: int) -> str:
     )
 
 
-CARD = """# `insertion`: {n} simulated peg insertions
-
-**Simulated.** Every trace was computed with MuJoCo {mujoco}; none was recorded on a robot. The counts are those of the
-paper that the method comes from ({successes} successes, {failures} failures); its own recordings are not public.
-
-    from dengine import load_dataset
-    data = load_dataset("insertion")        # X (1503, 1000) float32 newtons, y (1503,), cause (1503,)
-
-## How it was made
-
-    python training/make_insertion.py --out dengine/data --seed {seed}   # this file, its pictures and this card
-    dengine simulate --n {cycles} --seed {seed} --out traces.npz         # the same cycles, before the choice below
-
-The nominal `SimulatedCell` ran until it had {successes} successes and {failures} failures, which took {cycles} cycles;
-the first ones of each label were kept, in the order of their cycles. Trace *i* of a seed depends on (seed, cycle) alone,
-not on the number of processes; another MuJoCo or processor may differ in the last digits. The label is the final height
-alone: a success rests within ±{tolerance} mm of its seat.
-
-A gripper holds a square part (16 mm wide, 40 mm long) by dry friction, on a wrist of six springs, and pushes it down
-into a chamfered hole 12 mm deep, at a set speed, until it reaches its target or the force limit. A force sensor between
-wrist and tool, zeroed with the part in hand, is read at 500 Hz for 2 s. Pushing is positive.
-
-| key | what |
-| --- | --- |
-| `X` | ({n}, 1000) int16; times `scale` it is the z-force in `unit` (N) at `rate_hz` |
-| `y` | 1 = success, 0 = failure |
-| `cause` | why a part failed; `none` for a success |
-| `height_mm` | of the part's top over its seated height; −40 where there was no part |
-| `cycle` | of the cell, with this `seed`, that made the trace |
-| `conditions`, `condition_names` | everything that was drawn for it, physical and of the sensor |
-
-## What it looks like
-
-![Thirty simulated traces of each cause](insertion_causes.png)
-
-Real insertions of this kind look so: a failure meets the rim early and climbs to a plateau of 25 to 65 N, or slides
-off; a success shows a small bump at the chamfer and meets the bottom late, at 10 to 50 N.
-
-{causes}
-
-A cause names the fault that was drawn where it took effect, else where the part came to rest: on the rim or its chamfer
-(rim contact), in the hole (wedging), within 4 mm of its seat (stuck), or pushed up in the gripper by more than 1 mm (slip).
-A drawn fault does not make a failure: thin debris, or a weak grip on a well aligned part, ends as a success.
-
-## How hard it is
-
-Five folds, shuffled, three times (mean ± standard deviation over the three):
-
-{hardness}
-
-The undecided zone is physical, no label was flipped:
-
-{ambiguity}
-
-Short wrong parts go in like right ones and only the height tells; a part on a chip one millimetre thick meets the
-bottom hardly earlier than a part that was gripped one millimetre lower; a part that drags along the wall seats or sticks.
-
-![Final heights](insertion_heights.png)
-
-## No shortcut
-
-Accuracy of a random forest that sees one thing only, five folds. What comes before the first contact tells nothing of
-the outcome. The last two rows are physics, and may tell something:
-
-{shortcuts}
-
-Noise, ripple, bias, drift, quantisation and dropped samples are drawn from a stream of random numbers of their own,
-which neither the world nor the label ever reads.
-
-## The time step
-
-MuJoCo steps 0.5 ms. At 0.25 ms, {step}.
-
-## The scenarios of the simulated cell
-
-The data set is nominal. `simulate(n, scenario=...)` and `SimulatedCell(scenario=...)` know three more: `wear` (friction
-grows), `variant` (from half way on another part: heavier, tighter, with a smaller chamfer) and `bias_jump` (half way the
-sensor's offset jumps).
-
-![What each scenario changes in the force](insertion_scenarios.png)
-
-## What it is not
-
-One geometry of part and hole, rigid bodies, Coulomb friction, no vibration of the arm beyond a ripple. Square
-edges against a chamfer chatter more than rounded ones. A detector's accuracy here is no promise for a real cell.
-
-## Parameters of the nominal cell
-
-Two numbers are the ends of a uniform draw; `_sd` is the standard deviation of a normal one. Units are in the names;
-`dengine.cells.parameters.CellParameters` says what each means.
-
-{parameters}
-"""
+def with_table(card: str, new: str) -> str:
+    """The card with this table in place of that of the same head."""
+    head = re.escape(new.split("\n", 1)[0])
+    card, n = re.subn(rf"^{head}\n(\|.*\n)+", lambda found: f"{new}\n", card, flags=re.MULTILINE)
+    if n != 1:
+        raise SystemExit(f"Expected one table in {CARD} with the head {head}, found {n}.")
+    return card
 
 
 def write_card(out: Path, steps: int, jobs: int) -> str:
-    """The pictures and the card of the data set in this folder, every figure measured here and now."""
+    """The pictures and the card of the data set in this folder: its words, and every figure measured here and now."""
     data = load_dataset(out / "insertion.npz")
     with np.load(out / "insertion.npz", allow_pickle=False) as stored:
-        heights_mm, seed, cycles = stored["height_mm"], int(stored["seed"]), int(stored["cycle"][-1]) + 1
+        heights_mm = stored["height_mm"]
     wrong = predicted(data.X, data.y, forest()) != data.y
     draw_causes(data, out / "insertion_causes.png")
     draw_heights(data, heights_mm, wrong, out / "insertion_heights.png")
     draw_scenarios(out / "insertion_scenarios.png", n_jobs=jobs)
-    text = CARD.format(
-        n=len(data),
-        mujoco=mujoco.__version__,
-        successes=SUCCESSES,
-        failures=FAILURES,
-        seed=seed,
-        cycles=cycles,
-        tolerance=CellParameters().height_tolerance_mm,
-        causes=table("cause, traces", [(said(cause), np.sum(data.cause == cause)) for cause in CAUSES]),
-        hardness=hardness(data),
-        ambiguity=ambiguity(heights_mm, wrong),
-        shortcuts=shortcuts(data),
-        step=halved_step(steps, seed, jobs),
-        parameters=parameter_table(),
-    )
+    text = CARD.read_text(encoding="utf-8")
+    causes = table("cause, traces", [(said(cause), np.sum(data.cause == cause)) for cause in CAUSES])
+    for measured in (causes, hardness(data), ambiguity(heights_mm, wrong), shortcuts(data), parameter_table()):
+        text = with_table(text, measured)
+    text = re.sub(r"MuJoCo \d[\d.]*", f"MuJoCo {mujoco.__version__}", text)
+    text = re.sub(r"At 0\.25 ms, .*", f"At 0.25 ms, {halved_step(steps, SEED, jobs)}.", text)
     (out / "insertion.md").write_text(text, encoding="utf-8")
     return text
 
@@ -324,16 +231,15 @@ def main() -> None:
     """Write insertion.npz, insertion.md and the card's pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("dengine/data"), help="folder to write to")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the simulated cell")
     parser.add_argument("--steps", type=int, default=200, help="insertions to repeat at half the time step")
     parser.add_argument("--jobs", type=int, default=-1, help="processes; -1: one a core")
     parser.add_argument("--card-only", action="store_true", help="keep the traces that are there; measure and draw anew")
     args = parser.parse_args()
     if not args.card_only:
         start = time.perf_counter()
-        insertions = simulate(CYCLES, args.seed, n_jobs=args.jobs)
+        insertions = simulate(CYCLES, SEED, n_jobs=args.jobs)
         print(f"{time.perf_counter() - start:.0f} s for {CYCLES} cycles")
-        save_insertions(args.out / "insertion.npz", first_of_each(insertions, SUCCESSES, FAILURES), args.seed, force=True)
+        save_insertions(args.out / "insertion.npz", first_of_each(insertions, SUCCESSES, FAILURES), SEED, force=True)
     print(write_card(args.out, args.steps, args.jobs))
 
 

@@ -55,7 +55,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
     "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
     "cmake --build build/cpp": "--parallel 2",
-    "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20 --damaged 5",
+    "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20",
 }
 NOT_RUN = ("make ", ". .venv", "python -m pip")  # this very suite, and what installs
 CPP = ("cmake", "build/")

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from sklearn.decomposition import PCA
 
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
@@ -107,24 +106,22 @@ def test_the_curves_draw_the_lower_bound_and_the_tolerance_and_count_the_errors(
 # ---------------------------------------------------------------------------------------------------------- maps
 
 
-def ball_of(figure: Figure) -> Circle:
-    (ball,) = figure.axes[0].patches
-    return ball
-
-
 def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> None:
     figure = embedding_map(MANY_RIGHT)
+    (ball,) = figure.axes[0].patches
     assert [axes.get_aspect() for axes in figure.axes] == [1.0, 1.0]
-    assert ball_of(figure).get_radius() == RECIPE.radius
-    np.testing.assert_array_equal(ball_of(figure).get_center(), MANY_RIGHT.position[-1])
+    assert ball.get_radius() == RECIPE.radius
+    np.testing.assert_array_equal(ball.get_center(), MANY_RIGHT.position[-1])
+    assert "root mean square radius = 1" in figure.axes[0].get_ylabel()
+    grown = replay_of(["accept"] * 50, [1] * 50, recipe=replace(RECIPE, fraction=0.3))
+    assert len(embedding_map(grown).axes[0].patches) == 0  # one that grows has no radius to draw
 
 
 def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() -> None:
-    figure = embedding_map(replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05)))
-    assert figure.axes[0].get_xlabel() == "predicted probability of success"
-    assert "for the eye" in figure.axes[0].get_ylabel()
-    assert ball_of(figure).get_radius() == 0.05
-    assert "root mean square radius = 1" in embedding_map(MANY_RIGHT).axes[0].get_ylabel()
+    left = embedding_map(replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05))).axes[0]
+    assert left.get_xlabel() == "predicted probability of success"
+    assert "for the eye" in left.get_ylabel()
+    assert [ball.get_radius() for ball in left.patches] == [0.05]
 
 
 @pytest.mark.parametrize(
@@ -141,11 +138,6 @@ def test_a_reducer_says_whether_its_axis_is_a_probability(reducer: Any, probabil
     assert is_probability(Recipe(reducer)) is probability
 
 
-def test_a_ball_that_grows_has_no_radius_to_draw() -> None:
-    grown = replay_of(["accept"] * 50, [1] * 50, recipe=replace(RECIPE, fraction=0.3))
-    assert len(embedding_map(grown).axes[0].patches) == 0
-
-
 # ---------------------------------------------------------------------------------------------------------- runs
 
 
@@ -155,20 +147,15 @@ def log_of(clock_s: np.ndarray | None) -> Replay:
     return by_hand(action, truth, stopped=np.arange(100) == 89, clock_s=clock_s)
 
 
-def test_a_run_is_summed_up_by_stretches_that_add_up() -> None:
+def test_a_run_is_summed_up_by_stretches_that_add_up_and_by_an_hour_where_there_is_a_clock() -> None:
     log = log_of(np.cumsum(np.full(100, 36.0)))
     total, parts = log.stretch(), log.stretches(7)
     for name in ("verified", "accepted", "rejected", "false_positive", "false_negative", "stops"):
         assert total[name] == sum(part[name] for part in parts)
     assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
     assert total["parts_per_hour"] == pytest.approx(88.0)  # 59 verified good and 29 accepted good in an hour
-
-
-def test_a_cell_without_a_clock_has_no_rate_and_one_panel_less() -> None:
-    log = log_of(None)
-    assert log.stretch()["parts_per_hour"] is None
-    assert len(run_picture(log).axes) == 2
-    assert len(run_picture(log_of(np.arange(1.0, 101.0))).axes) == 3
+    assert log_of(None).stretch()["parts_per_hour"] is None
+    assert [len(run_picture(each).axes) for each in (log, log_of(None))] == [3, 2]
 
 
 def test_a_run_that_verified_every_part_lies_on_its_own_baseline() -> None:

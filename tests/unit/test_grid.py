@@ -51,20 +51,30 @@ def test_a_kept_replay_comes_back_whole(data: Dataset, tmp_path: Path) -> None:
     assert back.summary() == pytest.approx(played.summary(), nan_ok=True)
 
 
-def test_another_setting_seed_length_feedback_or_data_is_another_replay(data: Dataset, tmp_path: Path) -> None:
+def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_name_is_none(
+    data: Dataset, tmp_path: Path
+) -> None:
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
-    others = [
-        replace(task, seed=2),
-        replace(task, cycles=61),
-        replace(task, confirm=True),
-        replace(task, shuffle=False),
-        replace(task, contender=who.with_policy(alpha=0.2)),
+    asked = [
+        who.with_policy(alpha=0.2),
+        replace(RECIPE, radius=0.4),
+        Recipe(PCA(2), radius=0.5),
+        Recipe(PCA(2, whiten=True), radius=0.5),
+        *(FunctionTransformer(function) for function in (np.abs, np.sqrt)),
+        *(FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))),
+        "knn",
+        replace(Contender.load("knn"), params={"k": 3}),
     ]
-    paths = {kept.path(each) for each in [task, *others]}
-    flipped = replace(data, y=1 - data.y)
-    assert len(paths | {KeptReplays(tmp_path, flipped).path(task)}) == 7
+    others = [replace(task, **change) for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})]
+    others += [replace(task, contender=Contender.load(one)) for one in asked]
+    flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
+    assert len({flipped, *(kept.path(each) for each in [task, *others])}) == 2 + len(others)
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
+    alike = [Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0) for _ in range(2)]
+    assert kept.path(alike[0]) == kept.path(alike[1])
+    with pytest.raises(SettingError, match="define it in a module"):
+        kept.path(Task(Contender.load(FunctionTransformer(lambda x: x)), 0))
 
 
 @pytest.mark.parametrize("within", [False, True])
@@ -236,26 +246,3 @@ def test_transformers_are_named_by_their_settings_and_refused_where_these_read_a
         names([PCA(2), PCA(2)])
     one = Recipe(absolute)
     assert names([one, one.with_policy(stops="all")]) == ["Pipeline", "Pipeline"]
-
-
-def test_the_description_changes_with_every_setting_that_decides(data: Dataset, tmp_path: Path) -> None:
-    one = Contender.load(PLAIN)
-    others = [
-        Contender.load(replace(PLAIN, radius=0.4)),
-        one.with_policy(alpha=0.2),
-        Contender.load(Recipe(PCA(2), radius=0.5)),
-        Contender.load(Recipe(PCA(2, whiten=True), radius=0.5)),
-        Contender.load(FunctionTransformer(np.abs)),
-        Contender.load(FunctionTransformer(np.sqrt)),
-        Contender.load(FunctionTransformer(np.add, kw_args={"x2": np.zeros(3)})),
-        Contender.load(FunctionTransformer(np.add, kw_args={"x2": np.ones(3)})),
-        Contender.load("knn"),
-        replace(Contender.load("knn"), params={"k": 3}),
-    ]
-    said = [Task(each, 0).description for each in [one, *others]]
-    assert len(set(said)) == len(said)
-    assert Task(replace(one, name="another"), 0).description == said[0]
-    with pytest.raises(SettingError, match="define it in a module"):
-        _ = Task(Contender.load(FunctionTransformer(lambda x: x)), 0).description
-    alike = [Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))) for _ in range(2)]
-    assert Task(alike[0], 0).description == Task(alike[1], 0).description
