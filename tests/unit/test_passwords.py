@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sqlalchemy as sa
-from click.testing import CliRunner
 
 from dengine import DataEngine
 from dengine import errors as all_errors
@@ -19,6 +18,7 @@ from dengine.errors import DengineError, StoreError, shortened, without_password
 from dengine.records import plain
 from dengine.store import SqlStore
 from dengine.store.connections import make_engine
+from tests.support.command_line import dengine, well
 
 SECRET = "hunter2"
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES", "")
@@ -61,38 +61,29 @@ def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
-VERBS = {  # every verb that takes a store
-    "status": ["status", NOBODY],
-    "status as JSON": ["status", NOBODY, "--json"],
-    "train": ["train", "--data", "insertion", "--store", NOBODY],
-    "run": ["run", "--cell", "replay", "--cycles", "1", "--store", NOBODY],
-    "serve": ["serve", "--port", "0", "--store", NOBODY],
-    "export": ["export", NOBODY, "--out", "{out}"],
-    "import-labels": ["import-labels", "{journal}", "--store", NOBODY],
-    "explain": ["explain", NOBODY, "last"],
-    "correct": ["correct", NOBODY, "a", "bad"],
-    "forget": ["forget", NOBODY, "a"],
-    "rollback": ["rollback", NOBODY, "1"],
-    "policy": ["policy", NOBODY, "--alpha", "0.1", "--shadow", "on"],
-    **{verb: [verb, NOBODY] for verb in ("history", "verify", "retrain")},
-    "an unknown verb": [NOBODY],
-    "an unknown option": ["status", f"--store={NOBODY}"],
-    "a journal that is none": ["import-labels", NOBODY, "--store", "a.db"],
-    "too many words": ["status", "a.db", NOBODY],
-    "data that is none": ["data", NOBODY],
-}
+CALLS = [  # every verb that takes a store, and what click repeats
+    f"status {NOBODY}", f"status {NOBODY} --json", f"train --data insertion --store {NOBODY}",
+    f"run --cycles 1 --store {NOBODY}", f"serve --port 0 --store {NOBODY}", f"export {NOBODY} --out model.ts",
+    f"import-labels journal.csv --store {NOBODY}",
+    f"explain {NOBODY} last", f"correct {NOBODY} a bad", f"forget {NOBODY} a", f"rollback {NOBODY} 1",
+    f"policy {NOBODY} --alpha 0.1 --shadow on", f"history {NOBODY}", f"verify {NOBODY}", f"retrain {NOBODY}",
+    NOBODY, f"status --store={NOBODY}", f"import-labels {NOBODY} --store a.db",
+    f"status a.db {NOBODY}", f"data {NOBODY}",
+]  # fmt: skip
 
 
 def test_every_verb_that_takes_a_store_is_tried() -> None:
     takes = {name for name, verb in main.commands.items() if any(option.name == "store" for option in verb.params)}
-    assert takes <= {words[0] for words in VERBS.values()}
+    assert takes <= {words.split()[0] for words in CALLS}
 
 
-@pytest.mark.parametrize("words", VERBS.values(), ids=VERBS)
-def test_no_verb_shows_the_password_of_what_it_cannot_use(words: list[str], tmp_path: Path) -> None:
-    (tmp_path / "journal.csv").write_text("1,0.0\n")
-    paths = {"{out}": str(tmp_path / "model.ts"), "{journal}": str(tmp_path / "journal.csv")}
-    done = CliRunner().invoke(main, [paths.get(word, word) for word in words])
+@pytest.mark.parametrize("words", CALLS)
+def test_no_verb_shows_the_password_of_what_it_cannot_use(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("journal.csv").write_text("1,0.0\n")
+    done = dengine(*words.split())
     assert done.exit_code in (1, 2)
     assert SECRET not in done.output
 
@@ -127,18 +118,11 @@ def test_the_environment_gives_the_password_and_a_used_store_is_shown_without_it
         for x, y in zip(data.X, data.y, strict=True):
             engine.report(engine.decide(x).id, y)
     np.savez(table := tmp_path / "data.npz", X=data.X[:40] + 1, y=data.y[:40])
-    shown = ""
-    for words in (
-        ["status", url],
-        ["train", "--data", str(table), "--store", url, "--retrains", "1"],
-        ["export", url, "--out", str(tmp_path / "model.ts")],
-    ):
-        for form in ([], ["--json"]):
-            done = CliRunner().invoke(main, words + form)
-            assert done.exit_code == 0, done.output
-            assert SECRET not in done.output
-            shown += done.output
-    assert "***" in shown
+    for words in (("status", url), ("train", "--data", table, "--store", url, "--retrains", 1)):
+        for form in ((), ("--json",)):
+            shown = well(*words, *form).output
+            assert SECRET not in shown
+            assert "***" in shown
     with admin.connect() as connection:
         connection.execute(sa.text(f"DROP DATABASE {name}"))
     admin.dispose()
