@@ -1,26 +1,19 @@
 """A robot's force over RTDE, sample for sample: what was sent, what was recorded, and what was said to be missing.
 
     python training/benchmark_recording.py --insertions 300 --out out/
-    python training/benchmark_recording.py --insertions 20 --speed 20 --ur-rtde 10
+    python training/benchmark_recording.py --insertions 20 --speed 20
 
 A controller without a robot (`FakeController`) plays bundled insertions at 500 Hz over TCP on this machine, in real time:
 300 of them take ten minutes and a half. Packages are dropped, held back and sent in one burst, sent twice; connections are
 closed, in the middle of a package too, or broken by what is no RTDE, each at a random sample. Then a `DataEngine` drives
-the same cell, undisturbed, and its decisions are compared with those of a replay. --ur-rtde measures ur_rtde's own recorder
-for so many seconds against the same controller.
+the same cell, undisturbed, and its decisions are compared with those of a replay.
 """
 
 from __future__ import annotations
 
-import csv
-import subprocess
-import sys
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,15 +29,6 @@ from dengine.experiments.tables import write_csv
 SHARE = 0.5  # of the insertions that something goes wrong in
 LONGEST = {"drop": 60, "hold": 150}  # cycles
 KINDS = ("drop", "hold", "close", "half", "garbage", "repeat")
-MINE = "127.30.0.4"  # an address of the loopback: ur_rtde's port is fixed
-THEIRS = """
-import sys, time, rtde_receive
-receive = rtde_receive.RTDEReceiveInterface(sys.argv[1], 500.0)
-receive.startFileRecording(sys.argv[2], ["timestamp", "actual_TCP_force"])
-time.sleep(float(sys.argv[3]))
-receive.stopFileRecording()
-receive.disconnect()
-"""
 
 
 def troubles(insertions: int, samples: int, rng: np.random.Generator) -> list[Trouble]:
@@ -110,31 +94,6 @@ def compare(data: Dataset, recipe: Recipe, cycles: int) -> str:
     return f"{recipe.name}: {differing} of {cycles} decisions differ from the replay's ({told})."
 
 
-class Count:
-    """Shows a number that grows by one each control cycle."""
-
-    place = None
-
-    def __init__(self) -> None:
-        self.cycle = 0
-
-    def step(self, inputs: dict[str, float]) -> dict[str, float]:
-        """The next number, as the force along z."""
-        self.cycle += 1
-        return {"actual_TCP_force[2]": float(self.cycle)}
-
-
-def theirs(seconds: float) -> str:
-    """ur_rtde's recorder on the same controller, undisturbed: what its file holds."""
-    with tempfile.TemporaryDirectory() as folder, FakeController(Count(), host=MINE, port=30004):
-        path = Path(folder) / "theirs.csv"
-        subprocess.run([sys.executable, "-c", THEIRS, MINE, str(path), str(seconds)], check=True)
-        with path.open(encoding="utf-8") as file:
-            steps = np.diff([float(row["actual_TCP_force_2"]) for row in csv.DictReader(file)])
-    again, skipped = int((steps == 0).sum()), int((steps[steps > 1] - 1).sum())
-    return f"ur_rtde's file of {len(steps) + 1} rows: {skipped} packages are not in it, {again} rows repeat the one before."
-
-
 def counted(found: pd.DataFrame) -> list[dict[str, Any]]:
     """A row a kind of trouble."""
     columns = ["not_sent", "recorded", "differing", "unreported", "invented", "late", "repeated", "reconnects"]
@@ -149,10 +108,7 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=1.0, help="against real time; 0: as fast as it is read")
     parser.add_argument("--recipes", default="pca", help="with commas between; each is compared with a replay")
     parser.add_argument("--seed", type=int, default=0, help="of the faults")
-    parser.add_argument("--ur-rtde", type=float, default=0.0, metavar="SECONDS", help="measure ur_rtde's recorder too")
     asked = parser.parse_args()
-    if asked.ur_rtde > 0 and find_spec("rtde_receive") is None:
-        parser.error('expected ur_rtde for --ur-rtde, it is not installed: pip install "dengine[ur]"')
     data = load_dataset("insertion", asked.samples)
     wrong = troubles(asked.insertions, data.X.shape[-1], np.random.default_rng(asked.seed))
     took, found = wall_time(record, data, asked.insertions, asked.speed or None, wrong)
@@ -160,8 +116,6 @@ def main() -> None:
     print(f"{int(found.start_unseen.sum())} starts fell into a gap: no sample's place in those traces is known.")
     for name in asked.recipes.split(","):
         print(compare(data, Recipe.load(name).with_policy(**POLICY), asked.insertions))
-    if asked.ur_rtde > 0:
-        print(theirs(asked.ur_rtde))
     if asked.out is not None:
         print(f"Wrote {write_csv(found, asked.out / 'recording.csv', force=True)}")
 

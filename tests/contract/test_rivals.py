@@ -14,7 +14,7 @@ from dengine import Action, DataEngine, Policy, Recipe, replay, wilson_interval
 from dengine.errors import SettingError
 from dengine.experiments.rivals import RIVALS, Rival, make_rival
 from dengine.experiments.rivals.base import segment_means
-from dengine.experiments.rivals.bounded import (
+from dengine.experiments.rivals.methods import (
     BANDWIDTHS,
     chosen_bandwidth,
     guaranteed_threshold,

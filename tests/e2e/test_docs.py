@@ -49,8 +49,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --samples 100",
     "python training/benchmark_endurance.py": "--cycles 120 --every 60 --recipe pca --samples 100",
-    "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100 --ur-rtde 0",
-    "python training/check_cost_choice.py": "--data small.npz --parts 40 --repeats 2 --escapes 60 --n-jobs 1",
+    "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100",
     "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
     "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
     "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant

@@ -90,11 +90,3 @@ def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, mo
     monkeypatch.setattr(SqlStore, "put_version", slow)
     row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
     assert row["retrain_p50_s"] >= 0.4
-
-
-def test_a_choice_by_cost_is_tried_on_the_parts_that_it_did_not_see(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ("--data", tiny, "--parts", 30, "--repeats", 2, "--escapes", "30,60", "--n-jobs", 1, "--out", tmp_path)
-    said = run("check_cost_choice", *words)
-    assert "2 sets of 30 parts, 2 shuffles, 4 choices" in said
-    rows = (tmp_path / "cost_choice.csv").read_text(encoding="utf-8").splitlines()
-    assert len(rows) == 1 + 2 * 4

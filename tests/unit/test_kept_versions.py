@@ -11,7 +11,7 @@ import pytest
 
 from dengine import DataEngine, Dataset
 from dengine.errors import StoreError
-from dengine.experiments.rivals.baselines import AgreeingNeighbours
+from dengine.experiments.rivals.methods import AgreeingNeighbours
 from dengine.records import RetrainReport
 from dengine.store import MemoryStore, SqlStore, Store
 from dengine.store.records import KEEP, keeps_state
