@@ -1,6 +1,6 @@
 """Decisions that must never change by accident, most of the default engine: made once, kept, and played again by the test.
 
-    python tests/golden/golden.py tests/golden/default    # makes them anew; only where a change of decisions is meant
+    OMP_NUM_THREADS=1 python tests/golden/golden.py tests/golden/default    # makes them anew; only where that is meant
 
 Novelty is on, as nobody who names no recipe turns it off. Everything here goes through names that `dengine` itself
 exports, so that the same lines run before and after. Only decisions are kept, no store and no exported file: their forms
