@@ -303,6 +303,7 @@ class DataEngine:
         if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
             if self.agree_on(spec, inferred=True) != spec:  # a peer's trace came first
                 return as_agreed(trace, self.trace, False)
+            self._versions.template.look_ahead_safely(x[None])  # what will answer is compiled before there is much to do
         elif self._settings.waiting:
             self._settings.save()
         return x

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ..folds import COIN_BITS, MIX, audit_salt
-from ..model.compiled import NOVEL, Predictor
+from ..model.neighbours import NOVEL, Predictor
 from ..records import FITS, REASONS, Reason, TraceSpec
 from ..traces import TraceGate, fitted
 

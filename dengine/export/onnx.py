@@ -29,7 +29,7 @@ from ..decision.references import FARTHEST
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
-from ..model.compiled import NOVEL
+from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
 from .bundle import (

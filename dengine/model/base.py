@@ -181,7 +181,7 @@ class EngineModel(ABC):
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
         """`look_ahead`, or nothing where it fails."""
-        _guarded(lambda: self.look_ahead(X), 0, "the traces of the store could not be looked at ahead of a retrain")
+        _guarded(lambda: self.look_ahead(X), 0, "traces could not be looked at ahead of a retrain")
 
     def tell_safely(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""

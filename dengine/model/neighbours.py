@@ -1,41 +1,150 @@
-"""The model prediction: reducer, references and rule together, with honest counting.
+"""The model prediction: reducer, references and rule together, with honest counting; and the module that answers.
 
 A label may be counted for a query only in an embedding that never saw that label. So the reducer spans K spaces, fold k's
 references live in space k, a query is embedded in all K, and its counts are summed.
-"""
 
-from __future__ import annotations
+`Predictor` is what the engine asks, and what export saves: `export.decision` puts the trace gate before it and the audits'
+coin behind it.
+"""
 
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import reduce
 from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
+from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule
+from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, script
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
-from ..records import ACTIONS, REASONS, TraceSpec, as_labels, as_success
+from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
 from ..reducers import make_reducer, reducer_of
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, part, space_scale
 from ..reducers.cross_fitting import as_reducer
 from ..traces import as_traces
 from .base import Embedding, EngineModel, Exportable, Prediction
-from .compiled import CompiledPredictor, compile_predictor
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
 SUSPICIOUS = 0.05  # share of such traces
+NOVEL = REASONS.index(Reason.NOVEL)
+KINDS = 16  # compiled modules that a process keeps
+Predicted = tuple[int, int, float, float, int, int, Tensor]
+
+
+class Predictor(nn.Module):
+    """Encoder, scale, novelty, references and rule as one module; compiles where the rule does.
+
+    encoder : (B, C, T) -> (B, K, d).
+    scale : (K,) what each space is divided by.
+    """
+
+    scale: Tensor
+
+    def __init__(self, encoder: nn.Module, scale: Tensor, novelty: NoveltyGate, neighbours: RadiusNeighbours) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.register_buffer("scale", scale[:, None])
+        self.scaled = bool((scale != 1.0).any())
+        self.novelty = novelty
+        self.neighbours: RadiusNeighbours = neighbours
+        self.novel = NOVEL
+
+    @torch.jit.export
+    def embed(self, x: Tensor) -> Tensor:
+        """(C, T) one trace -> (K, d), scaled."""
+        z: Tensor = self.encoder(x.unsqueeze(0))[0]
+        return z / self.scale if self.scaled else z
+
+    @torch.jit.export
+    def add(self, point: Tensor, label: float, space: int, part: int) -> None:
+        """Make one labelled point (d,) of a part a reference of `space`."""
+        self.neighbours.ring.put(point, label, space, part)
+
+    @torch.jit.export
+    def n_references(self) -> int:
+        """References held."""
+        return self.neighbours.ring.size()
+
+    @torch.jit.export
+    def tell(self, lower: float, upper: float, success: bool, silent: int, novel: bool) -> None:
+        """Tell the rule what became of a part."""
+        self.neighbours.rule.observe(silent, novel)
+        self.neighbours.rule.tell(lower, upper, success)
+
+    @torch.jit.export
+    def safe_mode(self) -> int:
+        """Position in `SAFE_MODE` of the rule."""
+        return int(self.neighbours.rule.safe_mode())
+
+    def forward(self, x: Tensor, part: int = 0) -> Predicted:
+        """(C, T) one trace -> action, reason, lower, upper, n_success, n_failure, scaled embedding (K, d).
+
+        part : the hash of its part, which has no vote on itself; 0 for an unknown one.
+        """
+        z = self.embed(x)
+        if self.novelty(x):
+            return 0, self.novel, 0.0, 1.0, 0, 0, z
+        action, lower, upper, n_success, n_failure = self.neighbours(z, part)
+        return action, self.neighbours.reason(action), lower, upper, n_success, n_failure, z
+
+
+class InPython(nn.Module):
+    """The embedding of a reducer that has no module, UMAP for one."""
+
+    def __init__(self, reducer: Reducer) -> None:
+        super().__init__()
+        self.reducer = reducer
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) -> (B, K, d)."""
+        return torch.from_numpy(self.reducer.embed(x.numpy()))
+
+
+_COMPILED: dict[Any, Any] = {}  # a module of each structure: to script takes 24 ms and more, a copy of one 1 ms
+
+
+def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
+    """The compiled module of a predictor's structure, warm."""
+    plain = (bool, int, float, str, list)
+    structure = tuple(  # all that scripting reads of a module but its tensors' values
+        (
+            name,
+            type(module).__qualname__,
+            *sorted((key, repr(value)) for key, value in vars(module).items() if isinstance(value, plain)),
+            *((key, tuple(t.shape)) for key, t in module._buffers.items() if t is not None),
+        )
+        for name, module in eager.named_modules()
+    )
+    if (mould := _COMPILED.get(structure)) is None:
+        mould = script(eager)
+        with torch.inference_mode():
+            for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
+                mould(torch.zeros(trace_shape))
+        while len(_COMPILED) >= KINDS:
+            _COMPILED.pop(next(iter(_COMPILED)), None)
+        _COMPILED[structure] = mould
+    return mould
+
+
+def compiled(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
+    """A scripted module with another one's tensors, shared, not copied."""
+    module = copy.deepcopy(mould_of(eager, trace_shape))
+    for name, tensor in eager.named_buffers():
+        *path, leaf = name.split(".")
+        setattr(reduce(getattr, path, module), leaf, tensor)
+    return module
 
 
 class ModelPrediction(EngineModel):
@@ -66,7 +175,7 @@ class ModelPrediction(EngineModel):
         self.folds, self.name = folds, type(self.reducer).__name__
         self.rule = rule or self.classifier.policy().rule()
         self.spaces: Reducer = as_reducer(clone(self.reducer), folds)
-        self._compiled: CompiledPredictor | None = None
+        self._predictor: Any = None
         self._note = ""
 
     @classmethod
@@ -79,7 +188,7 @@ class ModelPrediction(EngineModel):
         return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
-    def user_model(self) -> ModelPrediction:  # itself: an attribute would be a circle
+    def user_model(self) -> "ModelPrediction":  # itself: an attribute would be a circle
         return self
 
     @property
@@ -133,32 +242,41 @@ class ModelPrediction(EngineModel):
         self.index.weigh()
         self._note = repeats_note(X, hashes)
         self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
-        self._compiled = None  # built by `prepare`, or when it is asked
+        self._predictor = None  # built by `prepare`, or when it is asked
         return self
 
     def look_ahead(self, X: NDArray[np.float32]) -> int:
-        return self.spaces.look_ahead(X)
+        """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
+        done, blank = self.spaces.look_ahead(X), self.spaces.blank(X)
+        if blank is not None and self.rule.scriptable and "index" not in vars(self):
+            gate = NoveltyGate(*X.shape[1:])
+            gate.asleep = not self.novelty
+            around = self.classifier.around(RadiusIndex(blank.dim, self.classifier.capacity), self.rule)
+            mould_of(Predictor(blank, torch.ones(self.n_spaces), gate, around).eval(), X.shape[1:])
+        return done
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule of an earlier model and, where it is alike, its compiled module; then warm up."""
+        """Take over the rule of an earlier model, and be compiled."""
         if isinstance(previous, ModelPrediction):
             self.rule, self.untold = previous.rule, previous.untold
-            self._compile(previous._compiled)
+            self._predictor = self._compile()
 
-    def _compile(self, mould: CompiledPredictor | None = None) -> CompiledPredictor:
-        around = self.classifier.around(self.index, self.rule)
-        self._compiled = compile_predictor(self.spaces, self.scale, self.gate, around, mould)
-        if self._compiled.structure is not None and (mould is None or mould.structure != self._compiled.structure):
-            for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
-                self.predict_one(np.zeros(self.trace_shape, dtype=np.float32))
-        return self._compiled
+    def _compile(self) -> Any:
+        around, encoder = self.classifier.around(self.index, self.rule), self.spaces.module()
+        scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable
+        if encoder is not None and compiles:
+            return compiled(Predictor(encoder, scale, self.gate, around).eval(), self.trace_shape)
+        encoder = InPython(self.spaces) if encoder is None else script(encoder)
+        return Predictor(encoder, scale, script(self.gate), script(around) if compiles else around).eval()
 
     @property
     def predictor(self) -> Any:
         """The module that answers, built where it is not yet; ValueError where nothing was fitted."""
         if "index" not in vars(self):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
-        return (self._compiled or self._compile()).predictor
+        if self._predictor is None:
+            self._predictor = self._compile()
+        return self._predictor
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Take in one labelled trace, (T,) or (C, T), as a reference."""
@@ -208,7 +326,7 @@ class ModelPrediction(EngineModel):
         """Another rule, and another module around the same references."""
         new, own = copy.copy(self), {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         new.classifier = clone(self.classifier).set_params(**own)
-        new.rule, new.untold, new._compiled = policy.rule(), False, None
+        new.rule, new.untold, new._predictor = policy.rule(), False, None
         return new
 
     def begin_safely_in(self, mode: int) -> None:
@@ -245,10 +363,10 @@ class ModelPrediction(EngineModel):
         """(n,) array of `Action`."""
         return np.array([p.action for p in self.predict_many(X)], dtype=object)
 
-    def successor(self) -> ModelPrediction:
+    def successor(self) -> "ModelPrediction":
         """A model to train next, warm from this one; all but the rule is its own, so this one goes on answering."""
         new = copy.copy(self)
-        new.spaces, new._compiled, new._note = copy.deepcopy(self.spaces), None, ""
+        new.spaces, new._predictor, new._note = copy.deepcopy(self.spaces), None, ""
         return new
 
     def defect(self) -> str:
@@ -277,7 +395,7 @@ class ModelPrediction(EngineModel):
             own = module.state_dict()  # shares its tensors with the module
             for name, value in part(state, prefix).items():
                 own[name].copy_(torch.from_numpy(np.array(value)))
-        self._compiled = None
+        self._predictor = None
         return self
 
     def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
@@ -291,7 +409,7 @@ class ModelPrediction(EngineModel):
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
-        return self.__dict__ | {"_compiled": None}
+        return self.__dict__ | {"_predictor": None}
 
 
 def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:

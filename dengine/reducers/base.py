@@ -55,10 +55,9 @@ class StopRule:
 
 @dataclass(frozen=True, slots=True)
 class FitReport:
-    """What an iterative fit says of itself: steps taken, and a held-out loss that no counted label chose (NaN: none)."""
+    """What a fit says of itself: the steps that it took, and what there is to tell."""
 
     n_steps: int = 0
-    holdout_loss: float = float("nan")
     note: str = ""
 
 
@@ -107,6 +106,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def look_ahead(self, X: Floats) -> int:
         """Do now what `train` on traces X (n, C, T) would begin with, as far as no label is read; of how many traces."""
         return 0
+
+    def blank(self, X: Floats) -> Any:
+        """A module as `module` gives once traces like X (n, C, T) are learned, with its dimension, `dim`; None: unknown."""
+        return None
 
     def embed(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, K, d) float32, every trace in every space."""

@@ -1,32 +1,43 @@
-"""Features of traces, which read no label: one set serves every fold. And what was computed of them, kept by trace.
+"""Features of traces, which read no label, and cross-fitted logistic heads over them: what conv and rocket share.
 
-A retrain computes features of new traces alone: they cost most, and do not change from one to the next.
+    x (B, C, T) -> features of a kind, standardised and clipped                                     (B, P)
+                -> W principal components: no label is read, so one set serves every fold           (B, W)
+                -> head k, a logistic regression on the labels outside fold k                       (B, K, d)
+
+In what answers the last two are one matrix. A retrain computes the features of new traces alone, finds the components anew
+where the traces have grown by half, and fits the heads from where they were.
 """
 
 import copy
-from collections.abc import Callable, Sequence
-from hashlib import sha1
+from collections.abc import Mapping
 from itertools import combinations
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
 from ..errors import SettingError
-from .base import Floats
+from ..folds import content_fold
+from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, part, seed_of
 
-# Weights (m, P), biases (m,) of scores on features as they were -> those that say the same on features as they are.
-Carry = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 TAPS = 9  # of MiniRocket's kernels; 84 = 9 choose 3 ways to place its three 2s among -1s
+MIN_TRACES = 20  # that an engine's first model is trained on
+FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, they would hold all parts for alike
+TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
+GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
+VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
+CHUNK = 64  # traces embedded at a time: what they need stays in the cache
+SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 
 
 class Features(nn.Module):
-    """(B, C, T) raw traces -> (B, P) standardised features; holds every constant it needs, and reads no label.
-
-    A kind of features gives `raw` and `learn_filters`.
-    """
+    """(B, C, T) raw traces -> (B, P) features, centred, scaled and clipped; a kind gives `raw` and `learn_filters`."""
 
     shift: Tensor
     scale: Tensor
@@ -43,31 +54,20 @@ class Features(nn.Module):
         self.register_buffer("offset", torch.zeros(n_features))
         self.register_buffer("gain", torch.ones(n_features))
 
-    @property
-    def n_out(self) -> int:
-        """P, features that come out."""
-        return len(self.gain)
-
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, n_out), standardised."""
-        return self.clipped(x)
+        """(B, C, T) -> (B, P)."""
+        return self.clipped(self.raw(x))
 
-    def clipped(self, x: Tensor) -> Tensor:
-        """(B, C, T) -> (B, P), each feature centred, scaled and clipped."""
-        f = torch.addcmul(self.offset, self.raw(x), self.gain)
-        return f.clamp_(-4.0, 4.0)  # CLIP: a scripted method reads no global
-
-    @torch.jit.unused
-    def folded(self, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights (m, n_out), biases (m,) of scores on these features -> (m, P), (m,) on the clipped ones."""
-        return weight, bias
+    def clipped(self, raw: Tensor) -> Tensor:
+        """(B, P) -> (B, P)."""
+        return torch.addcmul(self.offset, raw, self.gain).clamp_(-4.0, 4.0)  # CLIP: a scripted method reads no global
 
     def raw(self, x: Tensor) -> Tensor:
         """(B, C, T) -> (B, P), not standardised."""
         raise NotImplementedError
 
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
-        """Set what a kind learns from traces (n, C, T), their channels scaled."""
+        """Set what a kind draws from traces (n, C, T), their channels scaled."""
         raise NotImplementedError
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
@@ -79,21 +79,15 @@ class Features(nn.Module):
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
         self.scale.copy_(scale[:, None])
         self.shift.copy_((-centre * scale)[:, None])
-        some = X[torch.from_numpy(rng.permutation(len(X))[:256])]
+        some = X[torch.from_numpy(rng.permutation(len(X))[:128])]
         self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
 
-    def standardise(self, raw: Tensor) -> tuple[Tensor, Carry]:
-        """Set the features' mean and deviation from raw ones (n, P); returns them standardised, (n, P), and a `Carry`."""
-        gain, offset = self.gain.clone(), self.offset.clone()
-        wide = raw.double()
-        deviation = wide.std(0, unbiased=False)
+    def standardise(self, raw: Tensor) -> None:
+        """Set mean and deviation of the features from raw ones (n, P)."""
+        deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
         self.gain.copy_(1.0 / (deviation + floor))
-        self.offset.copy_(-wide.mean(0) / (deviation + floor))
-        ratio = gain / self.gain
-        shift = offset - ratio * self.offset  # before, a feature was ratio * f + shift
-        standard = torch.addcmul(self.offset, raw, self.gain).clamp(-CLIP, CLIP)
-        return standard, lambda weight, bias: (weight * ratio, bias + weight @ shift)
+        self.offset.copy_(-mean / (deviation + floor))
 
 
 def rocket_kernels() -> Tensor:
@@ -108,32 +102,293 @@ def dilations_of(samples: int, n: int) -> list[int]:
     return [int(d) for d in np.unique(np.floor(2.0 ** np.linspace(0.0, widest, n)))]
 
 
-class KeptFeatures:
-    """A row of features (P,) a trace, found by its key; `compute` gives those of traces (n, C, T), (n, P)."""
+class FeatureEmbedding(nn.Module):
+    """(B, C, T) raw traces -> (B, K, d): axis 1 the success probability of head k, axis 2 a principal direction.
 
-    def __init__(self, width: int) -> None:
-        self.places: dict[bytes, int] = {}
-        self.features = torch.empty(0, width)  # one tensor for all: one each would pickle them all with each
+    A probability is the natural axis for counting: what is sure lies close together, and a radius of 0.05 means "parts as
+    promising as this one, give or take five in a hundred".
+    """
 
-    def __len__(self) -> int:
-        return len(self.features)
+    weight: Tensor
+    bias: Tensor
+    unit: Tensor
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "KeptFeatures":
-        """The same rows, shared: neither what finds them nor they are ever changed in place."""
-        return copy.copy(self)
+    def __init__(self, features: Features, folds: int, dim: int) -> None:
+        super().__init__()
+        self.features, self.folds, self.dim = features, folds, dim
+        # Axis 2 is the same in every space; its copies cost less than an op to spread it.
+        self.register_buffer("weight", torch.zeros(len(features.gain), folds * dim))
+        self.register_buffer("bias", torch.zeros(folds * dim))
+        self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
 
-    def of(self, traces: Floats, compute: Callable[[Tensor], Tensor], keys: Sequence[bytes] | None = None) -> Tensor:
-        """(n, C, T) -> (n, P); what is not among these traces is forgotten, as it has left the window."""
-        keys = keys_of(traces) if keys is None else keys
-        missing = {key: i for i, key in enumerate(keys) if key not in self.places}
-        if missing:
-            self.places = self.places | {key: len(self) + j for j, key in enumerate(missing)}
-            self.features = torch.cat([self.features, compute(torch.from_numpy(traces[list(missing.values())]))])
-        self.features = self.features[[self.places[key] for key in keys]]
-        self.places = {key: i for i, key in enumerate(keys)}
-        return self.features
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, T) float32 -> (B, K, d) float32."""
+        return self.places(self.features(x))
+
+    def places(self, f: Tensor) -> Tensor:
+        """(B, P) clipped features -> (B, K, d)."""
+        scores = torch.addmm(self.bias, f, self.weight)
+        return scores.sigmoid_().mul_(self.unit).view(-1, self.folds, self.dim)
 
 
-def keys_of(traces: Floats) -> list[bytes]:
-    """What each trace (n, C, T) is found by: the fastest digest of its exact samples; a fold's hash is of rounded ones."""
-    return [sha1(trace, usedforsecurity=False).digest() for trace in traces]
+def fit_heads(
+    g: Tensor, y: Tensor, outside: Tensor, w: Tensor, l2: float, max_iter: int, stop: StopRule | None, least: int = 0
+) -> tuple[Tensor, Tensor, list[int], int]:
+    """K ridge logistic regressions by Newton's method with a line search, from where they start.
+
+    g (n, W) features, y (n,) labels, outside (K, n) bool: which rows train head k.  w (K, W+1) float64: where each starts,
+    its bias last.  Each minimises its log loss + l2/2 |w|^2: convex, so it ends at one place wherever it starts. A head
+    that says held-out labels worse than their base rate does says the base rate: its own gate, for a common one would let
+    fold k's labels choose head k.  At most `max_iter` steps, the first `least` however late.
+    Returns w, each head's leave-one-out log loss (K,), the heads that say the base rate, and the steps taken.
+    """
+    small = torch.cat([g, torch.ones(len(g), 1)], 1)
+    g, y, mask = small.double(), y.double(), outside.double()
+    ridge = torch.full_like(w, l2)
+    ridge[:, -1] = 1e-3  # the base rate is not shrunk
+
+    def losses(s: Tensor) -> Tensor:
+        return mask * (F.softplus(s) - y * s)
+
+    def objective(w: Tensor) -> Tensor:
+        return losses(w @ g.T).sum(1) + 0.5 * (ridge * w * w).sum(1)
+
+    def triangles(v: Tensor) -> Tensor:
+        """Cholesky factors of the heads' Hessians, (K, W+1, W+1); v (K, n) the rows' curvatures."""
+        products = torch.stack([(small * each[:, None]).T @ small for each in v.float()])  # a step need not be exact
+        found: Tensor = torch.linalg.cholesky(products.double() + torch.diag_embed(ridge))
+        return found
+
+    # Every head takes part in every product, done or not: of another shape it would round otherwise, and so tell head k
+    # of fold k's labels by the last step of another head.
+    done, before, step = torch.zeros(len(w), dtype=torch.bool), objective(w), 0
+    while step < max_iter and not done.all() and not (stop is not None and stop.exhausted(step, least)):
+        p = torch.sigmoid(w @ g.T)
+        slope = (mask * (p - y)) @ g + ridge * w
+        d = torch.cholesky_solve(slope[..., None], triangles(mask * p * (1.0 - p)))[..., 0]
+        d[done] = 0.0
+        for _ in range(6):
+            after = objective(w - d)
+            rises = after > before + 1e-9 * before.abs()
+            if not rises.any():
+                break
+            d[rises] /= 2.0
+        d[rises] = 0.0
+        w, before, step = w - d, torch.where(rises, before, after), step + 1
+        done |= d.abs().amax(1) < 1e-3  # what is left after such a step is its square
+    s = w @ g.T
+    p = torch.sigmoid(s)
+    v = p * (1.0 - p)
+    # Every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
+    solved = torch.linalg.solve_triangular(triangles(mask * v).float(), small.T[None], upper=False)
+    left_out = s + (lever := solved.square().sum(1)) * (p - y) / (1.0 - lever * v).clamp(min=0.05)
+    n = mask.sum(1)
+    loss, rate = losses(left_out).sum(1) / n, (mask @ y) / n
+    worse = loss > F.binary_cross_entropy(rate, rate, reduction="none")
+    w = torch.where(worse[:, None], 0.0, w)  # anew: who has the former heads keeps them
+    w[worse, -1] = torch.logit(rate[worse])
+    return w, loss, worse.nonzero().flatten().tolist(), step
+
+
+class FeatureReducer(Reducer):
+    """Trace -> point, by features, their principal components and cross-fitted logistic heads.
+
+    A kind has parameters `n_components` (d, 1 or 2), `folds` (K), `l2`, `max_iter` and `random_state` at least.
+    `n_iter_` : steps of the last fit.  `holdout_losses_` (K,) : the heads' leave-one-out log losses, each on rows outside
+    its fold.  `note_` : what the fit has to tell.
+    """
+
+    uses_labels = True
+    own_unit = True  # a radius of 0.05 is five in a hundred, never rescaled
+    width = 128  # W
+    n_components: int
+    folds: int
+    l2: float
+    max_iter: int
+    random_state: Any
+    net_: FeatureEmbedding
+    w_: Tensor
+
+    @property
+    def n_spaces(self) -> int:
+        return int(self.folds)
+
+    def make_features(self, channels: int, samples: int) -> Features:
+        """The features of traces (C, T)."""
+        raise NotImplementedError
+
+    def fit(
+        self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None, stop: StopRule | None = None
+    ) -> Self:
+        """Fit afresh.
+
+        folds : (n,) permanent folds; None: by content.  stop : asked before each step; None: until done.
+        Raises SettingError where a setting is out of range, or a head would see one class alone.
+        """
+        traces = self.check_traces(X, reset=True)
+        labels = binary_labels(y, len(traces), type(self).__name__)
+        self._start(traces)
+        self._fit_heads(traces, labels, content_fold(traces, self.folds) if folds is None else folds, stop)
+        return self
+
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+        """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
+        if len(X) < MIN_TRACES:
+            raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
+        f = self._fit_heads(self._begun(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
+        with torch.inference_mode():
+            return own_places(self.net_.places(f).numpy(), folds)
+
+    def look_ahead(self, X: Floats) -> int:
+        """Compute the features of traces that a store brings: in the first retrain it would take too long."""
+        if len(X) < MIN_TRACES:
+            return 0
+        with torch.no_grad():
+            return len(self.raw_features(self._begun(X)))
+
+    def blank(self, X: Floats) -> FeatureEmbedding:
+        new = self if "net_" in vars(self) else clone(self)
+        new._begun(X)
+        found: FeatureEmbedding = new.net_
+        return found
+
+    def _begun(self, X: Floats) -> Floats:
+        """The traces, checked, once there are features for them: the first ones that come set these."""
+        if "net_" not in vars(self):
+            self._start(self.check_traces(X, reset=True))
+        return self.check_traces(X)
+
+    def _start(self, traces: Floats) -> None:
+        """Learn what stays where it is from now on: the scales of the channels and the filters. No label is read."""
+        self._build(*self.trace_shape_)
+        self.net_.features.learn(torch.from_numpy(traces), np.random.default_rng(seed_of(self.random_state)))
+
+    def _build(self, channels: int, samples: int) -> None:
+        self.check()
+        features = self.make_features(channels, samples)
+        self.net_ = FeatureEmbedding(features, self.folds, self.n_components).eval()
+        self.n_fits_ = self.n_seen_ = 0
+        self._rows: dict[int, int] = {}  # of each trace that was seen last, by its exact samples
+        self._raw = torch.empty(0, len(features.gain))
+
+    def _fit_heads(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule | None) -> Tensor:
+        """Train head k on rows outside fold k, from the present weights; returns the features (n, P)."""
+        folds = np.asarray(folds, dtype=np.int64)
+        if folds.shape != labels.shape or folds.min() < 0 or folds.max() >= self.folds:
+            raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
+        with torch.no_grad():
+            raw = self.raw_features(traces)
+            least = 0
+            if len(raw) >= GROWN * self.n_seen_ or self.n_fits_ % FITS == 0:
+                self._compress(raw)
+                least = FIRST_STEPS
+            f, rows = self.net_.features.clipped(raw), np.arange(len(raw))
+            if len(rows) > TRAIN_TRACES:  # a draw that is blind to labels, another at each fit
+                rows = np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_]).permutation(rows)[
+                    :TRAIN_TRACES
+                ]
+            outside = self.trained_on(folds[rows])
+            for k, some in enumerate(outside):
+                if (classes := len(np.unique(labels[rows][some]))) < 2:
+                    raise one_class_outside(k, int(some.sum()), classes)
+            g, y = torch.addmm(self.centre_, f[rows], self.axes_), torch.from_numpy(labels[rows])
+            fitted = fit_heads(g, y, torch.from_numpy(outside), self.w_, self.l2, self.max_iter, stop, least)
+            self.w_, losses, unsure, self.n_iter_ = fitted
+            first = slice(None, None, self.n_components)
+            self.net_.weight[:, first] = (self.axes_.double() @ self.w_[:, :-1].T).float()
+            self.net_.bias[first] = (self.w_[:, -1] + self.w_[:, :-1] @ self.centre_.double()).float()
+        self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
+        heads = ", ".join(map(str, unsure))
+        self.note_ = f"head {heads} says the base rate: it would have done worse" if unsure else ""
+        return f
+
+    def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
+        """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
+        return np.asarray(folds != np.arange(self.folds)[:, None])
+
+    def _compress(self, raw: Tensor) -> None:
+        """Find the principal components of raw features (n, P); heads on them start from nothing."""
+        net, self.n_seen_ = self.net_, len(raw)
+        some = raw[:: 1 + (len(raw) - 1) // 1000]
+        net.features.standardise(some)
+        f = net.features.clipped(some).double()
+        centred = f - f.mean(0)
+        sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
+        sizes, axes = (each[..., -self.width :].flip(-1) for each in (sizes.clamp(min=0.0), axes))
+        axes = axes * (sizes > 1e-9 * sizes[0])
+        if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
+            second = (2.0 * axes[:, 0] / sizes[0].clamp(min=1e-12).sqrt()).float()
+            second = second if second @ net.weight[:, 1] >= 0 else -second  # its sign as it was
+            net.weight[:, 1::2], net.bias[1::2] = second[:, None], -(f.mean(0).float() @ second)
+        self.axes_ = (axes * (VARIANCE / sizes.sum().clamp(min=1e-9)).sqrt()).float()
+        self.centre_ = -(f.mean(0).float() @ self.axes_)
+        self.w_ = torch.zeros(self.folds, self.axes_.size(1) + 1, dtype=torch.float64)
+
+    def raw_features(self, traces: Floats) -> Tensor:
+        """(n, C, T) -> (n, P), not standardised: computed once a trace, and forgotten once it has left the window."""
+        keys = [hash(trace.tobytes()) for trace in traces]
+        new = {key: i for i, key in enumerate(keys) if key not in self._rows}
+        if new:
+            computed = in_chunks(self.net_.features.raw, torch.from_numpy(traces[list(new.values())]))
+            self._rows = self._rows | {key: len(self._raw) + j for j, key in enumerate(new)}
+            self._raw = torch.cat([self._raw, computed])
+        self._raw = self._raw[[self._rows[key] for key in keys]]
+        self._rows = {key: i for i, key in enumerate(keys)}
+        return self._raw
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """A training changes the module in place; all else it binds anew, so that may be shared."""
+        new = copy.copy(self)
+        if "net_" in vars(self):
+            new.net_ = copy.deepcopy(self.net_, memo)
+        return new
+
+    @property
+    def report(self) -> FitReport:
+        check_is_fitted(self, "net_")
+        return FitReport(self.n_iter_, self.note_)
+
+    def embed(self, X: ArrayLike) -> Floats:
+        traces = self.check_traces(X)
+        with torch.inference_mode():
+            out: Floats = in_chunks(self.net_, torch.from_numpy(traces)).numpy()
+        return out
+
+    def module(self) -> nn.Module:
+        check_is_fitted(self, "net_")
+        return self.net_
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        check_is_fitted(self, "net_")
+        counts = np.array([*self.trace_shape_, self.n_fits_, self.n_seen_, self.n_iter_])
+        own = {"counts": counts, "losses": self.holdout_losses_, "axes": self.axes_.numpy(), "centre": self.centre_.numpy()}
+        own |= {"w": self.w_.numpy()}
+        return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+        channels, samples, n_fits, n_seen, self.n_iter_ = (int(v) for v in state["counts"])
+        self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
+        self._build(channels, samples)
+        self.net_.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in part(state, "net.").items()})
+        self.axes_, self.centre_, self.w_ = (torch.from_numpy(np.array(state[name])) for name in ("axes", "centre", "w"))
+        self.n_fits_, self.n_seen_, self.holdout_losses_, self.note_ = n_fits, n_seen, np.array(state["losses"]), ""
+        return self
+
+    def check(self) -> None:
+        """Raise SettingError for a parameter out of its range."""
+        for name in ("n_components", "folds", "max_iter"):
+            if not isinstance(getattr(self, name), int | np.integer):
+                raise SettingError(f"Expected {name} to be an integer, got {getattr(self, name)!r}.")
+        for fits, expected, value in (
+            (self.n_components in (1, 2), "n_components 1 or 2", self.n_components),
+            (self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2),
+            (self.folds >= 2, "folds >= 2 where labels are used", self.folds),
+            (self.max_iter >= 1, "max_iter >= 1", self.max_iter),
+        ):
+            if not fits:
+                raise SettingError(f"Expected {expected}, got {value!r}.")
+
+
+def in_chunks(f: Any, x: Tensor) -> Tensor:
+    """The function over x, `CHUNK` traces at a time."""
+    return torch.cat([f(x[i : i + CHUNK]) for i in range(0, max(1, len(x)), CHUNK)])

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from .features import Features, dilations_of, rocket_kernels
-from .heads import FeatureReducer
+from .features import FeatureReducer, Features, dilations_of, rocket_kernels
 
 
 class RocketFeatures(Features):
@@ -70,7 +69,7 @@ class RocketReducer(FeatureReducer):
         folds: int = 5,
         dilations: int = 3,
         l2: float = 1.0,
-        max_iter: int = 12,
+        max_iter: int = 20,
         random_state: Any = 0,
     ) -> None:
         self.n_components = n_components

@@ -27,7 +27,7 @@ from dengine import (
 )
 from dengine.errors import SettingError
 from dengine.recipe import RECIPES
-from dengine.reducers.heads import FIRST_STEPS
+from dengine.reducers.features import FIRST_STEPS
 from tests.support.driving import Counting, drive
 
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)

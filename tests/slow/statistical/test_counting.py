@@ -21,8 +21,8 @@ from dengine.model import neighbours as prediction
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 from dengine.records import Reason
-from dengine.reducers import heads
-from dengine.reducers.heads import CrossFittedScores
+from dengine.reducers import features
+from dengine.reducers.features import FeatureReducer
 from tests.slow.proof.counts import count_noise, mean_square, moved, places, relabelled, weak_signal, white_noise
 from tests.slow.proof.replays import Case, broken, judge
 
@@ -83,8 +83,7 @@ Mutation = Callable[[pytest.MonkeyPatch], None]
 
 
 def heads_of_all_folds(patch: pytest.MonkeyPatch) -> None:
-    head = CrossFittedScores._head
-    patch.setattr(CrossFittedScores, "_head", lambda self, k, g, y, out, l2: head(self, k, g, y, torch.ones_like(out), l2))
+    patch.setattr(FeatureReducer, "trained_on", lambda self, folds: np.ones((self.folds, len(folds)), dtype=np.bool_))
 
 
 def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
@@ -100,42 +99,33 @@ def folds_dealt_anew(patch: pytest.MonkeyPatch) -> None:
 
 
 def references_at_the_mean_of_heads(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(heads, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
+    patch.setattr(features, "own_places", lambda Z, folds: np.ascontiguousarray(Z.mean(axis=1)))
 
 
 def one_gate_for_all_heads(patch: pytest.MonkeyPatch) -> None:
-    def train_on(
-        self: Any, g: Tensor, y: Tensor, folds: Tensor, l2: float, max_iter: int, stop: Any, least: int = 0
-    ) -> int:
-        g = torch.cat([g.double(), torch.ones(len(g), 1, dtype=torch.float64)], 1)
-        every = [self._head(k, g, y, folds != k, l2) for k in range(self.folds)]
-        steps = heads._interleave(every, max_iter, stop, least)
-        new, old, base = (
-            np.mean([f(h) for h in every])
-            for f in (lambda h: h.leave_one_out_loss(), lambda h: h.first_loss, lambda h: h.base_rate_loss())
-        )
-        self.kept.fill_(bool(new > max(old, base)))
-        if not self.kept[0]:
-            for k, head in enumerate(every):
-                self.weight[k * self.dim], self.bias[k * self.dim] = head.w[:-1].float(), head.w[-1].float()
-        self._turn(g[:, :-1])
-        return steps
+    fit_heads = features.fit_heads
 
-    patch.setattr(CrossFittedScores, "train_on", train_on)
+    def gated(g: Tensor, y: Tensor, outside: Tensor, *rest: Any) -> Any:
+        w, loss, unsure, steps = fit_heads(g, y, outside, *rest)
+        if unsure:
+            w = torch.zeros_like(w)
+            w[:, -1] = torch.logit((outside.double() @ y.double()) / outside.sum(1))
+        return w, loss, unsure, steps
+
+    patch.setattr(features, "fit_heads", gated)
 
 
 def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
-    train_on = CrossFittedScores.train_on
+    fit_heads = features.fit_heads
 
-    def screened(self: Any, g: Tensor, y: Tensor, folds: Tensor, *rest: Any) -> int:
+    def screened(g: Tensor, y: Tensor, *rest: Any) -> Any:
         relevance = ((g - g.mean(0)) * (y - y.double().mean())[:, None]).mean(0).abs() / (g.std(0) + 1e-9)
         best = torch.zeros(g.size(1)).index_fill_(0, relevance.topk(10).indices, 1.0)
-        self.weight[:: self.dim] *= best
-        steps = train_on(self, g * best, y, folds, *rest)
-        self.weight[:: self.dim] *= best
-        return steps
+        w, *others = fit_heads(g * best, y, *rest)
+        w[:, :-1] *= best
+        return (w, *others)
 
-    patch.setattr(CrossFittedScores, "train_on", screened)
+    patch.setattr(features, "fit_heads", screened)
 
 
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
