@@ -183,7 +183,7 @@ class Guard:
             answer = problem(refusal.status, refusal.detail, CLOSE | refusal.headers)
             await answer(scope, receive, _with_headers(send))
         else:
-            await self.app(scope, Body(receive, self.access).receive, _with_headers(send))
+            await self.app(scope, _limited(receive, self.access), _with_headers(send))
         finally:
             if connection is not None:
                 connection.end_request()
@@ -222,29 +222,28 @@ class Guard:
         raise Refusal(HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", ask)
 
 
-class Body:
-    """A request's body, that has to be of a size, and to come in time."""
+def _limited(receive: Receive, access: Access) -> Receive:
+    """What receives a request's body, which has to be of a size and to come in time; else Refusal."""
+    left, more = access.largest, True
+    until = asyncio.get_running_loop().time() + access.body_seconds
 
-    def __init__(self, receive: Receive, access: Access) -> None:
-        self._receive, self._access = receive, access
-        self._left, self._more = access.largest, True
-        self._until = asyncio.get_running_loop().time() + access.body_seconds
-
-    async def receive(self) -> Message:
-        """The next piece; Refusal where it is too much, or too late."""
-        if not self._more:  # what follows is the word that the client has gone, which may take as long as it likes
-            return await self._receive()
+    async def receiving() -> Message:
+        nonlocal left, more
+        if not more:  # what follows is the word that the client has gone, which may take as long as it likes
+            return await receive()
         try:
-            async with asyncio.timeout_at(self._until):
-                message = await self._receive()
+            async with asyncio.timeout_at(until):
+                message = await receive()
         except TimeoutError:
-            seconds = self._access.body_seconds
-            raise Refusal(HTTPStatus.REQUEST_TIMEOUT, f"Expected the request's body within {seconds:g} s.", CLOSE) from None
-        self._more = bool(message.get("more_body", False))
-        self._left -= len(message.get("body", b""))
-        if self._left < 0:
-            raise _too_large(self._access.largest)
+            text = f"Expected the request's body within {access.body_seconds:g} s."
+            raise Refusal(HTTPStatus.REQUEST_TIMEOUT, text, CLOSE) from None
+        more = bool(message.get("more_body", False))
+        left -= len(message.get("body", b""))
+        if left < 0:
+            raise _too_large(access.largest)
         return message
+
+    return receiving
 
 
 def _too_large(largest: int) -> Refusal:

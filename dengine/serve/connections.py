@@ -1,8 +1,8 @@
 """Connections with limits that uvicorn does not set: places, in all and for each address, and a time for a request's head.
 
-What ends a connection is answered before: 503 where there is no place, 408 to a head that takes too long (a body's time is
-`auth.Body`'s), 400 to what is no HTTP and to half a head of which no more comes. `Connection` stands between the socket and
-uvicorn's own protocol; `auth.Guard` tells it when a request has come and when it is answered.
+What ends a connection is answered before: 503 where there is no place, 408 to a head that takes too long (of a body's time
+`auth.Guard` takes care), 400 to what is no HTTP and to half a head of which no more comes. `Connection` stands between the
+socket and uvicorn's own protocol; `auth.Guard` tells it when a request has come and when it is answered.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Connection(asyncio.Protocol):
         """Let go."""
         self._stop_waiting()
         if self._has_place:
-            self._places.taken[self._address] -= 1
+            self._places.taken -= Counter([self._address])  # an address without one is forgotten
             self.inner.connection_lost(exc)
 
     def pause_writing(self) -> None:

@@ -234,24 +234,22 @@ class AddressSpace:
         self, call: Callable[..., Awaitable[list[Any]]], taken: list[Argument], given: list[Argument]
     ) -> Callable[..., Awaitable[Any]]:
         """A method as asyncua calls it: what is wrong is a status, and a line in LastRefused; nothing is raised."""
+        listed = ", ".join(f"{name} ({kind.name}{' array' if array else ''})" for name, kind, array, _ in taken)
 
         @wraps(call)
         async def method(parent: ua.NodeId, *arguments: ua.Variant) -> Any:
-            wrong: Any = _wrong(arguments, taken)
-            if wrong is not None:
-                listed = ", ".join(f"{name} ({kind.name}{' array' if array else ''})" for name, kind, array, _ in taken)
-                said = f"Expected {listed}."
-            else:
+            wrong, said = _wrong(arguments, taken), f"Expected {listed}."
+            if wrong is None:
                 try:
                     answer = await call(*(each.Value for each in arguments))
                     return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
                 except DengineError as error:
-                    wrong, said = _status(StatusCodes.BadInvalidArgument), str(error)
+                    wrong, said = StatusCodes.BadInvalidArgument, str(error)
                 except Exception:  # ours: the log has it, the caller verifies
                     log.exception("a call over OPC UA failed")
-                    wrong, said = _status(StatusCodes.BadInternalError), "The server failed on this call."
+                    wrong, said = StatusCodes.BadInternalError, "The server failed on this call."
             await self._nodes["LastRefused"].write_value(ua.DataValue(ua.Variant(one_line(said), VariantType.String)))
-            return wrong
+            return _status(wrong)
 
         return method
 
@@ -262,17 +260,15 @@ class AddressSpace:
         return ua.QualifiedName(text, self._index)
 
 
-def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> ua.CallMethodResult | None:
-    """What is wrong with a call's arguments, each by itself; None where nothing is."""
+def _wrong(arguments: tuple[ua.Variant, ...], taken: list[Argument]) -> int | None:
+    """What is wrong with a call's arguments, a status; None where nothing is."""
     if len(arguments) != len(taken):
-        few = len(arguments) < len(taken)
-        return ua.CallMethodResult(_status(StatusCodes.BadArgumentsMissing if few else StatusCodes.BadTooManyArguments))
-    fits = [
+        return StatusCodes.BadArgumentsMissing if len(arguments) < len(taken) else StatusCodes.BadTooManyArguments
+    fits = all(
         each.VariantType is type_ and isinstance(each.Value, list) is array and (array or each.Value is not None)
         for each, (_, type_, array, _) in zip(arguments, taken, strict=True)
-    ]
-    codes = [_status(StatusCodes.Good if each else StatusCodes.BadTypeMismatch) for each in fits]
-    return None if all(fits) else ua.CallMethodResult(_status(StatusCodes.BadInvalidArgument), codes)
+    )
+    return None if fits else StatusCodes.BadInvalidArgument
 
 
 def _status(code: int) -> ua.StatusCode:

@@ -46,7 +46,7 @@ def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
 def test_packages_come_whole_from_pieces_of_any_size() -> None:
     sent = [Package(Kind.DATA, bytes(range(n))) for n in (0, 1, 40)]
     for size in (1, 2, 7, 100):
-        stream, packages = b"".join(each.bytes for each in sent), Packages()
+        stream, packages = b"".join(each.packed() for each in sent), Packages()
         pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
         assert [found for piece in pieces for found in packages.feed(piece)] == sent
 
@@ -280,33 +280,26 @@ class Deaf(RobotProgram):
             yield
 
 
-@pytest.fixture
-def short() -> dict:
-    return {"order_timeout": 0.3, "start_timeout": 1.0, "samples": SAMPLES}
-
-
-def test_a_robot_that_does_not_answer_is_an_error_that_says_which_order(parts: Dataset, short: dict) -> None:
-    said = pytest.raises(CellError, match=r"to answer order 1 \(insert\) in time, it did not")
-    with FakeController(Deaf(parts), speed=20.0) as fake, UrCell(fake.host, port=fake.port, **short) as cell, said:
-        cell.insert()
-
-
-def test_a_program_that_is_stopped_ends_the_wait_at_once(parts: Dataset) -> None:
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("is deaf", r"to answer order 1 \(insert\) in time, it did not"),
+        ("has stopped", "its program has stopped"),
+        ("is started anew", "started anew"),
+    ],
+)
+def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(parts: Dataset, what: str, said: str) -> None:
     program = Deaf(parts)
+    restarting = threading.Timer(0.2, program.restart)
     with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
-        program.outputs[RUNTIME] = Runtime.STOPPED
-        with pytest.raises(CellError, match="its program has stopped"):
+        if what == "is deaf":
+            cell.order_timeout = 0.3
+        elif what == "has stopped":
+            program.outputs[RUNTIME] = Runtime.STOPPED
+        else:
+            restarting.start()
+        with pytest.raises(CellError, match=said):
             cell.insert()
-
-
-def test_a_program_that_is_started_anew_carries_no_old_order_out(parts: Dataset) -> None:
-    program = RobotProgram(parts, approach=10**6)
-    with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
-        timer = threading.Timer(0.2, program.restart)
-        timer.start()
-        with pytest.raises(CellError, match="started anew"):
-            cell.insert()
-        timer.join()
 
 
 def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:

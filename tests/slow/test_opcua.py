@@ -122,6 +122,10 @@ def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, stream: Dat
         assert await plant.value("ModelVersion") == version >= 1
         assert await plant.value("VerifiedShare") == actions.count(VERIFY) / len(actions)
         assert (await plant.value("SafeMode"), await plant.value("Shadow")) == (False, False)
+        assert await plant.report("unheard of", True) is False
+        with pytest.raises(ua.uaerrors.BadInvalidArgument):
+            await plant.decide(stream.X[1], "order-0")
+        assert "got another" in await plant.value("LastRefused")
         known = await plant.service.find("order-7")
         assert (known.decision.part, np.array_equal(known.trace[0], stream.X[7])) == ("P7", True)
 
@@ -148,19 +152,6 @@ def test_the_variables_and_methods_are_as_they_are_described_and_read_only(plant
                 assert said == [(name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments]
 
     run(scada())
-
-
-def test_a_request_that_is_asked_again_has_the_same_answer(plant: Plant, stream: Dataset, run) -> None:
-    async def plc() -> None:
-        first = await plant.decide(stream.X[0], "again")
-        assert await plant.decide(stream.X[0], "again") == first
-        with pytest.raises(ua.uaerrors.BadInvalidArgument):
-            await plant.decide(stream.X[1], "again")
-        assert "got another" in await plant.value("LastRefused")
-        assert await plant.report("unheard of", True) is False
-        assert await plant.report("", True) is False  # as the id of a decision that was not recorded
-
-    run(plc())
 
 
 def wrong_calls() -> list[tuple[str, tuple[Any, ...], type]]:

@@ -12,9 +12,9 @@ trigger. A program that starts answers an old order with VOID. `training/ur_cell
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from ...datasets.triggers import Trigger
 from ...errors import CellError
 from ...records import Outcome
-from .protocol import PORT
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import Row
 
@@ -88,9 +87,9 @@ REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED)
 class UrCell(AbstractContextManager["UrCell"]):
     """A `Cell` whose insert, verify, proceed and reject are orders to the program that runs on the robot.
 
-    host, trigger, samples, channels, rate_hz, before, port : as in `RtdeRecorder`; the trace is recorded while the robot
-    inserts.  order_timeout : seconds for each order to be answered.  start_timeout : seconds, at first, for the program to
-    run and to have finished what an earlier owner ordered.
+    host, trigger, how : as in `RtdeRecorder`; the trace is recorded while the robot inserts.
+    order_timeout : seconds for each order to be answered.  start_timeout : seconds, at first, for the program to run and to
+    have finished what an earlier owner ordered.
 
     A trace with a gap is handed on with NaN in it: the engine verifies that part and never learns from it; `last` says what
     is missing, `incomplete` counts them. CellError where the robot does not answer, its program stops, or it says FAILED.
@@ -100,16 +99,13 @@ class UrCell(AbstractContextManager["UrCell"]):
         self,
         host: str,
         trigger: Trigger | str = f"register@{PHASE}",
-        samples: int = 1000,
-        channels: Sequence[str] = ("FZ_Base",),
-        rate_hz: float = 500.0,
-        before: int = 0,
-        port: int = PORT,
+        *,
         order_timeout: float = 60.0,
         start_timeout: float = 30.0,
+        **how: Any,
     ) -> None:
         also = (ANSWER, ORDER, RUNTIME)
-        self.recorder = RtdeRecorder(host, trigger, samples, channels, rate_hz, before, port, also=also, inputs=(ORDER,))
+        self.recorder = RtdeRecorder(host, trigger, also=also, inputs=(ORDER,), **how)
         self.order_timeout, self.start_timeout = order_timeout, start_timeout
         self.last: InsertionRecord | None = None
         self.incomplete = 0

@@ -275,7 +275,7 @@ class FakeController(AbstractContextManager["FakeController"]):
                 answer = bytes([yes and payload == struct.pack(">H", VERSION)])
             case _:
                 answer = bytes([yes and (kind is not Kind.START or client.output is not None)])
-        client.socket.sendall(Package(kind, answer).bytes)
+        client.socket.sendall(Package(kind, answer).packed())
         client.started = kind is Kind.START and answer == b"\1"
 
     def _recipe(self, number: int, names: bytes, refused: Collection[Kind | str], why: str) -> Recipe:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
+from typing import NamedTuple
 
 from ...errors import CellError, SettingError
 
@@ -51,15 +52,13 @@ class Kind(IntEnum):
     PAUSE = ord("P")
 
 
-@dataclass(frozen=True, slots=True)
-class Package:
+class Package(NamedTuple):
     """One package, without its header."""
 
     kind: Kind
     payload: bytes
 
-    @property
-    def bytes(self) -> bytes:
+    def packed(self) -> bytes:
         """As it goes over the wire."""
         return HEADER.pack(HEADER.size + len(self.payload), self.kind) + self.payload
 
@@ -108,7 +107,7 @@ class Recipe:
         """A data package, whole; where a field is no double, its value is cut to a whole number."""
         letters = self.layout.format[2:]
         held = [value if letter == "d" else int(value) for value, letter in zip(values, letters, strict=True)]
-        return Package(Kind.DATA, self.layout.pack(self.number, *held)).bytes
+        return Package(Kind.DATA, self.layout.pack(self.number, *held)).packed()
 
     def unpack(self, payload: bytes) -> tuple[float, ...]:
         """The values, one a column; CellError for a package of another size, or of another recipe."""
@@ -125,14 +124,13 @@ def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
     types = tuple(payload[1:].decode("ascii", errors="replace").split(",")) if payload else ()
     if len(types) != len(names):
         raise CellError(f"Expected the types of {len(names)} {what} fields, got {len(types)}: {', '.join(types)[:80]}.")
-    unknown = [name for name, kind in zip(names, types, strict=True) if kind not in (*TYPES, IN_USE)]
-    if unknown:
+    named = dict(zip(names, types, strict=True))
+    if unknown := [name for name, kind in named.items() if kind not in (*TYPES, IN_USE)]:
         raise CellError(
             f"Expected {what} fields that this controller has, it does not know {', '.join(unknown)}; name others, or "
             "bring its software up to date (registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)."
         )
-    held = [name for name, kind in zip(names, types, strict=True) if kind == IN_USE]
-    if held:
+    if held := [name for name, kind in named.items() if kind == IN_USE]:
         raise HeldError(
             f"Expected to write {', '.join(held)}, another client of this controller does; close it, or its fieldbus "
             "unit (EtherNet/IP, PROFINET), or choose other registers."

@@ -79,7 +79,7 @@ class RtdeClient:
 
     def _ask(self, kind: Kind, payload: bytes) -> bytes:
         """Send a request and wait for its answer; text messages may come between."""
-        self._send(Package(kind, payload).bytes)
+        self._send(Package(kind, payload).packed())
         while (package := next(self._incoming)).kind is not kind:
             if kind is Kind.START and package.kind is Kind.DATA:  # its first data can overtake its yes
                 self._incoming = chain([package], self._incoming)
