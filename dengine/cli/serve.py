@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..engine.engine import DataEngine
     from ..recipe import Recipe
 
-NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml", "jinja2", "sse_starlette")
+NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
 SPEED, DEADLINE, PORT = click.FloatRange(0.01, 1000.0), click.FloatRange(0.001, 60.0), click.IntRange(1, 65535)
 DEMO = "Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."

@@ -9,9 +9,12 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
+from functools import cache, reduce
 from http import HTTPStatus
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from operator import or_
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -21,6 +24,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
+from ..decision.policy import Policy
+from ..engine.corrections import Changed
 from ..errors import (
     BusyError,
     DengineError,
@@ -31,9 +36,12 @@ from ..errors import (
     shortened,
     without_password,
 )
-from ..history.status import Status
-from ..records import Action, Decision
-from ..store.records import StoredDecision
+from ..history.explain import Explanation
+from ..history.map import PartMap
+from ..history.status import NEWEST, Course, Status
+from ..records import Action, Decision, plain
+from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
+from ..store.views import HistoryFilter
 from .service import Told
 
 log = logging.getLogger("dengine")
@@ -45,19 +53,19 @@ PROBLEMS = {
     400: "No JSON or MessagePack, or a header that makes no sense.",
     401: "The token is missing or another.",
     403: "A web page of another site asks.",
-    404: "There is no such path, or no such decision.",
+    404: "There is no such path, decision or version.",
     405: "The path has no such method.",
     408: "The request's body did not come in time.",
-    409: "The id is another trace's, or the label is against what was reported first.",
+    409: "The id is another trace's, the label is against what was reported first, or a part has several decisions.",
     413: "The request is larger than the server takes.",
     415: "The body is of a type that is not read here.",
     421: "The server was called by a name that is not its own.",
-    422: "The body says something that cannot be: what was expected stands in detail.",
+    422: "The body or the query says something that cannot be: what was expected stands in detail.",
     429: "Too many requests of one client; Retry-After says when.",
     500: "The server failed; its log says why.",
     503: "Too many wait, the store is away, or the server is closing; Retry-After says when.",
 }
-LATER, EVERYWHERE = (429, 503), (401, 421, 429, 500)
+LATER = (429, 503)
 RETRY_AFTER = 1  # seconds
 DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
 STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
@@ -88,23 +96,94 @@ class RawQuery(Struct, forbid_unknown_fields=True):
 
 
 class Report(Struct, forbid_unknown_fields=True):
-    """What became of a part.  id : of the decision.  success : true, or 1: good; false, or 0: bad."""
+    """What became of a part; false for one that was accepted and came back is a system stop.
+
+    id : of the decision.  part : its number in the place of that, where there is one decision of it; or the id.
+    success : true, or 1: good; false, or 0: bad.  author : who says so, for the event log; a robot leaves it out.
+    """
+
+    success: bool | float
+    id: str | UnsetType = UNSET
+    part: str | UnsetType = UNSET
+    author: str = ""
+
+
+class Signed(Struct, forbid_unknown_fields=True):
+    """Who asks for it.  author : a name, for the event log."""
+
+    author: str
+
+
+class Correct(Signed, forbid_unknown_fields=True):
+    """A label to put right.  id : of the decision.  success : what it counts as from now on."""
 
     id: str
-    success: bool | float
+    success: bool
 
 
-class ListQuery(Struct, forbid_unknown_fields=True):
-    """Which decisions.  open : only verified ones that wait for a label.  limit : how many at most."""
+class Forget(Signed, forbid_unknown_fields=True):
+    """Labels to leave out.  ids : of the decisions.  reason : for the event log."""
 
-    open: bool = False
+    ids: list[str]
+    reason: str = ""
+
+
+class Rollback(Signed, forbid_unknown_fields=True):
+    """A version to go back to.  version : its number, as /versions lists it."""
+
+    version: int
+
+
+class StatusQuery(Struct, forbid_unknown_fields=True):
+    """last : the newest so many decisions are looked at apart.  watch : how far the safe mode's detectors are, too."""
+
+    last: Annotated[int, Meta(ge=1, le=100_000)] = NEWEST
+    watch: bool = False
+
+
+class EventQuery(Struct, forbid_unknown_fields=True):
+    """limit : how many at most."""
+
     limit: Annotated[int, Meta(ge=1, le=200)] = 20
 
 
-class DetailQuery(Struct, forbid_unknown_fields=True):
-    """How much of a decision.  trace : its samples too."""
+class DecisionQuery(Struct, forbid_unknown_fields=True):
+    """Which decision.  trace : with its samples too."""
 
+    id: str
     trace: bool = False
+
+
+class Nothing(Struct, forbid_unknown_fields=True):
+    """There is nothing to ask for."""
+
+
+def _optional(name: str, record: type, doc: str, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
+    """A request of a record's fields, each of which may be left out, and of more of them: a type, and a default."""
+    kinds = {key: (kind | UnsetType, UNSET) for key, kind in get_type_hints(record).items() if key not in without} | more
+    members = [(key, *kind) for key, kind in kinds.items()]
+    space = {"__doc__": f"{doc}\n{record.__doc__}"}
+    return msgspec.defstruct(name, members, namespace=space, forbid_unknown_fields=True, kw_only=True)
+
+
+ListQuery = _optional(
+    "ListQuery",
+    HistoryFilter,
+    "Which decisions.  open : verified ones that wait for a label.  limit : how many at most.  before : older ones than "
+    "the answer that said so as `older`.",
+    label=(Literal["good", "bad", "none"] | UnsetType, UNSET),
+    open=(bool, False),
+    limit=(Annotated[int, Meta(ge=1, le=200)], 20),
+    before=(str, ""),
+)
+# A guarantee may be a class by name, and nothing that is asked over the network may have one imported.
+PolicyChange = _optional("PolicyChange", Policy, "What is to change.  author : who asks.", ("guarantee",), author=(str,))
+
+
+def given(asked: Struct, record: type) -> Json:
+    """What a request says of a record's fields."""
+    names = {field.name for field in fields(record)}
+    return {key: value for key, value in msgspec.structs.asdict(asked).items() if key in names and value is not UNSET}
 
 
 class Refusal(Exception):  # noqa: N818  # it is an answer, not a fault
@@ -143,7 +222,7 @@ async def read_struct(request: Request, kind: type[T], *others: str) -> T:
         raise Refusal(422, f"{error}.") from error
     except (ValueError, RecursionError) as error:
         raise Refusal(400, f"Expected {media}: {error}.") from error
-    if _keys(media, body) > sum(getattr(found, name) is not UNSET for name in kind.__struct_fields__):  # type: ignore[attr-defined]  # a Struct's
+    if _keys(media, body) != len(DECODERS[media](body, type=dict[str, msgspec.Raw])):
         raise Refusal(400, "Expected each name once, got one twice.")
     return found
 
@@ -156,8 +235,8 @@ def _keys(media: str, body: bytes) -> int:
 
 
 def read_query(request: Request, kind: type[T]) -> T:
-    """A request's query as a struct; Refusal for another name, a name twice, or a value that it does not take."""
-    pairs = request.query_params.multi_items()
+    """A request's query, and what its path names, as a struct; Refusal for another name, a name twice, or a wrong value."""
+    pairs = [*request.query_params.multi_items(), *request.path_params.items()]
     try:
         if len(dict(pairs)) < len(pairs):
             raise ValueError("Expected each name of the query once")
@@ -198,14 +277,37 @@ def _samples(given: bytes | list[Any], channels: int) -> NDArray[Any]:
 # What is answered
 
 
-def _answer(name: str, about: str, *records: type, optional: Json | None = None, **more: Any) -> type[Struct]:
-    """The type of an answer: the fields of records, where a number that is not finite is null, and more of them."""
-    kinds = {field.name: get_type_hints(each)[field.name] for each in records for field in fields(each)}
-    kinds = {key: float | None if kind is float else kind for key, kind in kinds.items() if key not in HIDDEN} | more
-    members: list[Any] = [(key, kind) for key, kind in kinds.items() if key not in (optional or {})]
-    members += [(key, kind, UNSET) for key, kind in (optional or {}).items()]
+def _answer(
+    name: str, about: str, *records: type, without: tuple[str, ...] = (), optional: Json | None = None, **more: Any
+) -> type[Struct]:
+    """The type of an answer: the fields of records as JSON has them but for some, and more of them."""
+    kinds = {key: kind for each in records for key, kind in _members(each).items() if key not in without} | more
+    members: list[Any] = [*kinds.items(), *((key, kind, UNSET) for key, kind in (optional or {}).items())]
     doc = "\n".join([about, *(each.__doc__ or "" for each in records)])
     return msgspec.defstruct(name, members, namespace={"__doc__": doc}, kw_only=True)
+
+
+def _members(record: type) -> Json:
+    """A record's fields as `plain` gives them: without those that stand apart, and with those of one that is flat."""
+    hints, found = get_type_hints(record), dict[str, Any]()
+    for field in fields(record):
+        if "flat" in field.metadata:
+            found |= _members(hints[field.name])
+        elif "apart" not in field.metadata:
+            found[field.name] = _shape(hints[field.name])
+    return found
+
+
+@cache
+def _shape(kind: Any) -> Any:
+    """A type as JSON has it; a number that is not finite is null."""
+    if isinstance(kind, type) and is_dataclass(kind):
+        return _answer(kind.__name__, "", kind)
+    if isinstance(kind, UnionType):
+        return reduce(or_, map(_shape, get_args(kind)))
+    if get_origin(kind) in (list, tuple):
+        return list[_shape(get_args(kind)[0])]  # type: ignore[misc]  # made here
+    return float | None if kind is float else kind
 
 
 class Health(Struct):
@@ -229,33 +331,56 @@ class Problem(Struct):
     action: Action = Action.VERIFY
 
 
-# JavaScript has no integers of 64 bits, a stored decision's fields are the decision's too, `ever.retrains` counts those.
-HIDDEN = ("content_hash", "decision", "settings", "retrains")
 LATE = (
     "late : deadline exceeded in the queue; recorded as VERIFY.  seconds : from the request to the answer, in the server."
 )
 LINE = (
     "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
-    "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at."
+    "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at.  "
+    "check_seconds : that a verification takes."
 )
+ARRAYS = (
+    "trace : (channels, samples).  low, median, high : of the band of good parts, likewise; null while there is none.  "
+    "bads : the newest bad parts' traces.  corrections : of its label, oldest first."
+)
+Samples = list[list[float | None]]
+HASH, MUCH = ("content_hash",), ("settings", "retrains")  # 64 bits are no JavaScript's; `ever.retrains` counts those
 IN_LINE: Json = {"waiting": int, "late": int, "busy": int, "deadline": float}
-TRACE = {"trace": list[list[float | None]]}
 ANSWERS: dict[str, type[Struct]] = {
     "Answer": _answer("Answer", f"A decision, as it is recorded.\n{LATE}", Decision, late=bool, seconds=float),
     "Told": _answer("Told", "The label is on the disk.", Told),
-    "Decision": _answer("Decision", "A decision with its label.", Decision, StoredDecision, optional=TRACE),
-    "Status": _answer("Status", LINE, Status, **IN_LINE, alarm=str),
+    "Changed": _answer("Changed", "", Changed),
+    "Decision": _answer(
+        "Decision", "A decision with its label.", StoredDecision, without=HASH, optional={"trace": Samples}
+    ),
+    "Explanation": _answer(
+        "Explanation",
+        ARRAYS,
+        Explanation,
+        trace=Samples,
+        low=Samples | None,
+        median=Samples | None,
+        high=Samples | None,
+        bads=list[Samples],
+        corrections=list[_shape(Correction)],  # type: ignore[misc]  # made above
+    ),
+    "Status": _answer("Status", LINE, Status, without=MUCH, **IN_LINE, alarm=str, check_seconds=float),
+    "Course": _answer("Course", "", Course),
+    "PartMap": _answer("PartMap", "", PartMap),
+    "Events": _answer("Events", "Newest first.", events=list[_shape(Event)]),  # type: ignore[misc]
+    "Versions": _answer("Versions", "Oldest first.", versions=list[_shape(StoredVersion)]),  # type: ignore[misc]
     "Health": Health,
     "Problem": Problem,
 }
-Known = ANSWERS["Decision"]
-ANSWERS["Decisions"] = _answer("Decisions", "Newest first.", decisions=list[Known])  # type: ignore[valid-type]  # made above
+OLDER = "Newest first.  older : what `before` of the next request says for the ones before these; null: there are none."
+Known: Any = ANSWERS["Decision"]
+ANSWERS["Decisions"] = _answer("Decisions", OLDER, decisions=list[Known], older=str | None)
 
 
-def answer(name: str, *records: object, **more: Any) -> Struct:
-    """An answer out of records' fields and properties; of two that have one, the later's."""
-    names = ANSWERS[name].__struct_fields__
-    return ANSWERS[name](**{key: getattr(each, key) for each in records for key in names if hasattr(each, key)} | more)
+def answer(name: str, *records: object, **more: Any) -> Json:
+    """An answer: what it has of records' fields, and more of them."""
+    said = {key: value for each in records for key, value in plain(each).items()} | more
+    return {key: said[key] for key in ANSWERS[name].__struct_fields__ if key in said}
 
 
 def answered(body: Any, status: int = 200, headers: Mapping[str, str] | None = None, kind: str = JSON) -> Response:
@@ -297,6 +422,7 @@ STATUSES: dict[type[Exception], int] = {  # the first that fits
     UnknownDecisionError: 404,
     ReportConflictError: 409,
     TraceConflictError: 409,
+    VersionError: 404,
     BusyError: 503,
     StoreError: 503,
     DengineError: 422,
@@ -311,33 +437,46 @@ HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
 class Operation(NamedTuple):
     """One method on one path.
 
-    run : answers it; its docstring says what it does.  answer : of `ANSWERS`, or a media type.  problems : statuses.
-    takes : the struct of its body.  query : of its query.  examples : of its body.  raw : whether the body may be bytes.
+    run : answers what is asked; its docstring says what it does.  answer : of `ANSWERS`, or a media type.
+    takes : the struct of a POST's body, of a GET's query and path; None: it is not looked at.
+    raw : whether the body may be bytes: `run` reads the request itself.  examples : of the body.
     """
 
     method: str
     path: str
-    run: Callable[[Request], Awaitable[Response]]
+    run: Callable[[Any], Awaitable[Json | Response]]
     answer: str
-    problems: tuple[int, ...] = ()
     takes: type[Struct] | None = None
-    query: type[Struct] | None = None
-    examples: tuple[Json, ...] = ()
     raw: bool = False
+    examples: tuple[Json, ...] = ()
+
+    async def serve(self, request: Request) -> Response:
+        """Read what is asked, and answer it."""
+        asked: Any = request
+        if self.takes is not None and not self.raw:
+            asked = read_query(request, self.takes) if self.method == "GET" else await read_struct(request, self.takes)
+        found = await self.run(asked)
+        return found if isinstance(found, Response) else answered(found)
 
     def described(self) -> Json:
         """It, as the document has it."""
         known = self.answer in ANSWERS
         schema = {"$ref": f"#/components/schemas/{self.answer}"} if known else {"type": "string"}
-        content: Json = {JSON if known else self.answer: {"schema": schema}}
-        responses = {"200": {"description": "Done.", "content": content}}
-        responses |= {str(s): {"$ref": f"#/components/responses/{s}"} for s in sorted({*self.problems, *EVERYWHERE})}
-        asked = _schemas([self.query])[self.query.__name__]["properties"] if self.query else {}
-        parameters = [{"name": name, "in": "query", "required": False, "schema": kind} for name, kind in asked.items()]
-        if "{" in self.path:
-            parameters.append({"name": "id", "in": "path", "required": True, "schema": {"type": "string"}})
-        said = {"summary": " ".join((self.run.__doc__ or "").split()), "parameters": parameters, "responses": responses}
+        wrong = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+        responses = {
+            "200": {"description": "Done.", "content": {JSON if known else self.answer: {"schema": schema}}},
+            "default": {"description": "A problem.", "content": wrong},
+        }
+        said: Json = {"summary": " ".join((self.run.__doc__ or "").split()), "parameters": [], "responses": responses}
         if self.takes is None:
+            return said
+        query = RawQuery if self.raw else self.takes
+        if self.method == "GET" or self.raw:
+            for name, kind in _schemas([query])[query.__name__]["properties"].items():
+                here = f"{{{name}" in self.path
+                place = {"name": name, "in": "path" if here else "query", "required": here, "schema": kind}
+                said["parameters"].append(place)
+        if self.method == "GET":
             return said
         body: Json = {"schema": {"$ref": f"#/components/schemas/{self.takes.__name__}"}}
         examples = {"examples": {str(i): {"value": value} for i, value in enumerate(self.examples)}}
@@ -362,23 +501,17 @@ def _schemas(kinds: Iterable[Any]) -> Json:
 
 def document(operations: Iterable[Operation], version: str) -> Json:
     """The OpenAPI document of these operations."""
-    after = {"Retry-After": {"schema": {"type": "integer"}, "description": f"Seconds, {RETRY_AFTER} as a rule."}}
-    content = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     paths: Json = {}
     for each in operations:
         paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = each.described()
-    components = {
-        "schemas": _schemas([*ANSWERS.values(), *(each.takes for each in operations if each.takes)]),
-        "responses": {
-            str(status): {"description": about, "content": content} | ({"headers": after} if status in LATER else {})
-            for status, about in PROBLEMS.items()
-        },
-        "securitySchemes": {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")},
-    }
+    bodies = {each.takes for each in operations if each.takes and each.method == "POST"}
     return {
         "openapi": "3.1.0",
         "info": {"title": "dengine serve", "version": version, "description": "A robot cell's data engine."},
         "paths": paths,
-        "components": components,
+        "components": {
+            "schemas": _schemas([*ANSWERS.values(), *bodies]),
+            "securitySchemes": {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")},
+        },
         "security": [{}, {"bearer": []}, {"basic": []}],
     }

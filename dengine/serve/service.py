@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine
 from ..errors import BusyError
-from ..history.status import Status, status
+from ..history.status import NEWEST, Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
 from ..store.base import Store, open_store
 from ..store.records import StoredDecision
@@ -40,10 +40,14 @@ IDLE = 0.05  # seconds between two looks at what the engine has to do while nobo
 
 
 class Job(NamedTuple):
-    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more."""
+    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more.
+
+    looks : it changes nothing, so that nobody is told of a change.
+    """
 
     future: Future[Any]
     work: Callable[[DataEngine, bool], Any]
+    looks: bool = False
 
     def run(self, engine: DataEngine) -> None:
         """Do it, also where whoever asked has cancelled the future meanwhile."""
@@ -90,6 +94,7 @@ class CellService:
     store : the same store's name, for `reading`; None: the engine remembers in memory.
     deadline : seconds that a decision may wait in line; then the answer is VERIFY, `Reason.LATE`, and recorded so.
     most : requests in line; one more is a BusyError, and nothing of it is recorded.
+    check_seconds : that the expensive verification takes, for the time that was saved: the paper's height check.
     """
 
     def __init__(
@@ -98,8 +103,9 @@ class CellService:
         store: str | os.PathLike[str] | None = None,
         deadline: float = DEADLINE,
         most: int = MOST,
+        check_seconds: float = 5.0,
     ) -> None:
-        self.deadline = deadline
+        self.deadline, self.check_seconds = deadline, check_seconds
         self.late = self.busy = 0  # answers since it began
         self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
         self._jobs: queue.Queue[Job | None] = queue.Queue(most)
@@ -135,9 +141,10 @@ class CellService:
             self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
 
-    async def report(self, decision_id: str, success: float) -> Told:
+    async def report(self, decision_id: str, success: float, author: str = "") -> Told:
         """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
 
+        author : of a person's report, for the event log; "": a machine's, which is not an event.
         ReportError as `DataEngine.report`; BusyError where too many wait.
         """
         begin, said = time.monotonic(), as_success(success)
@@ -146,7 +153,11 @@ class CellService:
             known = engine.find(decision_id)
             if known is not None and known.success is said:
                 return True, None
-            return False, engine.report(decision_id, said)
+            retrain = engine.report(decision_id, said)
+            if author:
+                text = f"decision {decision_id} was {'good' if said else 'bad'}"
+                engine.store.put_event("report", text, author=author)
+            return False, retrain
 
         repeated, retrain = await self.ask(work)
         if retrain is not None:
@@ -155,7 +166,7 @@ class CellService:
 
     async def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace and label; None for an unknown id."""
-        return await self.ask(lambda engine: engine.find(decision_id))
+        return await self._look(lambda engine: engine.find(decision_id))
 
     async def ask(self, work: Callable[[DataEngine], T]) -> T:
         """Do something in the engine's thread, between two decisions; what it raises is raised here."""
@@ -168,17 +179,20 @@ class CellService:
     async def read(self, work: Callable[[Store], T]) -> T:
         """Read the store as the disk has it, in a thread of its own; in the engine's where it remembers in memory."""
         if self.reading is self.engine.store:
-            return await self.ask(lambda engine: work(engine.store))
+            return await self._look(lambda engine: work(engine.store))
         return await asyncio.to_thread(work, self.reading)
 
     async def look(self, work: Callable[[Store], T]) -> T:
         """Read a store that holds all that was decided so far."""
-        await self.ask(lambda engine: engine.flush())
+        await self._look(lambda engine: engine.flush())
         return await self.read(work)
 
-    async def status(self) -> Status:
-        """How the cell is doing: by its store, and by what the running engine alone knows."""
-        found, engine = await self.read(status), self.engine
+    async def _look(self, work: Callable[[DataEngine], T]) -> T:
+        return await asyncio.wrap_future(self._put(lambda engine, late: work(engine), looks=True))
+
+    async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
+        """How the cell is doing, as `history.status`: by its store, and by what the running engine alone knows."""
+        found, engine = await self.look(lambda store: status(store, last, watching)), self.engine
         live = ("version", "shadow", "safe_mode", "new_labels", "store_fault", "retraining")
         return replace(found, **{name: getattr(engine, name) for name in live})
 
@@ -192,14 +206,20 @@ class CellService:
         """Seconds since the engine's thread last took a job, or looked for one; infinite where it has ended."""
         return time.monotonic() - self._beat if self._thread.is_alive() else float("inf")
 
-    async def changes(self) -> AsyncIterator[None]:
-        """Yield whenever something has changed since the last yield, at once for the first time."""
+    async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
+        """Yield True whenever something has changed since the last yield, at once for the first time.
+
+        quiet : seconds without a change, after which False is yielded; None: never.
+        """
         here = asyncio.get_running_loop(), asyncio.Event()
         self._listeners.add(here)
         try:
+            changed = True
             while not self._listening_ended:
-                yield
-                await here[1].wait()
+                yield changed
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(here[1].wait(), quiet)
+                changed = here[1].is_set()
                 here[1].clear()
         finally:
             self._listeners.discard(here)
@@ -224,8 +244,8 @@ class CellService:
         if self.reading is not self.engine.store:
             self.reading.close()
 
-    def _put(self, work: Callable[[DataEngine, bool], T]) -> Future[T]:
-        job = Job(Future(), work)
+    def _put(self, work: Callable[[DataEngine, bool], T], looks: bool = False) -> Future[T]:
+        job = Job(Future(), work, looks)
         if self._closing or not self._thread.is_alive():
             raise BusyError(CLOSING)
         try:
@@ -257,7 +277,8 @@ class CellService:
         with engine:
             while (job := self._next(engine)) is not None:
                 job.run(engine)
-                self._tell()
+                if not job.looks:
+                    self._tell()
 
     def _next(self, engine: DataEngine) -> Job | None:
         """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""

@@ -575,6 +575,8 @@ class SqlStore:
     ) -> list[StoredDecision]:
         of = ((DECISION.c.action, where.action), (DECISION.c.predicted, where.predicted), (DECISION.c.reason, where.reason))
         meant = [column == wanted.value for column, wanted in of if wanted is not None]
+        if where.part is not None:
+            meant.append(DECISION.c.part == where.part)
         if where.label is not None:
             label = LABELS[where.label]
             meant.append(SAID.is_(None) if label is None else SAID.in_([int(label)]))

@@ -89,7 +89,7 @@ LABELS: dict[str, bool | None] = {"good": True, "bad": False, "none": None}
 class HistoryFilter:
     """Which decisions are meant; None: all.
 
-    predicted : what the model alone would have done.
+    predicted : what the model alone would have done.  part : its number.
     label : good, bad or none.  since, until : times in seconds, the first included, the last not.
     Raises StoreError for a label that is none of these.
     """
@@ -100,6 +100,7 @@ class HistoryFilter:
     since: float | None = None
     until: float | None = None
     predicted: Action | None = None
+    part: str | None = None
 
     def __post_init__(self) -> None:
         if self.label is not None and self.label not in LABELS:
@@ -114,6 +115,7 @@ class HistoryFilter:
             and (self.since is None or past.time >= self.since)
             and (self.until is None or past.time < self.until)
             and (self.predicted is None or past.decision.predicted is self.predicted)
+            and (self.part is None or past.decision.part == self.part)
         )
 
 

@@ -9,7 +9,9 @@ import socket
 import ssl
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ import pytest
 from click.testing import CliRunner
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
-for name in ("starlette", "prometheus_client", "defusedxml", "jinja2", "sse_starlette"):
+for name in ("starlette", "prometheus_client", "defusedxml"):
     pytest.importorskip(name)
 httpx = pytest.importorskip("httpx", reason="the tests' HTTP client is not installed: pip install httpx")
 msgpack = pytest.importorskip("msgspec.msgpack")
@@ -177,7 +179,7 @@ def test_asked_again_it_answers_the_same(client: Client, stream: Dataset) -> Non
 
 
 def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Dataset) -> None:
-    client.post("/decide", **forms(stream.X[2] * 9, "label-0")["JSON"])
+    client.post("/decide", json={"trace": (stream.X[2] * 9).tolist(), "request": "label-0"})
     assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
     for repeated in (False, True):
         told = client.post("/report", json={"id": "label-0", "success": True}).json()
@@ -194,15 +196,143 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
 
 
 def test_what_can_be_looked_at_is_as_the_document_says(client: Client) -> None:
-    listed = client.get("/decisions", params={"limit": 3})
-    for answer, schema in ((client.get("/status"), "Status"), (client.get("/healthz"), "Health"), (listed, "Decisions")):
-        validate(answer.json(), schema, client)
-    times = [each["time"] for each in listed.json()["decisions"]]
-    assert len(times) == 3
-    assert times == sorted(times, reverse=True)
-    must_be_problem(client.get("/decisions/nobody"), 404)
-    for query in ("limit=0", "limit=x", "limit=9999", "open=yes"):
-        must_be_problem(client.get(f"/decisions?{query}"), 422)
+    newest = client.get("/decisions?limit=1").json()["decisions"][0]["id"]
+    for path, schema in {
+        "status?watch=true&last=7": "Status",
+        "healthz": "Health",
+        "decisions?limit=3": "Decisions",
+        f"explanations/{newest}": "Explanation",
+        "course": "Course",
+        "embedding": "PartMap",
+        "versions": "Versions",
+        "events?limit=3": "Events",
+    }.items():
+        validate(client.get(f"/{path}").json(), schema, client)
+    for path in ("decisions/nobody", "explanations/nobody"):
+        must_be_problem(client.get(f"/{path}"), 404)
+    queries = ("limit=0", "limit=x", "limit=9999", "open=yes", "label=fine", "before=x,y", "prat=7", "since=monday")
+    for path in (*(f"decisions?{query}" for query in queries), "course?last=3", "events?limit=0", "status?last=0"):
+        must_be_problem(client.get(f"/{path}"), 422)
+
+
+def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another(stream: Dataset) -> None:
+    with serving() as (_, client):
+        for i in range(7):
+            client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"found-{i}", "part": f"F{i % 6}"})
+        client.post("/report", json={"id": "found-1", "success": False})
+
+        def found(**query: Any) -> list[str]:
+            return [each["id"] for each in client.get("/decisions", params=query).json()["decisions"]]
+
+        assert found(part="F0") == ["found-6", "found-0"]
+        assert found(part="F1", label="bad", action="verify") == ["found-1"]
+        assert found(part="F1", action="reject") == found(part="nobody") == found(part="F1", until=1.0) == []
+        pages, older = [], None
+        while older is not None or not pages:
+            page = client.get("/decisions", params={"limit": 3} | ({"before": older} if older else {})).json()
+            pages += [each["id"] for each in page["decisions"]]
+            older = page["older"]
+        assert len(pages) == len(set(pages)) == client.get("/status").json()["ever"]["decisions"]
+        # An accepted part that comes back is reported by its number; one with several decisions needs the id.
+        problem = must_be_problem(client.post("/report", json={"part": "F0", "success": False}), 409)
+        assert "found-6, found-0" in problem["detail"]
+        told = client.post("/report", json={"part": "F2", "success": False, "author": "Kim"}).json()
+        assert (told["decision_id"], told["success"]) == ("found-2", False)
+        assert client.get("/events?limit=1").json()["events"][0]["author"] == "Kim"
+        assert client.post("/report", json={"part": "found-3", "success": True}).json()["decision_id"] == "found-3"
+        must_be_problem(client.post("/report", json={"part": "nobody", "success": False}), 404)
+        for both in ({}, {"id": "found-0", "part": "F0"}):
+            must_be_problem(client.post("/report", json={"success": False} | both), 422)
+
+
+def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(stream: Dataset) -> None:
+    with serving() as (service, client):
+        for i in range(3):
+            client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"wrong-{i}"})
+            client.post("/report", json={"id": f"wrong-{i}", "success": True})
+        for path, asked in (
+            ("correct", {"id": "wrong-0", "success": False}),
+            ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
+            ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
+            ("policy", {"shadow": True}),
+        ):
+            changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
+            validate(changed, "Changed", client)
+            assert changed["event"] is not None
+            assert client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
+        events = client.get("/events").json()["events"]
+        assert [each["kind"] for each in events] == ["shadow", "policy", "forget", "correct"]
+        assert {each["author"] for each in events} == {"Kim Lee"}
+        assert (service.engine.policy.alpha, service.engine.shadow) == (0.2, True)
+        assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [False, None, None]
+
+
+@pytest.mark.parametrize(
+    ("status", "path", "asked"),
+    [
+        (422, "correct", {"id": "label-0", "success": False}),
+        (422, "correct", {"id": "label-0", "success": False, "author": "  "}),
+        (422, "forget", {"ids": [], "author": "Kim"}),
+        (422, "retrain", {"author": "x" * 300}),
+        (422, "retrain", {"author": "Kim\u202e"}),
+        (422, "correct", {"id": "label-0", "success": "bad", "author": "Kim"}),
+        (404, "correct", {"id": "nobody", "success": False, "author": "Kim"}),
+        (404, "rollback", {"version": 7, "author": "Kim"}),
+        (422, "rollback", {"version": "../1", "author": "Kim"}),
+        (422, "policy", {"alpha": 7, "author": "Kim"}),
+        (422, "policy", {"guarantee": "os:system", "author": "Kim"}),  # nothing is imported since a request names it
+        (422, "export", {"author": "Kim"}),  # there is no model yet
+    ],
+)
+def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event(status: int, path: str, asked: dict[str, Any]) -> None:
+    with serving() as (_, client):
+        must_be_problem(client.post(f"/{path}", json=asked), status)
+        must_be_problem(client.post(f"/{path}", json=asked, headers={"origin": "http://evil.example"}), 403)
+        assert client.get("/events").json()["events"] == []
+
+
+def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> None:
+    free = threading.Event()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(free.wait, 60)  # what follows waits behind it
+        service = CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), deadline=60.0)
+        try:
+            with running(service) as client:
+                for i in range(20):
+                    client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"order-{i}"})
+                    client.post("/report", json={"id": f"order-{i}", "success": bool(stream.y[i])})
+                texts = [client.post("/retrain", json={"author": "Kim"}).json()["text"] for _ in range(2)]
+            assert texts == ["The retrain has begun.", "A retrain is under way already; nothing changed."]
+        finally:
+            free.set()
+            service.close()
+
+
+def test_whoever_listens_is_told_of_changes_and_not_of_looks(stream: Dataset) -> None:
+    with serving() as (service, client), client.stream("GET", "/changes") as answer:
+        events = (line.removeprefix("event: ") for line in answer.iter_lines() if line.startswith("event: "))
+        assert [next(events), next(events)] == ["hello", "changed"]
+        for _ in range(3):
+            client.get("/status")
+            client.get("/decisions")
+        assert next(events) == "tick"  # five seconds of quiet
+        client.post("/decide", json={"trace": stream.X[0].tolist()})
+        assert next(events) == "changed"
+        service.end_listening()
+        assert list(events) == []
+
+
+def test_the_page_is_files_that_may_ask_nobody_else(hasty: Client) -> None:
+    for view in ("", "overview", "map", "part?id=nobody", "history", "actions"):
+        answer = hasty.get(f"/{view}")
+        assert answer.status_code == 200
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+        assert "unsafe" not in policy
+    for path in re.findall(r'(?:src|href)="(page/[^"]+)"', answer.text):
+        assert hasty.get(f"/{path}").status_code == 200
+    for unknown in ("/page/static/../__init__.py", "/page/static/%2e%2e/__init__.py", "/how"):
+        assert hasty.get(unknown).status_code == 404
 
 
 def test_the_document_names_every_route_and_every_example_is_served(service: CellService, client: Client) -> None:
@@ -326,7 +456,8 @@ def test_a_token_is_asked_for_and_compared(stream: Dataset) -> None:
         ):
             refused = client.get("/status", headers=headers)
             must_be_problem(refused, 401)
-            assert refused.headers["www-authenticate"].startswith("Bearer")
+            asked = refused.headers.get_list("www-authenticate")
+            assert [each.split()[0] for each in asked] == ["Basic", "Bearer"]  # a line each, or no browser asks for it
         assert client.get("/status", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
         assert client.get("/status", auth=("anybody", TOKEN)).status_code == 200
         assert client.get("/healthz").status_code == 200

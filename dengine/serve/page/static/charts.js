@@ -1,0 +1,281 @@
+// Pictures of what the server answers: traces and courses by uPlot, bounds and the map as SVG. Each says what it shows in words.
+
+import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
+
+const CHANNELS = 3; // drawn, those that leave the band farthest
+const drawn = new Map(); // a chart's element: its uPlot, and what watches its width
+const probe = document.createElement("span");
+
+function colour(name) {
+  if (!probe.isConnected) document.body.append(probe);
+  probe.hidden = true;
+  probe.style.color = `var(--${name})`;
+  return getComputedStyle(probe).color; // of light-dark() the one that holds
+}
+
+function chart(key, alt, height, made) {
+  // made : uPlot's options and data, asked for once the chart is in the page, and again in another appearance.
+  const node = el("div", { class: "chart", role: "img", "aria-label": alt, "data-chart": key });
+  node.make = () => {
+    const { options, data } = made();
+    const size = () => ({ width: Math.max(200, node.clientWidth), height });
+    const plot = new uPlot({ ...size(), legend: { show: false }, cursor: { y: false, drag: { setScale: false } }, ...options }, data, node);
+    const watch = new ResizeObserver(() => plot.setSize(size()));
+    watch.observe(node);
+    drawn.set(node, { plot, watch });
+  };
+  return node;
+}
+
+export function drawAll(anew = false) {
+  // Draw what is new in the page, and let go of what has left it.
+  for (const [node, { plot, watch }] of drawn) {
+    if (node.isConnected && !anew) continue;
+    watch.disconnect();
+    plot.destroy();
+    drawn.delete(node);
+  }
+  for (const node of document.querySelectorAll("[data-chart]")) if (!drawn.has(node)) node.make();
+}
+
+function axis(side, given = {}) {
+  const ink = colour("muted");
+  const grid = { stroke: colour("edge"), width: 1 };
+  return { side, stroke: ink, font: "14px system-ui, sans-serif", labelFont: "14px system-ui, sans-serif", grid, ticks: grid, ...given };
+}
+
+// Traces
+
+export function traceCharts(found) {
+  const widest = found.trace.map(() => 0);
+  for (const each of found.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
+  const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
+  return order.slice(0, CHANNELS).sort((a, b) => a - b).map((channel) => traceChart(found, channel));
+}
+
+function traceChart(found, channel) {
+  const trace = found.trace[channel];
+  const band = found.low && [found.high[channel], found.low[channel], found.median[channel]];
+  const bads = found.bads.map((bad) => bad[channel]);
+  const key = [found.decision.id, channel, found.envelope?.n, bads.length].join(" ");
+  const said = traceWords(found, channel);
+  const line = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
+  const made = () => ({
+    data: [trace.map((_, i) => i / found.spec.rate_hz), ...(band ?? []), ...bads, trace],
+    options: {
+      scales: { x: { time: false } },
+      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: found.spec.unit, labelSize: 22, size: 56 })],
+      bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
+      series: [
+        {},
+        ...(band ? [line("good-soft", 0), line("good-soft", 0), line("good", 1.6)] : []),
+        ...bads.map(() => line("bad", 1, [7, 4])),
+        line("trace", 2.4),
+      ],
+    },
+  });
+  return el("figure", {}, chart(key, said, 220, made), el("figcaption", {}, said));
+}
+
+function traceWords(found, channel) {
+  const { envelope, spec } = found;
+  const values = found.trace[channel].filter((value) => value !== null);
+  const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
+  const of = found.trace.length > 1 ? `${spec.columns[channel] ?? `Channel ${channel + 1}`}: ` : "";
+  const said = `${of}Force over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. `;
+  if (!envelope) return `${said}No band of good parts is drawn before 20 of them are known.`;
+  const outside = `${said}${percent(envelope.outside, 1)} of it lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
+  const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
+  if (!most) return outside;
+  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} between ${number(most.from_s, 2)} s and ${number(most.to_s, 2)} s.`;
+}
+
+export function traceLegend(found) {
+  const { envelope } = found;
+  const swatch = (kind, text) => el("li", {}, el("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
+  return el("ul", { class: "legend" },
+    swatch("line-trace", "this part"),
+    envelope && [swatch("area-band", `95 % of ${number(envelope.n)} good parts`), swatch("line-median", "their median")],
+    found.bads.length > 0 && swatch("line-bad", `bad parts (${number(found.bads.length)})`));
+}
+
+// The course of decisions
+
+export function courseChart(course) {
+  const ends = [0];
+  for (const each of course.stretches) ends.push(ends.at(-1) + each.n);
+  const share = (name) => [...course.stretches, course.stretches.at(-1)].map((each) => each[name] / each.n);
+  const [verified, accepted, novel] = ["verified", "accepted", "novel"].map(share);
+  const after = (time) => ends[course.stretches.filter((each) => each.last <= time).length];
+  const said = `Share of verified parts from the first to the newest: it began at ${percent(verified[0])} and is now at ${percent(verified.at(-1))}; accepted without a check now: ${percent(accepted.at(-1))}.`;
+
+  function marks(plot) {
+    const { ctx, bbox } = plot;
+    const at = (x) => plot.valToPos(x, "x", true);
+    const size = 5 * devicePixelRatio;
+    ctx.save();
+    ctx.setLineDash([]);
+    ctx.fillStyle = colour("muted");
+    for (const x of new Set(course.retrains.map((each) => at(after(each.time))))) {
+      ctx.beginPath();
+      ctx.moveTo(x - size, bbox.top + bbox.height);
+      ctx.lineTo(x, bbox.top + bbox.height - 2 * size);
+      ctx.lineTo(x + size, bbox.top + bbox.height);
+      ctx.fill();
+    }
+    ctx.strokeStyle = colour("bad");
+    ctx.lineWidth = 3 * devicePixelRatio;
+    course.stretches.forEach((each, i) => {
+      if (!each.bad) return;
+      const [x, y] = [at((ends[i] + ends[i + 1]) / 2), bbox.top + 2 * size];
+      ctx.beginPath();
+      ctx.moveTo(x - size, y - size);
+      ctx.lineTo(x + size, y + size);
+      ctx.moveTo(x + size, y - size);
+      ctx.lineTo(x - size, y + size);
+      ctx.stroke();
+    });
+    ctx.restore();
+  }
+
+  const paths = (...given) => uPlot.paths.stepped({ align: 1 })(...given);
+  const line = (name, width, dash) => ({ stroke: colour(name), width, dash, paths, points: { show: false } });
+  const made = () => ({
+    data: [ends, verified, accepted, novel],
+    options: {
+      scales: { x: { time: false }, y: { range: [0, 1] } },
+      axes: [axis(2, { label: "parts", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { size: 62, values: (_, ticks) => ticks.map((tick) => percent(tick)) })],
+      series: [{}, line("open", 3), line("good", 2, [8, 3]), line("muted", 1.5, [2, 3])],
+      hooks: { draw: [marks] },
+    },
+  });
+  const legend = [["line-verified", "verified"], ["line-accepted", "accepted"], ["line-novel", "novel"]].map(([kind, text]) =>
+    el("li", {}, el("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text));
+  legend.push(el("li", {}, el("span", { "aria-hidden": "true" }, "▲"), "retrain"));
+  legend.push(el("li", { class: "label bad" }, el("span", { "aria-hidden": "true" }, "✕"), "bad accepted"));
+  return [el("figure", {}, chart(JSON.stringify(course.stretches.map((each) => each.n)) + ends.at(-1) + course.retrains.length, said, 260, made), el("figcaption", {}, said)),
+    el("ul", { class: "legend" }, legend)];
+}
+
+// Bounds: a bar over the zones in which a part is accepted or rejected
+
+export function boundChart(bound) {
+  const zones = [];
+  const marks = [];
+  if (bound.reject_at !== null) {
+    zones.push([0, bound.reject_at, "reject"]);
+    marks.push(["✕ ≤", bound.reject_at]);
+  }
+  if (bound.accept_at !== null) {
+    zones.push([bound.accept_at, 1, "accept"]);
+    marks.push(["✓ ≥", bound.accept_at]);
+  }
+  const said = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_at, 1)} on, rejected up to ${percent(bound.reject_at, 1)}.`;
+  return interval(1, bound.lower, bound.upper, zones, marks, said);
+}
+
+export function judgedChart(judged) {
+  const most = Math.min(1, Math.max(0.02, 2 * judged.tolerance, 1.1 * judged.upper));
+  const said = `The share of wrong ones lies between ${percent(judged.lower, 1)} and ${percent(judged.upper, 1)}; the tolerance is ${percent(judged.tolerance, 1)}.`;
+  return interval(most, judged.lower, judged.upper, [[0, judged.tolerance, "accept"]], [["≤", judged.tolerance]], said);
+}
+
+function interval(most, lower, upper, zones, marks, said) {
+  const [begin, end, middle] = [16, 464, 42];
+  const x = (value) => begin + (Math.min(value, most) / most) * (end - begin);
+  const bar = (low, high, half, least, kind) =>
+    svg("rect", { x: x(low), y: middle - half, width: Math.max(least, x(high) - x(low)), height: 2 * half, class: kind });
+  const places = marks.map(([, value]) => Math.min(Math.max(x(value), begin + 44), end - 44));
+  const text = (words, at, kind) => svg("text", { x: at, y: 88, class: kind, "aria-hidden": "true" }, words);
+  const ends = [[0, begin, "start"], [most, end, "end"]].filter(([, at]) => places.every((place) => Math.abs(at - place) > 110));
+  return svg("svg", { viewBox: "0 0 480 96", role: "img", "aria-label": said, class: "bound" },
+    bar(0, most, 20, 0, "axis"),
+    zones.map(([low, high, kind]) => bar(low, high, 20, 1, `zone ${kind}`)),
+    bar(lower, upper, 7, 3, "interval"),
+    [lower, upper].map((value) => svg("line", { x1: x(value), x2: x(value), y1: middle - 15, y2: middle + 15, class: "interval-end" })),
+    marks.map(([sign, value], i) => text(`${sign} ${percent(value)}`, places[i], "middle strong")),
+    ends.map(([value, at, kind]) => text(percent(value), at, kind)));
+}
+
+// The map: every mark is a link to its part, and one of them is reached by the tab key
+
+const WIDE = 720;
+const HIGH = 500;
+const ROOM = 24;
+
+export function mapChart(found, chosen) {
+  const xs = found.marks.map((mark) => mark.x);
+  const ys = found.marks.map((mark) => mark.y).sort((a, b) => a - b);
+  const cut = Math.floor(ys.length * 0.005); // outermost parts lie on the edge
+  const across = scale(found.probability ? [0, 1] : [Math.min(...xs), Math.max(...xs)], [ROOM, WIDE - ROOM]);
+  const up = scale([ys[cut], ys.at(-1 - cut)], [HIGH - ROOM, ROOM]);
+  const newest = found.marks.at(-1);
+  const reached = found.marks.find((mark) => mark.id === chosen) ?? newest;
+  const known = found.marks.filter((mark) => mark.action === null);
+  const good = known.filter((mark) => mark.success).length;
+  const said = `Map of ${known.length} known parts, ${good} good and ${known.length - good} bad, and the newest ${found.marks.length - known.length}. Arrow keys go from part to part.`;
+  const ball = found.radius !== null && svg("svg", { x: 0, y: 0, width: WIDE, height: HIGH, "aria-hidden": "true" },
+    svg("ellipse", { cx: across(newest.x), cy: up(newest.y), rx: found.radius * across.per, ry: found.radius * up.per, class: "ball" }));
+  const name = found.probability ? "model's probability of a good part" : "first axis";
+  return svg("svg", { viewBox: `0 0 ${WIDE} ${HIGH + 26}`, role: "group", "aria-label": said, class: "map" },
+    svg("rect", { x: 1, y: 1, width: WIDE - 2, height: HIGH - 2, class: "axis" }),
+    svg("text", { x: WIDE - 4, y: HIGH + 20, class: "end", "aria-hidden": "true" }, `${name} →`),
+    ball,
+    found.marks.map((mark) => mapMark(mark, across(mark.x), up(mark.y), mark === reached, mark.id === chosen, mark === newest)));
+}
+
+function scale([low, high], [begin, end]) {
+  const per = (end - begin) / (high - low || 1);
+  const place = (value) => Number((begin + (Math.min(Math.max(value, low), high) - low) * per).toFixed(1));
+  place.per = Math.abs(per);
+  return place;
+}
+
+function mapMark(mark, x, y, reached, chosen, newest) {
+  const kind = labelOf(mark.success);
+  const name = [nameOf(mark.part, mark.id), mark.action && capital(mark.action), labelWord(kind)].filter(Boolean).join(", ");
+  const shapes = {
+    good: () => svg("circle", { cx: x, cy: y, r: 5.6, class: "shape" }),
+    bad: () => svg("path", { d: `M${x - 7} ${y - 7}l14 14m-14 0l14 -14`, class: "shape cross" }),
+    none: () => svg("rect", { x: x - 5, y: y - 5, width: 10, height: 10, class: "shape" }),
+  };
+  return svg("a", {
+    href: partAddress(mark.id, "map"), id: `mark-${mark.id}`, "data-id": mark.id, "data-x": x, "data-y": y,
+    class: ["mark", kind, mark.action && "recent", newest && mark.action && "newest", chosen && "chosen"].filter(Boolean).join(" "),
+    tabindex: reached ? 0 : -1, "aria-label": name, "aria-current": chosen ? "true" : null,
+  },
+  svg("title", {}, name),
+  svg("circle", { cx: x, cy: y, r: 10.5, class: "hit" }),
+  mark.action && svg("circle", { cx: x, cy: y, r: newest ? 15 : 11, class: "ring" }),
+  shapes[kind]());
+}
+
+const DIRECTIONS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+
+export function goOverMap(event) {
+  // Arrow keys go to the nearest mark in their direction.
+  const mark = event.target.closest?.("a.mark");
+  const direction = DIRECTIONS[event.key];
+  if (!mark || !direction) return;
+  event.preventDefault();
+  const next = nearest(mark, direction);
+  if (!next) return;
+  mark.setAttribute("tabindex", "-1");
+  next.setAttribute("tabindex", "0");
+  next.focus();
+}
+
+function nearest(mark, [dx, dy]) {
+  const place = (each) => [Number(each.dataset.x), Number(each.dataset.y)];
+  const [x, y] = place(mark);
+  let best = null;
+  let least = Infinity;
+  for (const each of mark.parentNode.querySelectorAll("a.mark")) {
+    const [ax, ay] = [place(each)[0] - x, place(each)[1] - y];
+    const along = ax * dx + ay * dy;
+    const beside = Math.abs(ax * dy) + Math.abs(ay * dx);
+    if (each === mark || along <= 0 || beside > 2 * along + 1) continue;
+    if (along + 2 * beside < least) [best, least] = [each, along + 2 * beside];
+  }
+  return best;
+}

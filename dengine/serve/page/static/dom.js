@@ -1,0 +1,83 @@
+// Elements out of data, and how numbers, times and the engine's words are written. Text stays text: nothing is parsed as HTML.
+
+const SVG = "http://www.w3.org/2000/svg";
+const SHAPES = {
+  accept: "M4 13l5 5L20 6",
+  reject: "M5 5l14 14M19 5L5 19",
+  verify: "M17 10.5a6.5 6.5 0 1 1-13 0a6.500 6.500 0 1 1 13 0M15.500 15.500L21 21",
+  shield: "M12 3l8 3v6c0 5-3.500 8-8 9-4.500-1-8-4-8-9V6Z",
+  none: "M12 10a2 2 0 1 0 .01 0",
+};
+SHAPES.good = SHAPES.kept = SHAPES.accept;
+SHAPES.bad = SHAPES.broken = SHAPES.reject;
+SHAPES.open = SHAPES.verify;
+
+function filled(node, given, children) {
+  for (const [name, value] of Object.entries(given)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else node.setAttribute(name, value === true ? "" : value);
+  }
+  node.append(...children.flat(9).filter((each) => each !== null && each !== undefined && each !== false));
+  return node;
+}
+
+export const el = (name, given = {}, ...children) => filled(document.createElement(name), given, children);
+export const svg = (name, given = {}, ...children) => filled(document.createElementNS(SVG, name), given, children);
+export const icon = (name) => svg("svg", { class: "icon", viewBox: "0 0 24 24", "aria-hidden": "true" }, svg("path", { d: SHAPES[name] }));
+
+export function number(value, digits = 0) {
+  if (value === null || value === undefined) return "–";
+  const text = Math.abs(value).toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  return value < 0 && /[1-9]/.test(text) ? `−${text}` : text;
+}
+
+export const percent = (share, digits = 0) => (share === null || share === undefined ? "–" : `${number(100 * share, digits)}\u202f%`);
+
+export function duration(seconds) {
+  if (Math.abs(seconds) < 120) return `${number(seconds)} s`;
+  return Math.abs(seconds) < 7200 ? `${number(seconds / 60)} min` : `${number(seconds / 3600, 1)} h`;
+}
+
+const two = (n) => String(n).padStart(2, "0");
+
+export function clock(seconds) {
+  const at = new Date(seconds * 1000);
+  return `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+}
+
+export function moment(seconds) {
+  const at = new Date(seconds * 1000);
+  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${clock(seconds)}`;
+}
+
+export const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
+const REASONS = {
+  not_finite: "samples missing", constant: "dead sensor", saturated: "sensor at its limit",
+  no_model: "no model yet", no_store: "store away", late: "too late",
+};
+const LABELS = { good: "good", bad: "bad", none: "not known" };
+const SOURCES = { verification: "check", audit: "audit", stop: "system stop", confirmed: "confirmed later" };
+
+export const ACTIONS = ["verify", "accept", "reject"];
+export const REASON_NAMES = [
+  "certain", "uncertain", "no_model", "audit", "not_finite", "constant", "saturated", "model_error", "novel", "safe_mode", "no_store", "late",
+];
+export const LABEL_NAMES = Object.keys(LABELS);
+export const reasonOf = (name) => REASONS[name] ?? name.replace("_", " ");
+export const labelWord = (name) => LABELS[name];
+export const labelOf = (success) => (success === null ? "none" : success ? "good" : "bad");
+export const sourceOf = (name) => SOURCES[name] ?? name;
+export const nameOf = (part, id) => part ?? id.slice(0, 12);
+export const partAddress = (id, view = "part") => `${view}?id=${encodeURIComponent(id)}`;
+
+export const chip = (action) => el("span", { class: `chip ${action}` }, icon(action), capital(action));
+export const label = (success) => el("span", { class: `label ${labelOf(success)}` }, icon(labelOf(success)), labelWord(labelOf(success)));
+
+export function table(titles, rows, given = {}) {
+  // titles : [text, class]; rows : arrays of cells, in the same order.
+  const head = titles.map(([title, kind]) => el("th", { scope: "col", class: kind }, title));
+  const body = rows.map((row) => el("tr", {}, row.map((cell, i) => el("td", { class: titles[i][1] }, cell))));
+  return el("table", given, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body));
+}
