@@ -195,8 +195,8 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
     assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()["repeated"]
 
 
-def test_what_can_be_looked_at_is_as_the_document_says(client: Client) -> None:
-    newest = client.get("/decisions?limit=1").json()["decisions"][0]["id"]
+def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: Dataset) -> None:
+    newest = client.post("/decide", json={"trace": stream.X[9].tolist()}).json()["id"]
     for path, schema in {
         "status?watch=true&last=7": "Status",
         "healthz": "Health",

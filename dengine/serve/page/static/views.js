@@ -125,16 +125,17 @@ function labelActions(decision) {
   return two((good) => act.report(id, good, action === "accept" && !good));
 }
 
-function detail(found) {
+function detail(found, level) {
+  const head = (text) => el(`h${level}`, {}, text);
   const { decision } = found;
   return [
     el("p", { class: "headline" }, chip(decision.action), " ", el("span", { class: "muted" }, reasonOf(decision.reason)), " ", label(decision.success)),
     traceCharts(found), traceLegend(found),
-    el("h3", {}, "Why"), why(found),
-    found.bound && [el("h3", {}, "Bound"), bound(found)],
-    el("h3", {}, "Neighbours"), counts(decision), neighbours(found),
-    el("h3", {}, "Its history"), story(found), el("p", { class: "muted" }, "Decision ", el("code", {}, decision.id)),
-    el("h3", {}, "Its label"), el("p", { class: "buttons" }, labelActions(decision)),
+    head("Why"), why(found),
+    found.bound && [head("Bound"), bound(found)],
+    head("Neighbours"), counts(decision), neighbours(found),
+    head("Its history"), story(found), el("p", { class: "muted" }, "Decision ", el("code", {}, decision.id)),
+    head("Its label"), el("p", { class: "buttons" }, labelActions(decision)),
   ];
 }
 
@@ -224,7 +225,7 @@ async function map(get, query) {
       mapChart(found, chosen), el("ul", { class: "legend" }, legend),
       el("details", { id: "map-list" }, el("summary", {}, "The newest parts of the map as a list"), table([["Part"], ["Label"]], rows))]);
   const beside = el("section", { class: "card part", id: "part", "data-part": true, "aria-labelledby": "part-title" }, part
-    ? [el("h2", { id: "part-title", tabindex: -1 }, `Part ${nameOf(part.decision.part, part.decision.id)}`), detail(part)]
+    ? [el("h2", { id: "part-title", tabindex: -1 }, `Part ${nameOf(part.decision.part, part.decision.id)}`), detail(part, 3)]
     : el("h2", { id: "part-title", tabindex: -1, class: "muted" }, "No part is chosen."));
   return { title: "Map", shown: [el("h1", {}, "Map of the parts"), el("div", { class: "split" }, picture, beside)] };
 }
@@ -232,7 +233,7 @@ async function map(get, query) {
 async function part(get, query) {
   const found = await explanation(get, query.get("id") ?? "");
   const name = nameOf(found.decision.part, found.decision.id);
-  return { title: `Part ${name}`, shown: [el("article", { class: "card part", id: "part", "data-part": true }, el("h1", {}, `Part ${name}`), detail(found))] };
+  return { title: `Part ${name}`, shown: [el("article", { class: "card part", id: "part", "data-part": true }, el("h1", {}, `Part ${name}`), detail(found, 2))] };
 }
 
 const FILTERS = [["action", "Decision", ACTIONS, capital], ["reason", "Reason", REASON_NAMES, reasonOf], ["label", "Label", LABEL_NAMES, labelWord]];
