@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import compileall
-import json
 import os
 import shutil
 import signal
@@ -23,7 +22,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from py_compile import PycInvalidationMode
 from queue import SimpleQueue
@@ -58,6 +57,11 @@ class Fault:
             yield f"{self.file}: {self.name}: expected its text once, found it {times} times"
         if self.before == self.after or not self.tests:
             yield f"{self.file}: {self.name}: expected another text after it, and tests"
+        for test in self.tests:
+            path, _, function = test.partition("[")[0].partition("::")
+            there = (REPO / path).is_file() and f"def {function}" in (REPO / path).read_text(encoding="utf-8")
+            if not there:
+                yield f"{self.file}: {self.name}: expected a test that is there, got {test}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +165,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="faults whose names contain one of these")
     parser.add_argument("--tier", choices=list(TIERS), default="all", help="test: by what `make test` runs")
     parser.add_argument("--jobs", type=int, default=2, help="faults that are tried at a time")
-    parser.add_argument("--json", action="store_true", help="one document in place of lines")
     asked = parser.parse_args(arguments)
     try:
         faults = read_faults(asked.only)
@@ -172,18 +175,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             trials = []
             for trial in side_by_side(try_one, faults, trees, asked.tier):
                 trials.append(trial)
-                if not asked.json:
-                    word, why = "caught" if trial.caught else "MISSED", trial.why and f" ({trial.why})"
-                    print(f"{word}  {trial.seconds:5.1f} s  {trial.file}: {trial.name}{why}", flush=True)
+                word, why = "caught" if trial.caught else "MISSED", trial.why and f" ({trial.why})"
+                print(f"{word}  {trial.seconds:5.1f} s  {trial.file}: {trial.name}{why}", flush=True)
     except ListError as error:
         print(error, file=sys.stderr)
         return 2
     caught = sum(trial.caught for trial in trials)
-    if asked.json:
-        document = {"tier": asked.tier, "caught": caught, "faults": len(trials), "trials": list(map(asdict, trials))}
-        print(json.dumps(document, indent=1))
-    else:
-        print(f"caught {caught} of {len(trials)}" + (" by make test" if asked.tier == "test" else ""))
+    print(f"caught {caught} of {len(trials)}" + (" by make test" if asked.tier == "test" else ""))
     return int(caught < len(trials))
 
 

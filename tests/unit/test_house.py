@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.faults import read_faults
+
 REPO = Path(__file__).resolve().parents[2]
 PACKAGE = REPO / "dengine"
 FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file in sorted(PACKAGE.rglob("*.py"))}
@@ -83,6 +85,10 @@ def test_no_module_is_imported_by_a_string() -> None:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and {node.value.partition(":")[0]} & KNOWN
     }
     assert not strings, f"import them, or move what needs them; a string only hides a layer: {', '.join(sorted(strings))}"
+
+
+def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() -> None:
+    assert len(read_faults([])) == 60
 
 
 INSIDE = ("test_store.py", "test_store_postgres.py")  # they set the store's clock, and look at its queue
