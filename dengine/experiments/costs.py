@@ -106,7 +106,7 @@ class CostCurve:
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that pays, or may; None where none does: verify everything."""
+        """The policy that pays, or may: try it in the shadow mode first. None where none does: verify everything."""
         return None if self.verdict == "does not pay" else self.cheapest.policy
 
     @property
@@ -167,18 +167,6 @@ def cost_curve(
     costs = Costs(check, escape, false_reject)
     tasks = cost_tasks(recipe, alphas, lower_bounds, range(seed, seed + repeats), cycles)
     return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done), costs)
-
-
-def policy_from_costs(dataset: Any, *, check: float, escape: float, false_reject: float, **how: Any) -> Policy:
-    """The policy that made a part cheapest in replays of the user's own recordings; arguments as in `cost_curve`.
-
-    It pays, or may pay: only `CostCurve.verdict` tells the two apart, so try it in the shadow mode first.
-    Raises SettingError where nothing is cheaper than verifying everything, with what the cheapest policy costs.
-    """
-    curve = cost_curve(dataset, check=check, escape=escape, false_reject=false_reject, **how)
-    if curve.policy is None:
-        raise SettingError(f"Expected a policy that costs less than verifying everything. {curve.sentence}")
-    return curve.policy
 
 
 def cost_tasks(

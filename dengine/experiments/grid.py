@@ -60,14 +60,6 @@ class Task:
     shuffle: bool = True
     confirm: bool = False
 
-    @property
-    def description(self) -> str:
-        """All that its decisions depend on beside the data and the code; SettingError for a reducer that can't be told."""
-        who, reducer = self.contender, self.contender.recipe.reducer
-        own = {"seed": self.seed, "cycles": self.cycles, "shuffle": self.shuffle, "confirm": self.confirm}
-        handed_in = "" if isinstance(reducer, str) else f"\n{described(reducer)}\n{_digest_of_reducer(reducer)}"
-        return f"{who.recipe.to_toml()}{handed_in}\n{who.rival} {sorted(who.params.items())}\n{json.dumps(own)}"
-
 
 class KeptReplays:
     """A folder of finished replays of one data set; made if need be."""
@@ -81,11 +73,17 @@ class KeptReplays:
         self._of_data = digest.hexdigest()
 
     def path(self, task: Task) -> Path:
-        """Where the replay of a task is kept: its name changes with the text of the files that a reducer stands in."""
-        own = task.contender.recipe.reducer
-        source = map(_source_of, [reducer_class(own)] if isinstance(own, str) else _parts_of(own))
-        said = "\n".join([self._of_data, _digest_of_source(), *source, task.description])
-        return self.folder / f"{hashlib.sha256(said.encode()).hexdigest()[:32]}.npz"
+        """Where the replay of a task is kept: a hash of all that its decisions depend on, a reducer's own files among it.
+
+        SettingError for a reducer that cannot be told apart from others.
+        """
+        who, own = task.contender, task.contender.recipe.reducer
+        by_name = isinstance(own, str)
+        parts = [reducer_class(own)] if by_name else _parts_of(own)
+        handed_in = [] if by_name else [described(own), _digest_of_reducer(own)]
+        how = [task.seed, task.cycles, task.shuffle, task.confirm, who.rival, sorted(who.params.items())]
+        said = [self._of_data, _digest_of_source(), *map(_source_of, parts), *handed_in, who.recipe.to_toml(), str(how)]
+        return self.folder / f"{hashlib.sha256('\n'.join(said).encode()).hexdigest()[:32]}.npz"
 
     def get(self, task: Task) -> Replay | None:
         """The replay, under the contender's present name; None where it is not there, or damaged."""

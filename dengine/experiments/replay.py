@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+EVIDENCE: dict[str, Any] = dict.fromkeys(("action", "reason"), np.str_)  # of a decision, and how it is kept
+EVIDENCE |= dict.fromkeys(("lower", "upper"), np.float64) | dict.fromkeys(("n_success", "n_failure"), np.int64)
 COUNTED = ("verified", "accepted", "rejected", "false_positive", "false_negative", "novel", "safe_mode")
 
 
@@ -250,26 +252,21 @@ class RunRecorder:
         decisions = [cycle.decision for cycle in cycles]
         has_clock = getattr(self.cell, "clock", None) is not None
 
-        def column(name: str, kind: Any, of: Sequence[Any] = decisions) -> NDArray[Any]:
-            return np.array([getattr(each, name) for each in of], dtype=kind)
-
+        known: dict[str, Any] = {
+            name: np.array([getattr(each, name) for each in decisions], dtype=kind) for name, kind in EVIDENCE.items()
+        }
         return Replay(
-            action=column("action", np.str_),
             truth=np.array([truth for _, truth, _ in self._seen], dtype=np.float64),
-            lower=column("lower", np.float64),
-            upper=column("upper", np.float64),
-            n_success=column("n_success", np.int64),
-            n_failure=column("n_failure", np.int64),
             position=_positions(decisions),
-            decide_seconds=column("decide_seconds", np.float64, cycles),
-            stopped=column("outcome", object, cycles) == Outcome.STOPPED,
-            reason=column("reason", np.str_),
-            version=column("model_version", np.int64),
-            safe_mode=column("safe_mode", object, cycles) != "",
+            decide_seconds=np.array([each.decide_seconds for each in cycles], dtype=np.float64),
+            stopped=np.array([each.outcome is Outcome.STOPPED for each in cycles], dtype=np.bool_),
+            version=np.array([each.model_version for each in decisions], dtype=np.int64),
+            safe_mode=np.array([each.safe_mode != "" for each in cycles], dtype=np.bool_),
             clock_s=np.array([clock for _, _, clock in self._seen], dtype=np.float64) if has_clock else None,
             retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
             recipe=self._recipe,
             name=self._recipe.name,
+            **known,
         )
 
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from dengine import Dataset, Policy, Recipe
 from dengine.cli import main
 from dengine.errors import SettingError
-from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of, policy_from_costs
+from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of
 from dengine.experiments.figures import cost_picture
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Replay, replay
@@ -120,14 +120,8 @@ def test_the_curve_is_that_of_replays(found: CostCurve, make_data: Callable[...,
 
 def test_what_a_recipe_says_beside_alpha_and_lb_stays(make_data: Callable[..., Dataset]) -> None:
     how = HOW | {"recipe": Recipe.load("pca").with_policy(stops="all")}
-    policy = policy_from_costs(make_data(160), check=5, escape=20, false_reject=10, **how)
+    policy = cost_curve(make_data(160), check=5, escape=20, false_reject=10, **how).policy
     assert (policy.alpha, policy.stops) == (0.5, "all")
-
-
-def test_where_nothing_pays_there_is_no_policy_from_costs(make_data: Callable[..., Dataset]) -> None:
-    coins = replace(make_data(160), y=np.random.default_rng(0).integers(0, 2, 160).astype(np.int8))
-    with pytest.raises(SettingError, match=r"verifying everything\. Nothing pays"):
-        policy_from_costs(coins, check=5, escape=1e6, false_reject=1e6, **HOW)
 
 
 @pytest.mark.parametrize("how", [{"repeats": 1}, {"alphas": (2,)}, {"lower_bounds": (0.4,)}, {"check": -1}])
