@@ -37,8 +37,8 @@ from .reducers.cross_fitting import CrossFitted as CrossFitted
 from .reducers.pca import PcaReducer as PcaReducer
 from .reducers.rocket import RocketReducer as RocketReducer
 from .reducers.umap import UmapReducer as UmapReducer
-from .store.base import open_store as open_store
 from .store.memory import MemoryStore as MemoryStore
+from .store.opening import open_store as open_store
 from .store.sql import SqlStore as SqlStore
 
 __version__: str

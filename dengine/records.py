@@ -63,7 +63,7 @@ class Reason(StrEnum):
     MODEL_ERROR = "model_error"  # the model raised; the cell went on
     NOVEL = "novel"  # unlike all that was learned from, whatever its neighbours say
     SAFE_MODE = "safe_mode"  # everything is verified: what was accepted failed too often, or too much is novel
-    NO_STORE = "no_store"  # what is decided cannot be written where it belongs: the part is verified, its label waits
+    NO_STORE = "no_store"  # the journal takes nothing, or whether the id is new cannot be looked up
     LATE = "late"  # the answer would have come too late: whoever asked verifies already
 
 

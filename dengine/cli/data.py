@@ -144,7 +144,7 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
     from ..datasets.importing import form_in, import_labelled, train_until_done
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
-    from ..store.base import UNHURRIED
+    from ..store.opening import UNHURRIED
 
     before = form_in(store, source.data)  # of what the store has, where no other form was asked for
     data = replace(source, how={**before, **source.how}).load()

@@ -20,8 +20,7 @@ from .output import Out, duration, facts, tell, when
 if TYPE_CHECKING:
     from ..history.explain import Explanation, Neighbour
     from ..records import Decision
-    from ..store.records import Event, StoredDecision
-    from ..store.views import PastRetrain
+    from ..store.records import Event, StoredDecision, StoredVersion
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 WIDEST = 120  # columns
@@ -70,7 +69,7 @@ def history(store: str, events: bool, **asked: Any) -> None:
     from ..history.status import beside, interleaved
     from ..history.status import history as read
     from ..records import plain
-    from ..store.base import open_store
+    from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = list(read(opened, **asked))
@@ -104,7 +103,7 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which 
 }
 
 
-def _table(happened: Iterable[StoredDecision | PastRetrain | Event]) -> str:
+def _table(happened: Iterable[StoredDecision | StoredVersion | Event]) -> str:
     """A table; retrains and events are lines of their own among the decisions."""
     from ..store.records import StoredDecision
 
@@ -121,7 +120,7 @@ def _table(happened: Iterable[StoredDecision | PastRetrain | Event]) -> str:
     return "\n".join(line if isinstance(line, str) else sides.format(*line).rstrip() for line in lines)
 
 
-def _told(each: PastRetrain | Event) -> str:
+def _told(each: StoredVersion | Event) -> str:
     from ..store.records import Event
 
     if isinstance(each, Event):
@@ -147,7 +146,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
     from ..history.status import history
-    from ..store.base import open_store
+    from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         if decision == "last":

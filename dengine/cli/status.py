@@ -51,7 +51,7 @@ def status(store: str, last: int, watch: float | None, out: Out | None) -> None:
         raise click.UsageError("--watch and --json exclude each other.")
     from ..files import check_output
     from ..records import plain
-    from ..store.base import must_be_there
+    from ..store.opening import must_be_there
     from ..store.peers import list_cells
     from ..store.records import CellAddress, address
 
@@ -86,7 +86,7 @@ def _read(store: str, last: int, out: Out | None) -> tuple[Status, dict[str, Any
     from ..experiments.figures import status_picture
     from ..history.status import course
     from ..history.status import status as status_of
-    from ..store.base import open_store
+    from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)

@@ -44,7 +44,7 @@ author_option = click.option("--author", default=_login, help="Who says so, for 
 def _changed(store: str, author: str, change: Callable[[DataEngine], Changed]) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine.engine import DataEngine
-    from ..store.base import UNHURRIED
+    from ..store.opening import UNHURRIED
 
     with DataEngine.open(store, wait=UNHURRIED) as engine:
         changed = change(engine)
@@ -126,7 +126,7 @@ def retrain(store: str, author: str) -> None:
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
-    from ..store.base import UNHURRIED
+    from ..store.opening import UNHURRIED
 
     with DataEngine.open(store, wait=UNHURRIED) as engine:
         report = engine.retrain()

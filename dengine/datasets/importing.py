@@ -25,7 +25,8 @@ from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec, trace_in
-from ..store.base import UNHURRIED, Store, opening
+from ..store.base import Store
+from ..store.opening import UNHURRIED, opening
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
 from .loading import TABLES

@@ -120,7 +120,7 @@ def _reader_of_files(path: Path) -> tuple[Sequence[str], Reader]:
 
 def _read_store(path: Path, name: str, asked: Asked) -> Dataset:
     """Every labelled trace of a store, in the order of the labels, as they count now, without bad and forgotten ones."""
-    from ..store.base import opening
+    from ..store.opening import opening
 
     with opening(path, must_exist=True) as store:
         held, spec = store.labelled(), trace_in(store.settings())

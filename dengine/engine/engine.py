@@ -45,7 +45,8 @@ from ..records import (
     as_success,
     source_of,
 )
-from ..store.base import Store, opening
+from ..store.base import Store
+from ..store.opening import opening
 from ..store.outbox import CLOSE, Outbox
 from ..store.records import StoredDecision
 from ..traces import as_agreed
@@ -148,6 +149,7 @@ class DataEngine:
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._outbox = Outbox(store, owning=not reading, patient=replaying)
         weakref.finalize(self, self._outbox.close)  # of a program that forgot to
+        self._used = threading.RLock()
         self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
         self._settings = SettingsInForce(settings, self._outbox)
         self._versions = ModelVersions(template, retrainer, self._outbox, clock, settings.evidence)
@@ -214,6 +216,19 @@ class DataEngine:
                 engine._settings.now.must_agree_with(settings | {"seed": seed})
             return engine
 
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Uninterrupted; StoreError while another thread does something with the engine."""
+        if not self._used.acquire(blocking=False):
+            raise StoreError(
+                "Expected an engine that one thread uses, got a call while another thread is in one; use it in one thread."
+            )
+        try:
+            with uninterrupted():
+                yield
+        finally:
+            self._used.release()
+
     def decide(
         self,
         trace: ArrayLike,
@@ -230,28 +245,35 @@ class DataEngine:
         decision_id : of the caller's: the same id and trace have the same decision for ever, on the disk when this returns.
         late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
-        for what is no id. Whatever else fails becomes VERIFY, a store that is away too.
+        for what is no id. Whatever else fails becomes VERIFY; an id that cannot be looked up too, and that is not recorded.
         """
         self._outbox.check()
-        with uninterrupted():
-            id_ = None if decision_id is None else as_id(decision_id)
-            if id_ is not None and (known := self._known(id_)) is not None:
-                return decided_before(known, trace, self.trace)
+        with self._alone():
+            id_, number = None if decision_id is None else as_id(decision_id), as_part(part)
+            if id_ is not None:
+                try:
+                    if (known := self._outbox.decided_before(id_)) is not None:
+                        return decided_before(known, trace, self.trace)
+                except StoreError as error:
+                    return self._unrecorded(id_, number, error)
             self._versions.collect()
-            x, number = self._as_trace(trace), as_part(part)
+            x = self._as_trace(trace)
             self._feedback.settle()
             unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
-            known = self._put(self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_))
+            known = self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_)
+            known = self._outbox.decided(known)
+            # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
+            if id_ is not None and not self._outbox.secure() and known.decision.action is not Action.VERIFY:
+                known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
+            self._feedback.decided(known)
             if wait:
                 self._outbox.flush()
-            elif id_ is not None:
-                self._outbox.secure()
         return known.decision
 
-    def _put(self, item: StoredDecision) -> StoredDecision:
-        known = self._record(item)
-        self._feedback.decided(known)
-        return known
+    def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
+        """VERIFY for an id that may have a decision, which cannot be looked up: nothing of it is recorded."""
+        log.warning("whether %r was decided before cannot be looked up; it is verified: %s", decision_id, error)
+        return unasked(decision_id, part, self.version, Reason.NO_STORE)
 
     def decide_late(self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str) -> Decision:
         """VERIFY, `Reason.LATE`, in any thread: what `decide` in the engine's own would say comes too late.
@@ -260,30 +282,19 @@ class DataEngine:
         trace has set the contract, `decide` has to record it, with `late`. Errors as of `decide`.
         """
         self._outbox.check()
-        id_ = as_id(decision_id)
-        if (known := self._known(id_)) is None:
-            number = as_part(part)
+        id_, number = as_id(decision_id), as_part(part)
+        try:
+            known = self._outbox.decided_before(id_)
+        except StoreError as error:
+            return self._unrecorded(id_, number, error)
+        if known is None:
             if self.trace is None or self.store.wait is None:
                 return unasked(id_, number, self.version, Reason.LATE)
             reason = Reason.NO_STORE if self._outbox.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
-            known = self._record(self._maker.decide(x, number, None, self.version, reason, id_))
+            known = self._outbox.decided(self._maker.decide(x, number, None, self.version, reason, id_))
         self._outbox.secure()
         return decided_before(known, trace, self.trace)
-
-    def _record(self, item: StoredDecision) -> StoredDecision:
-        """Record a decision; returns what its id has now: of two threads the first's."""
-        first = self._outbox.recent.add(item)
-        if first is item:
-            self._outbox.decided(item)
-        return first
-
-    def _known(self, decision_id: str) -> StoredDecision | None:
-        try:
-            return None if self._outbox.recent.is_new(decision_id) else self._outbox.find(decision_id)
-        except StoreError as error:  # the store is away: what was decided lately is known all the same
-            log.warning("whether %r was decided before cannot be looked up: %s", decision_id, error)
-            return None
 
     def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
         """Set the traces' contract, where none is set yet; returns the one in force. inferred : from a first trace."""
@@ -316,11 +327,11 @@ class DataEngine:
         success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
         Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a
-        rejected part, or what is no label; StoreError where neither the store nor its journal can be written.
+        rejected part, or what is no label; StoreError where the label is not known to be taken: say the same again.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._outbox.check()
-        with uninterrupted():
+        with self._alone():
             self._versions.collect()
             known = self._outbox.find(id_) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
@@ -333,12 +344,14 @@ class DataEngine:
                 "a system stop whose decision was lost can be reported with its trace."
             )
         item = self._maker.lost_accept(self._as_trace(trace), as_part(part), self.version, decision_id)
-        return self._put(item)
+        known = self._outbox.decided(item)
+        self._feedback.decided(known)
+        return known
 
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
         self._outbox.check()
-        with uninterrupted():
+        with self._alone():
             return self._versions.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
@@ -376,7 +389,7 @@ class DataEngine:
 
         brief : bring a version that an executor has trained a step further, a few milliseconds, and not to the end.
         """
-        with uninterrupted():
+        with self._alone():
             self._versions.collect(to_the_end=not brief)
             self._versions.work(self.recipe.retrain_every)
             return self._versions.take_news()
@@ -384,9 +397,9 @@ class DataEngine:
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and let the store go; a second time does nothing.
 
-        StoreError where something is left that neither the store nor its journal takes; close again when there is room.
+        StoreError where something is left that the journal does not take; close again when the disk is well.
         """
-        with uninterrupted():
+        with self._alone():
             if self._outbox.usable:
                 self._feedback.store_waiting()
                 self._versions.collect(CLOSE)
@@ -419,12 +432,13 @@ class DataEngine:
     def know_ids(self) -> None:
         """Learn which ids are taken (a second for a million), so that `decide` looks no new one up in the store."""
         self.flush()
-        self._outbox.recent.know(self.store.decision_ids())
+        self._outbox.know()
 
     def flush(self) -> None:
         """Return when all that is known so far is on the disk."""
         self._feedback.store_waiting()
         self._outbox.flush()
+        self._feedback.arrive()
 
     @property
     def retraining(self) -> bool:
@@ -473,7 +487,7 @@ class DataEngine:
 
     @property
     def store_fault(self) -> str:
-        """Why the store cannot be written at present, and labels wait in its journal; "" where it can."""
+        """Why the store, or its journal, cannot be written at present; "" where both can."""
         return self._outbox.fault
 
     def certificate(self) -> Certificate:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 
 from ..errors import StoreError
 from ..records import Action, Source, source_of
 from ..store.outbox import Outbox
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision, already_reported
 from .settings import SettingsInForce
 from .versions import ModelVersions, Point
 
@@ -38,7 +39,9 @@ class Feedback:
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
         self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
-        self._in_journal: dict[str, tuple[StoredDecision, bool]] = {}  # labels without a number yet
+        self._numberless: dict[str, tuple[StoredDecision, bool]] = {}  # learned, and not numbered by the store yet
+        self._doubtful: dict[str, tuple[StoredDecision, NewLabel, Point | None]] = {}  # not known to be taken
+        self._arrived_late: dict[str, bool] = {}  # of those, which were
         self._silent = 0
         self._mode = ""
         self._untrue = False  # whether the rule was told what did not happen
@@ -81,10 +84,7 @@ class Feedback:
             else:
                 self._silent += 1
         if len(self._waiting) >= 100:  # so many confirmed parts wait for a report
-            try:
-                self.store_waiting()
-            except StoreError:  # they still wait, in memory; no decision fails for it
-                log.exception("confirmed parts could not be stored")
+            self.store_waiting(secure=False)
         self.announce()
 
     def decided(self, known: StoredDecision) -> None:
@@ -93,67 +93,82 @@ class Feedback:
             self._went_on[known.decision.id] = known
 
     def report(self, known: StoredDecision, success: bool) -> None:
-        """Take in a report; it is stored before anything else changes."""
-        source = source_of(known.decision.id, known.decision.action, known.decision.audit, success)
-        late = [each for each in self._waiting if each[0].decision.id == known.decision.id]  # it was taken for confirmed
-        self._waiting = [each for each in self._waiting if each[0].decision.id != known.decision.id]
+        """Take in a report; it is in the journal before anything else changes."""
+        id_ = known.decision.id
+        self.arrive()
+        if self._arrived_late.get(id_) is success:
+            return
+        source = source_of(id_, known.decision.action, known.decision.audit, success)
+        late = [each for each in self._waiting if each[0].decision.id == id_]  # it was taken for confirmed
+        self._waiting = [each for each in self._waiting if each[0].decision.id != id_]
+        label: NewLabel | None = None
         try:
             self.store_waiting()
-            label, point = self._label(known, success, source, int(self._was_silent(known)))
-            (seq,) = self.outbox.labels([label])
-        except Exception:
-            self._waiting += late  # nothing was stored: it still waits as it did
+            if id_ in self._doubtful:
+                known, label, point = self._doubtful[id_]
+                if label.success is not success:
+                    raise already_reported(id_, (label.success, label.source), (success, source))
+            else:
+                label, point = self._label(known, success, source, int(self._was_silent(known)))
+            self.outbox.labels([(known, label)])
+        except Exception as error:
+            self._waiting += late  # it still waits as it did
+            if label is not None and isinstance(error, StoreError):
+                self._doubtful[id_], self._silent = (known, label, point), 0
             raise
-        self._went_on.pop(known.decision.id, None)
-        if known.quarantined:
-            return
+        self._doubtful.pop(id_, None)
+        self._take_in(known, label, point, bool(late))
         if late:
-            self.versions.unlearn(known)
-        self._learn(known, label, point)
-        self._keep(known, success, int(seq))
-        self._untrue |= bool(late)
+            with suppress(StoreError):  # then it is told anew when the store is back
+                self.outbox.drain()
         self.arrive()
         self.announce()
 
+    def _take_in(self, known: StoredDecision, label: NewLabel, point: Point | None, untrue: bool) -> None:
+        """Learn what is in the journal."""
+        self._went_on.pop(known.decision.id, None)
+        if known.quarantined:
+            return
+        if untrue:
+            self.versions.unlearn(known)
+        self._learn(known, label, point)
+        self._numberless[known.decision.id] = known, label.success
+        self._untrue |= untrue
+
     def arrive(self) -> None:
-        """Do what had to wait for the store: labels that it has taken by now train, and the rule is told the truth."""
+        """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
         for id_, seq in self.outbox.arrived():
-            known, success = self._in_journal.pop(id_, (None, False))
-            if known is not None:
-                self.versions.keep(known, success, seq)
-        if self._untrue and not self.outbox.fault:
+            if id_ in self._doubtful:  # it was taken after all, among later ones
+                known, label, point = self._doubtful.pop(id_)
+                self._take_in(known, label, point, False)
+                self._arrived_late[id_], self._untrue = label.success, True
+            if id_ in self._numberless:
+                self.versions.keep(*self._numberless.pop(id_), seq)
+        if self._untrue and self.outbox.drained and not self.outbox.fault:
             try:
                 self.versions.tell_anew()
                 self._untrue = False
             except StoreError:
                 log.exception("the rule is told anew when the store is back")
 
-    def _keep(self, known: StoredDecision, success: bool, seq: int) -> None:
-        """Give a label to the next retrain, once it has its number."""
-        if seq:
-            self.versions.keep(known, success, seq)
-        else:
-            self._in_journal[known.decision.id] = known, success
-
-    def store_waiting(self) -> None:
-        """Commit the labels of confirmed parts, and give them to the next retrain."""
+    def store_waiting(self, secure: bool = True) -> None:
+        """Put the labels of confirmed parts into the journal; secure : wait until they are on the disk."""
         if not self._waiting:
             return
-        seqs = self.outbox.labels([label for _, label in self._waiting])
-        waiting, self._waiting = self._waiting, []
-        for (known, _), seq in zip(waiting, seqs, strict=True):
-            self._keep(known, True, int(seq))
+        self.outbox.labels(self._waiting, secure)
+        self._numberless |= {known.decision.id: (known, True) for known, _ in self._waiting}
+        self._waiting = []
+        self.arrive()
 
     def store_all(self) -> None:
-        """Have every label in the store; StoreError while some wait in its journal."""
+        """Have every label in the store, and its number; StoreError where the store is away."""
         self.store_waiting()
         self.journal_cleared()
 
     def journal_cleared(self) -> None:
-        """StoreError while a label of this cell waits in the journal: of a product's news one may be that very label."""
+        """The same for what is in the journal: of a product's news one may be that very label."""
+        self.outbox.drain()
         self.arrive()
-        if self._in_journal:
-            raise StoreError(f"{len(self._in_journal)} labels wait in the journal until the store is back.")
 
     def _was_silent(self, known: StoredDecision) -> bool:
         """Whether an accepted part was counted among the silent ones before its label came."""

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import itertools
 import logging
+import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -21,7 +23,7 @@ from ..model.base import EngineModel
 from ..records import Reason, RetrainReport
 from ..reducers.base import State
 from ..store.base import Store
-from ..store.outbox import Asked, Outbox
+from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, without_rule
 from .resume import change, join_since, refit, resume, tell_all
 from .settings import EvidenceWindow
@@ -41,7 +43,9 @@ class Candidate:
         if self.model is not None:
             self.model.prepare_safely(previous)
         self.report = RetrainReport(version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason)
-        self.storing: Asked[int | None] | None = None
+        self.storing: Future[int] | None = None
+        self.until = np.inf  # when its commit takes too long, of `time.monotonic`
+        self.patience = 20  # steps that it waits for the labels' numbers, before it asks for them
         self.seconds = clock() - trained.begin  # of work on it: the cell's own, in between, is not counted
         self._clock = clock
         self._seen: set[int] = set()
@@ -344,15 +348,21 @@ class ModelVersions:
             if candidate.storing is None:
                 if not candidate.learn(window, np.inf if to_the_end else STEP):
                     return
+                if self._can_wait(candidate, to_the_end):
+                    return
                 self.store_waiting()
                 candidate.learn(window)
-                candidate.storing = self._store(candidate)
-            if not to_the_end and not candidate.storing.due:
+                candidate.storing, limit = self._store(candidate), self.outbox.limit
+                candidate.until = np.inf if limit is None else time.monotonic() + limit
+            storing = candidate.storing
+            if not to_the_end and not storing.done() and (storing.running() or time.monotonic() < candidate.until):
                 return
-            number = candidate.storing.result()
+            number = self.outbox.result(storing)
         except StoreError as error:  # a version that is not stored would be gone with the process
             self._candidate = None
             self._not_stored(candidate.report, error)
+            return
+        if self._can_wait(candidate, to_the_end):
             return
         try:
             self.store_waiting()  # what was confirmed since is to be among its references
@@ -363,7 +373,12 @@ class ModelVersions:
         self._candidate = None
         self._swap(candidate, number)
 
-    def _store(self, candidate: Candidate) -> Asked[int | None]:
+    def _can_wait(self, candidate: Candidate, to_the_end: bool) -> bool:
+        """Whether labels are on their way into the store, and the cell need not wait for that."""
+        candidate.patience -= 1
+        return not to_the_end and not self.outbox.drained and candidate.patience > 0
+
+    def _store(self, candidate: Candidate) -> Future[int]:
         model, state = candidate.model, None
         candidate.report = replace(candidate.report, seconds=candidate.seconds)  # storing it comes on top
         if model is not None:
@@ -371,9 +386,8 @@ class ModelVersions:
             state = self._state(model, TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1])))
         return self.outbox.version(candidate.report, self.retrainer.window.newest_seq, state)
 
-    def _swap(self, candidate: Candidate, number: int | None) -> None:
-        report, model = candidate.report, candidate.model
-        report = replace(report, version=report.version if number is None else number)  # one without products has no other
+    def _swap(self, candidate: Candidate, number: int) -> None:
+        report, model = replace(candidate.report, version=number), candidate.model
         if model is not None:
             model.untold = model.untold or self.newest.untold
             self._newest = report.version

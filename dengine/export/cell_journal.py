@@ -28,7 +28,8 @@ from ..errors import DataError, StoreError
 from ..folds import own_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, TraceSpec, source_of, trace_in
-from ..store.base import Store, opening
+from ..store.base import Store
+from ..store.opening import opening
 from ..store.records import NewLabel
 from ..traces import TraceGate, as_trace
 

@@ -66,7 +66,8 @@ def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision
         return None
     if "points" not in stored.state:  # a rival keeps nothing
         return None
-    retrains = [each.last_seq for each in store.past_retrains() if each.report.accepted and each.report.version > version]
+    reports = ((each.report, each.last_seq) for each in store.versions(own=True))
+    retrains = [last_seq for report, last_seq in reports if report.accepted and report.version > version]
     upto = min([*retrains[:1], stored.last_seq + STRIDE])
     later = store.past_labels(stored.last_seq, upto, points=True)
     if then is not None:
@@ -421,7 +422,7 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
         f" in safe mode, in which every part is: {found.safe_mode or 'its reason is not kept'}."
     ),
     Reason.NO_STORE: lambda *_: (
-        ": the store could not be written then, so the model was not asked; decision and label waited in its journal."
+        ": the cell's disk did not take it then, or could not say whether its id was new, so the model was not asked."
     ),
     Reason.LATE: lambda *_: (
         ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."

@@ -21,8 +21,8 @@ from ..errors import SettingError, StoreError
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec, trace_in
 from ..store.base import Store
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Key, Outcomes, StoredDecision
-from ..store.views import LABELS, HistoryFilter, PastRetrain, Stretch, Tally
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Key, Outcomes, StoredDecision, StoredVersion
+from ..store.views import LABELS, HistoryFilter, Stretch, Tally
 
 PAGE = 500  # decisions read at a time
 NEWEST = 500  # decisions that are looked at apart
@@ -140,7 +140,7 @@ class Status:
     recent: int
     recent_novel: int
     certificate: Certificate
-    retrains: tuple[PastRetrain, ...]
+    retrains: tuple[StoredVersion, ...]
     events: tuple[Event, ...]
     write_failures: int
     watch: Watch | None
@@ -172,7 +172,7 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
     settings = store.settings()
     if "recipe" not in settings:
         raise StoreError(f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is empty.")
-    recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.past_retrains()
+    recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.versions(own=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     # Labels are numbered from 1, or over a whole product.
@@ -208,7 +208,7 @@ MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
 COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten", "last_label_time", "write_failures")
 
 
-def _span(tally: Tally, retrains: list[PastRetrain], policy: Policy) -> Span:
+def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     outcomes, first, n = tally.outcomes, tally.first, tally.count()
     here = [each.report for each in retrains if first is not None and each.time >= first]
     reasons: Counter[Reason] = Counter()
@@ -282,7 +282,7 @@ class Course:
     """
 
     stretches: list[Stretch]
-    retrains: list[PastRetrain]
+    retrains: list[StoredVersion]
     modes: list[Event]
     tolerance: float
     last: int
@@ -296,7 +296,7 @@ def course(store: Store, recipe: Recipe, last: int) -> Course:
     """Read what a picture is drawn from."""
     modes = [event for event in store.events() if event.kind in MODES]
     n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
-    return Course(store.stretches(n), store.past_retrains(), modes, 1.0 - recipe.policy.lower_bound, last)
+    return Course(store.stretches(n), store.versions(own=True), modes, 1.0 - recipe.policy.lower_bound, last)
 
 
 def history(
@@ -349,15 +349,15 @@ def _newest(store: Store, where: HistoryFilter, last: int) -> Iterator[StoredDec
     return iter(found)
 
 
-def beside(store: Store, since: float | None = None, until: float | None = None) -> dict[str, list[PastRetrain | Event]]:
+def beside(store: Store, since: float | None = None, until: float | None = None) -> dict[str, list[StoredVersion | Event]]:
     """What happened beside the decisions, retrains and events, oldest first, between two times in seconds; None: any."""
     first, end = since or float("-inf"), float("inf") if until is None else until
-    past: dict[str, list[Any]] = {"retrains": store.past_retrains(), "events": store.events()}
+    past: dict[str, list[Any]] = {"retrains": store.versions(own=True), "events": store.events()}
     return {name: [each for each in happened if first <= each.time < end] for name, happened in past.items()}
 
 
 def interleaved(
-    decisions: list[StoredDecision], others: Mapping[str, list[PastRetrain | Event]]
-) -> Iterator[StoredDecision | PastRetrain | Event]:
+    decisions: list[StoredDecision], others: Mapping[str, list[StoredVersion | Event]]
+) -> Iterator[StoredDecision | StoredVersion | Event]:
     """All of it in the order in which it happened; what has the same time keeps that order too."""
     return heapq.merge(*others.values(), decisions, key=lambda each: each.time)

@@ -55,7 +55,7 @@ class Metrics:
             ("model_version", "Of the model that answers; 0 before the first retrain.", engine.version),
             ("safe_mode", "1 while everything is verified for what went wrong.", bool(engine.safe_mode)),
             ("shadow", "1 while everything is verified, and the model is only asked.", engine.shadow),
-            ("store_fault", "1 while the store cannot be written, and labels wait in a journal.", bool(engine.store_fault)),
+            ("store_fault", "1 while the store or its journal cannot be written.", bool(engine.store_fault)),
             ("retraining", "1 while a retrain is under way.", engine.retraining),
             ("new_labels", "Labels since the last retrain began.", engine.new_labels),
             ("waiting", "Requests in line.", service.waiting),

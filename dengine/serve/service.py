@@ -27,7 +27,8 @@ from ..engine.engine import DataEngine
 from ..errors import BusyError
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
-from ..store.base import Store, open_store
+from ..store.base import Store
+from ..store.opening import open_store
 from ..store.records import StoredDecision
 
 log = logging.getLogger("dengine")

@@ -1,6 +1,6 @@
 from .base import Store as Store
-from .base import open_store as open_store
 from .memory import MemoryStore as MemoryStore
+from .opening import open_store as open_store
 from .records import AddedPoints as AddedPoints
 from .records import Change as Change
 from .records import Correction as Correction

@@ -1,28 +1,18 @@
-"""Where an engine remembers: the `Store` protocol, and `open_store`, which opens what a user names.
-
-    store = open_store("engine.db")      # SqlStore; `open_store(None)` is a MemoryStore, which forgets
-
-The database behind `SqlStore` lives in `sql.py`, so that importing this module costs numpy and no more.
-"""
+"""Where an engine remembers: the `Store` protocol."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import StoreError
 from ..records import Decision, RetrainReport, Source
 from .journal import Journal, Record
-from .memory import MemoryStore
 from .records import (
     AddedPoints,
-    CellAddress,
     Change,
     Correction,
     Event,
@@ -36,9 +26,7 @@ from .records import (
     StoredDecision,
     StoredVersion,
 )
-from .views import HistoryFilter, PastLabel, PastRetrain, Stretch, Tally
-
-UNHURRIED = 10.0  # seconds to wait for a store where no cell waits, as its wait
+from .views import HistoryFilter, PastLabel, Stretch, Tally
 
 
 @runtime_checkable
@@ -49,13 +37,15 @@ class Store(Protocol):
         all the product's cells: `labelled`, `last_version`, `versions`, `retrains`, `corrections`, and the numbers that
         `put_labels` and `put_version` give. What became of decisions stays the cell's own.
     wait : seconds that its engine waits for it at most; None: it answers at once, and has no journal.
-    remote : whether it is on a server, which may be away while this machine's disk is well.
+    clock : the time in seconds that rows are stamped with.
+    before_use : called before each use of it but `take`, so that it sees what is on its way into it.
     """
 
     cell_id: str
     product: str | None
     wait: float | None
-    remote: bool
+    clock: Callable[[], float]
+    before_use: Callable[[], None]
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
@@ -67,16 +57,16 @@ class Store(Protocol):
         """Return the settings of the product's other cells, by cell."""
 
     def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
-        """Take a decision and its trace, (C, T) or (T,), without waiting for the disk.
+        """Commit a decision and its trace, (C, T) or (T,).
 
         content_hash : of the trace's content, or of its part's number where one is given.
         """
 
     def flush(self) -> None:
-        """Return when every decision so far is committed."""
+        """Return when all that is on its way into it is there, as far as it comes in time."""
 
     def get_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision with its trace, queued ones included; None where it is unknown or forgotten.
+        """Return the decision with its trace; None where it is unknown or forgotten.
 
         StoreError where the trace is not as it was stored.
         """
@@ -89,6 +79,7 @@ class Store(Protocol):
         *, silent: int = 0,
     ) -> int:  # fmt: skip
         """Commit a label, with its decision, before returning its sequence number 1, 2, ...: one of `put_labels`."""
+        return int(self.put_labels([NewLabel(decision_id, success, source, model_version, point, silent)])[0])
 
     def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
         """Commit labels, with their decisions, all or none; returns their sequence numbers, in the order given.
@@ -155,17 +146,22 @@ class Store(Protocol):
     def load_version(self, version: int) -> ModelVersion:
         """Return an accepted version by its number. VersionError, naming those that can be loaded, where it cannot."""
 
-    def versions(self) -> list[StoredVersion]:
-        """Return every retrain, oldest first: its number, time, reason, and whether its state is kept."""
+    def versions(self, own: bool = False) -> list[StoredVersion]:
+        """Return every retrain, oldest first: its number, time, report, and whether its state is kept.
+
+        own : this cell's alone.
+        """
 
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""
+        return [each.report for each in self.versions()]
 
     def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
         """Commit what happened, in a word and for people to read, to the cell's log.
 
         data : the same for machines, as JSON has it.  author : who did it; "" for the engine itself.
         """
+        self.record(Change(kind, text, data, author))
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest `limit` events, all where it is None; oldest first."""
@@ -182,7 +178,7 @@ class Store(Protocol):
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
     ) -> list[StoredDecision]:
-        """Return the newest (or oldest) `limit` decisions that are meant, oldest first, queued ones included.
+        """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
 
         beyond : only those before (or after) this one: the next page.
         """
@@ -192,9 +188,6 @@ class Store(Protocol):
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
         """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
-
-    def past_retrains(self) -> list[PastRetrain]:
-        """Return every retrain of this cell, oldest first."""
 
     def tally(self, last: int | None = None) -> Tally:
         """Count the newest `last` decisions, all where it is None."""
@@ -208,63 +201,30 @@ class Store(Protocol):
     def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
         """Roll back this thread's transactions that are not wanted any more before their commit."""
 
-    def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
-        """Write what a journal held, in one transaction; what is stored already counts as written.
+    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
 
-        Returns the numbers of the labels by their decisions, and what could not be written, in words.
+        What is there already, and is the same, counts as taken. Another decision of the same id, a label on that, or a
+        second label becomes an event, "set aside": it is never guessed which one is right.
         """
 
+    def doubt(self) -> str:
+        """Say what of settings, labels and corrections is not as the ledger has it; "" where nothing is."""
+
+    def newest_entry(self) -> tuple[int, str] | None:
+        """Return number and digest of the newest entry of its ledger; None where there is none."""
+
+    def holds_entry(self, number: int, digest: str) -> bool:
+        """Whether its ledger has that entry."""
+
     def let_go(self) -> None:
-        """Stop and disconnect without writing or waiting: the journal holds what is missing."""
+        """Disconnect without waiting: the journal holds what is missing."""
 
     def close(self) -> None:
-        """Flush and let go."""
+        """Disconnect."""
 
+    def __enter__(self) -> Self:
+        return self
 
-def open_store(
-    store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False, wait: float | None = None
-) -> Store:
-    """Return the store that a user named: nothing (memory), a file or URL (database), or a store as it is.
-
-    A file or URL may say whose rows it means, and what that cell makes: `address`.
-    must_exist : a file or a cell that is not there is a StoreError; by default it is made.
-    wait : as `SqlStore` takes it; `UNHURRIED` where no cell waits.
-    """
-    if store is None:
-        return MemoryStore()
-    if isinstance(store, str | os.PathLike):
-        if must_exist:
-            must_be_there(store)
-        cell_id, product = (store.cell_id, store.product) if isinstance(store, CellAddress) else ("cell", None)
-        from .peers import must_have_cell  # SQLAlchemy is imported where it is used
-        from .sql import SqlStore
-
-        if must_exist:
-            must_have_cell(os.fspath(store), cell_id)
-        return SqlStore(os.fspath(store), cell_id, product=product, wait=wait)
-    if not isinstance(store, Store):
-        raise StoreError(f"Expected None, a file, a URL or a Store, got {type(store).__name__}; see `Store`.")
-    return store
-
-
-def must_be_there(store: str | os.PathLike[str]) -> None:
-    """StoreError for a file that is not there; of a database behind a URL nothing is asked."""
-    if "://" not in str(store) and not Path(store).is_file():
-        raise StoreError(
-            f"Expected a store that an engine has used, found no file {store}; "
-            "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
-        )
-
-
-@contextmanager
-def opening(
-    store: str | os.PathLike[str] | Store | None, *, must_exist: bool = False, wait: float | None = None
-) -> Iterator[Store]:
-    """`open_store`; where what follows fails, a store that was opened here is closed again."""
-    opened = open_store(store, must_exist=must_exist, wait=wait)
-    try:
-        yield opened
-    except BaseException:
-        if opened is not store:
-            opened.close()
-        raise
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -1,36 +1,30 @@
-"""A database that one cell writes to: engine, transactions, lease on the cell, and the queue of decisions with its writer.
+"""A database that one cell writes to: engine, transactions, the lease on the cell, and what goes in.
 
-A deleted file, a fork, a lost answer and a row that the database refuses are each met here.
+A deleted file, a fork, and a row that the database refuses are each met here.
 """
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import logging
 import os
 import sqlite3
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, shortened
-from .journal import owned_by, owner
+from .journal import Record, TakenLabel, owned_by, owner
 from .ledger import LedgerEntry, chain_writes
-from .queries import Scope, join_product
-from .records import Event, StoredDecision, as_text, duplicate_id, to_row
-from .schema import DECISION, EVENT, TRACE, chunks, decision_row, prepare_tables, trace_row
+from .queries import Scope, held_query, join_product
+from .records import Event, StoredDecision, as_text, pack, to_row
+from .schema import DECISION, EVENT, LABEL, LEDGER, TRACE, chunks, decision_row, label_row, prepare_tables, trace_row
 
 log = logging.getLogger("dengine")
-LINGER = 0.05  # seconds that a decision waits for company before it is committed
-RETRY = 1.0  # seconds before the writer tries again after a failure
-QUEUE_BYTES = 64 << 20  # of traces that may wait in memory
-
 T = TypeVar("T")
 
 # Of a server that answers no more, libpq says so after some seconds, not hours.
@@ -142,37 +136,33 @@ OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, 
 
 
 class Database:
-    """An open database, prepared for a cell, and the decisions on their way to it.
+    """An open database, prepared for a cell; one thread writes at a time.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
     clock : the time in seconds that entries of the ledger are stamped with.
     scope : the cell and its product.  name : the URL without its password.  failures : how many writes failed so far.
+    before_use : called before each transaction, so that it sees what is on its way into the database.
     """
 
-    def __init__(self, url: str, cell_id: str, clock: Callable[[], float] = time.time, product: str | None = None) -> None:
+    def __init__(
+        self, url: str, cell_id: str, clock: Callable[[], float], product: str | None, before_use: Callable[[], None]
+    ) -> None:
         self.cell_id = cell_id
         self.failures = 0
+        self._newest: tuple[int, str] | None = None  # entry of the ledger
+        self._before_use = before_use
         self._clock = clock
-        self._queue: dict[str, StoredDecision] = {}
-        self._queue_bytes = 0
-        self._clash: StoreError | None = None
-        self._doubtful = False  # the last write failed, and may have been committed all the same
-        self._closed = self._left = False  # left: let go without writing
+        self._closed = False
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
         self._leasing = False  # a lease is taken on each new connection that writes
         self._leased: sa.Connection | None = None
-        self._lock = threading.Condition()  # guards the queue
-        self._stop = threading.Event()
         self._engine = make_engine(url)
         chain_writes(self._engine)
         self.name = self._engine.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
         self._file = WatchedFile(self._engine.url)
-        self._writer = threading.Thread(target=self._write_queue, name=f"dengine-store-{cell_id}", daemon=True)
-        self._writer.start()
-        atexit.register(self._close_at_exit)
 
     @property
     def url(self) -> sa.URL:
@@ -199,28 +189,27 @@ class Database:
             raise
         except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *OF_A_ROW) as error:
             self.failures += write
-            self._doubtful |= write
-            n = len(self._queue)
-            waiting = f" {n} decisions wait in memory; the next flush or report writes them." if n else ""
             raise StoreError(
-                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}{waiting}"
+                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}"
             ) from error
 
     @contextmanager
     def transaction(self, write: bool) -> Iterator[sa.Connection]:
         """Begin a transaction that is committed at its end, or rolled back by an error."""
-        self._check_open()
+        self.check_open()
+        if not write:
+            self._before_use()
         with self._told("write to" if write else "read", write), self._connected(write) as plain:
-            entry = LedgerEntry(self.cell_id, self._clock) if write else None
+            entry = LedgerEntry(self.scope, self._clock) if write else None
             connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
             with connection.begin():
                 if write:
                     self._file.check()
                 yield connection
-                if entry is not None:
-                    entry.append(connection)  # chains what the transaction added
+                newest = None if entry is None else entry.append(connection)  # chains what the transaction added
                 if write and not getattr(self._asked, "wanted", lambda: True)():
                     raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
+            self._newest = newest or self._newest
             if write:
                 self._file.check()  # nobody is told that a file holds what went into another one
 
@@ -250,17 +239,30 @@ class Database:
         except (sa.exc.SQLAlchemyError, StoreError):
             self._let_lease_go()
             raise
+        if self._closed:  # meanwhile: `close` did not wait
+            self._disconnect()
+
+    def newest_entry(self) -> tuple[int, str] | None:
+        """Number and digest of the newest entry of the ledger that is known here; None where there is none."""
+        if self._newest is None:
+            mine = sa.select(LEDGER.c.number, LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
+            for row in self.read(mine.order_by(LEDGER.c.number.desc()).limit(1)):
+                self._newest = row.number, row.digest.hex()
+        return self._newest
+
+    def holds_entry(self, number: int, digest: str) -> bool:
+        """Whether the ledger has that entry."""
+        mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
+        return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
 
     def lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
-        with self._writing:
-            self._leasing = True
-            try:
-                with self.transaction(write=True):
-                    pass
-            except StoreError:
-                self._leasing = False
-                raise
+        self._leasing = True
+        try:
+            self.write(lambda connection: None)
+        except StoreError:
+            self._leasing = False
+            raise
 
     def _take_lease(self, connection: sa.Connection) -> None:
         """Lock the cell for as long as this PostgreSQL connection lives."""
@@ -278,17 +280,14 @@ class Database:
         holder = connection.execute(asked, key).scalar()
         raise owned_by(str(holder or "another engine"), f"cell {self.cell_id!r} of {self.name}")
 
-    def _disconnect(self) -> None:
-        self._let_lease_go()
-        self._engine.dispose()
-
     def _let_lease_go(self) -> None:
         connection, self._leased = self._leased, None
         if connection is not None:
             connection.invalidate()  # back in the pool its session would keep the lease
             connection.close()
 
-    def _check_open(self) -> None:
+    def check_open(self) -> None:
+        """StoreError after closing, and in a fork."""
         if self._closed:
             raise StoreError(f"Expected an open store, got {self.name} after close(); open it again.")
         if os.getpid() != self._pid:
@@ -298,174 +297,133 @@ class Database:
             )
 
     def write(self, work: Callable[[sa.Connection], T]) -> T:
-        """Commit the queued decisions and `work` in one transaction."""
-        with self._writing:
-            with self._lock:
-                batch = list(self._queue.values())
-            try:
-                return self._commit(work, batch)
-            except StoreError as error:
-                bad = self._unstorable(batch) if isinstance(error.__cause__, OF_A_ROW) else {}
-                if not bad:
-                    raise
-                self._set_aside(bad)
-                return self._commit(work, [item for item in batch if item.decision.id not in bad])
-
-    def _commit(self, work: Callable[[sa.Connection], T], batch: Sequence[StoredDecision]) -> T:
-        with self.transaction(write=True) as connection:
-            self.insert(connection, self._not_yet_stored(connection, batch) if self._doubtful else batch)
-            result = work(connection)
-        self._doubtful = False
-        self._forget(batch)
-        return result
-
-    def _unstorable(self, batch: Sequence[StoredDecision]) -> dict[str, str]:
-        """Return which rows the database refuses for what they hold, each with the reason; nothing is written."""
-        refused: dict[str, str] = {}
-        with self._told("write to"), self._connected(write=True) as plain:
-            connection = plain.execution_options(dengine_write=True, dengine_entry=LedgerEntry(self.cell_id, self._clock))
-            with connection.begin() as tried:
-                for item in self._not_yet_stored(connection, batch):
-                    try:
-                        with connection.begin_nested():
-                            self.insert(connection, [item])
-                    except OF_A_ROW as error:
-                        refused[item.decision.id] = str(getattr(error, "orig", None) or error)
-                tried.rollback()
-        return refused
-
-    def _set_aside(self, refused: dict[str, str]) -> None:
-        """Take rows out of the queue that would keep all others from being written; they become events."""
-        now = time.time()
-        with self._lock:
-            bad = [self._queue[name] for name in refused]
-        self._forget(bad)
-
-        def record(connection: sa.Connection) -> None:
-            first = self.scope.next_number(connection, EVENT.c.number)
-            for number, (name, reason) in enumerate(refused.items(), first):
-                text = as_text(f"a decision that the database refused, {name!r}: {reason}")
-                row = to_row(Event(number, now, "set aside", text)) | {"cell_id": self.cell_id}
-                connection.execute(sa.insert(EVENT), row)
-                log.error("%s", text)
-
-        self._commit(record, [])
-
-    # The queue
-
-    def put(self, item: StoredDecision) -> None:
-        """Queue a decision for the writer thread; where the queue is full, write it first."""
-        self._check_open()
-        if self._queue_bytes > QUEUE_BYTES:
-            self.write(lambda connection: None)
-        with self._lock:
-            if item.decision.id in self._queue:
-                raise duplicate_id(item.decision.id)
-            self._queue[item.decision.id] = item
-            self._queue_bytes += item.trace.nbytes
-            self._lock.notify()
-
-    def queued(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision that still waits; None where it was written or is unknown."""
-        with self._lock:
-            return self._queue.get(decision_id)
-
-    def insert(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> None:
-        """Add decisions and their traces in a transaction that is under way."""
-        for part in chunks(batch):
-            connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
-            connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
+        """Commit what `work` adds, in one transaction."""
+        self.check_open()
+        self._before_use()  # not while others are kept from writing
+        with self._writing, self.transaction(write=True) as connection:
+            return work(connection)
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
         """Return the rows of a query."""
         with self.transaction(write=False) as connection:
             return connection.execute(query).all()
 
-    def look(self, query: sa.Select[Any]) -> Sequence[Any]:
-        """`read`, once what is queued was written; an empty queue needs no lock of a database that a cell writes to."""
-        if self._queue:
-            self.flush()
-        return self.read(query)
-
-    def insert_new(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> None:
-        """Add those decisions of a batch that are not stored yet."""
-        stored = self._stored(connection, batch)
-        self.insert(connection, [item for item in batch if item.decision.id not in stored])
-
-    def _forget(self, batch: Sequence[StoredDecision]) -> None:
-        with self._lock:
-            for item in batch:
-                if self._queue.pop(item.decision.id, None) is not None:
-                    self._queue_bytes -= item.trace.nbytes
-
-    def _not_yet_stored(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> list[StoredDecision]:
-        """After a failure: leave out what was committed although the answer got lost, and ids that were taken."""
-        stored = self._stored(connection, batch)
-        for item in batch:
-            same = (item.content_hash, item.decision.action.value, item.time)
-            if stored.get(item.decision.id, same) != same:
-                self._clash = duplicate_id(item.decision.id)  # raised by the next flush; the queue must go on
-        return [item for item in batch if item.decision.id not in stored]
-
-    def _stored(self, connection: sa.Connection, batch: Sequence[StoredDecision]) -> dict[str, tuple[int, str, float]]:
-        columns = (DECISION.c.id, DECISION.c.content_hash, DECISION.c.action, DECISION.c.time)
-        query = sa.select(*columns).where(DECISION.c.cell_id == self.cell_id)
-        parts = chunks([item.decision.id for item in batch])
-        rows = [row for part in parts for row in connection.execute(query.where(DECISION.c.id.in_(part)))]
-        return {row.id: (row.content_hash, row.action, row.time) for row in rows}
-
-    def flush(self) -> None:
-        """Return when every decision so far is committed."""
-        self.write(lambda connection: None)
-        clash, self._clash = self._clash, None
-        if clash is not None:
-            raise clash
-
-    def _write_queue(self) -> None:
-        """Commit queued decisions in batches until the store is closed (the writer thread)."""
-        while not self._stop.is_set():
-            with self._lock:
-                self._lock.wait_for(lambda: self._queue or self._stop.is_set())
-            self._stop.wait(RETRY if self._doubtful else LINGER)
-            if not self._stop.is_set() and self._queue:
-                with suppress(StoreError):  # it is counted, keeps the queue, and is raised by the next flush or report
-                    self.write(lambda connection: None)
-        if self._left:
-            with self._writing:  # not under the hands of a write that still waits for the database
+    def close(self, waiting: bool = True) -> None:
+        """Disconnect; waiting : for a write that is under way."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._writing.acquire(blocking=waiting):
+            try:
                 self._disconnect()
+            finally:
+                self._writing.release()
 
-    # Opening and closing
+    def _disconnect(self) -> None:
+        self._let_lease_go()
+        self._engine.dispose()
 
-    def close(self) -> None:
-        """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""
-        if self._closed:
-            return
-        self.flush()
-        self._stop.set()
-        with self._lock:
-            self._lock.notify_all()
-        self._writer.join()
-        with self._writing:
-            self.flush()  # of what other threads put meanwhile
-            self._closed = True
-        self._disconnect()
-        atexit.unregister(self._close_at_exit)
+    # What goes in
 
-    def let_go(self) -> None:
-        """Stop and disconnect without writing or waiting, lease and all; what is queued is kept elsewhere."""
-        if self._closed:
-            return
-        self._closed = self._left = True
-        self._stop.set()
-        with self._lock:
-            self._lock.notify_all()
-        atexit.unregister(self._close_at_exit)
+    def held(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
+        """What is stored of decisions and their labels, by id, once the cell is locked."""
+        self.scope.lock_cell(connection)
+        return {row.id: row for part in chunks(ids) for row in connection.execute(held_query(self.cell_id, part))}
 
-    def _close_at_exit(self) -> None:
-        """Write what a program that forgot to close has queued; a fork of it has nothing of its own."""
-        if os.getpid() != self._pid:
-            return
+    def insert(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> None:
+        """Add decisions and their traces."""
+        for part in chunks(decisions):
+            connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
+            connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
+
+    def insert_labels(self, connection: sa.Connection, labels: Sequence[TakenLabel], held: Mapping[str, Any]) -> list[int]:
+        """Add labels of held decisions; returns their numbers."""
+        first = self.scope.next_number(connection, LABEL.c.seq)
+        for part in chunks(range(len(labels))):
+            rows = [label_row(self.cell_id, labels[i], first + i, held[labels[i].label.decision_id]) for i in part]
+            connection.execute(sa.insert(LABEL), rows)
+        return list(range(first, first + len(labels)))
+
+    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        """Commit what a journal held, as `Store.take`."""
         try:
-            self.close()
-        except StoreError as error:  # an engine has put into its journal what is missing here
-            log.warning("a store was left open at the end of the program: %s", error)
+            return self.write(lambda connection: self._take(connection, records))
+        except StoreError as error:
+            if not isinstance(error.__cause__, OF_A_ROW):
+                raise
+            if len(records) > 1:  # one of them is what the database refuses
+                half = len(records) // 2
+                return self.take(records[:half]) + self.take(records[half:])
+            text = f"{_named(records[0])}, which the database refused: {error.__cause__}"
+        self.write(lambda connection: self._insert_events(connection, [self._set_aside(text)]))
+        return []
+
+    def _take(self, connection: sa.Connection, records: Sequence[Record]) -> list[tuple[str, int]]:
+        """Insert what is not there yet; what is there must be the same, or it is set aside."""
+        events = [each for each in records if isinstance(each, Event)]
+        if events:
+            events = self._new_events(connection, events)
+        events += self._take_decisions(connection, [each for each in records if isinstance(each, StoredDecision)])
+        labels = [each for each in records if isinstance(each, TakenLabel)]
+        held = self.held(connection, [each.label.decision_id for each in labels])
+        numbers = {name: row.seq for name, row in held.items() if row.seq is not None}
+        said = {name: (held[name].success, held[name].source) for name in numbers}
+        fresh: dict[str, TakenLabel] = {}
+        well: list[str] = []
+        for each in labels:
+            name, now = each.label.decision_id, (each.label.success, each.label.source.value)
+            if name not in held:
+                events.append(self._set_aside(f"{_named(each)}, which the store does not hold"))
+            elif (held[name].content_hash, held[name].time) != (each.content_hash, each.decided):
+                events.append(self._set_aside(f"{_named(each)}, of which the store holds another decision"))
+            elif said.setdefault(name, now) != now:
+                events.append(self._set_aside(f"a second label: {_named(each)}, which has one"))
+            else:
+                well.append(name)
+                if name not in numbers:
+                    fresh.setdefault(name, each)
+        if fresh:
+            numbers |= zip(fresh, self.insert_labels(connection, list(fresh.values()), held), strict=True)
+        self._insert_events(connection, events)
+        return [(name, numbers[name]) for name in dict.fromkeys(well)]
+
+    def _take_decisions(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> list[Event]:
+        """Insert the new ones; returns what is to be said of those whose id has another decision."""
+        same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
+        query = sa.select(*DECISION.c, TRACE.c.data).select_from(DECISION.outerjoin(TRACE, same))
+        query = query.where(DECISION.c.cell_id == self.cell_id)
+        stored: dict[str, Any] = {}
+        for part in chunks([each.decision.id for each in decisions]):
+            stored |= {row.id: row._mapping for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
+        self.insert(connection, [each for each in decisions if each.decision.id not in stored])
+        events = []
+        for each in decisions:
+            if (row := stored.get(each.decision.id)) is not None:
+                given = decision_row(self.cell_id, each) | {"data": pack(each.trace)}
+                if other := ", ".join(name for name, value in given.items() if row[name] != value):
+                    events.append(self._set_aside(f"{_named(each)}, of which the store holds another: {other} differ"))
+        return events
+
+    def _new_events(self, connection: sa.Connection, events: Sequence[Event]) -> list[Event]:
+        query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(EVENT.c.cell_id == self.cell_id)
+        stored = {tuple(row) for row in connection.execute(query.where(EVENT.c.time.in_([each.time for each in events])))}
+        return [each for each in events if (each.time, each.kind, each.text) not in stored]
+
+    def _insert_events(self, connection: sa.Connection, events: Sequence[Event]) -> None:
+        if events:
+            first = self.scope.next_number(connection, EVENT.c.number)
+            rows = [to_row(each) | {"cell_id": self.cell_id, "number": i} for i, each in enumerate(events, first)]
+            connection.execute(sa.insert(EVENT), rows)
+
+    def _set_aside(self, text: str) -> Event:
+        log.error("set aside: %s", text)
+        return Event(0, self._clock(), "set aside", as_text(text))
+
+
+def _named(record: Record) -> str:
+    if isinstance(record, Event):
+        return f"an event, {record.text!r}"
+    if isinstance(record, StoredDecision):
+        return f"a decision, {record.decision.id!r}"
+    said = "success" if record.label.success else "failure"
+    return f"a label, {said} from {record.label.source.value}, on {record.label.decision_id!r}"

@@ -1,262 +1,277 @@
-"""The journal beside a store: what a store could not take, kept on the local disk until it can.
+"""A cell's journal: where each decision, label and event is written first, on the local disk, before it is in the store.
 
-A file of records, each with its length and CRC-32, after a header that names the owner. The file is locked as long as an
-engine owns the cell, and its space is reserved beforehand, so that a full disk has room for some hours of labels.
-
-What a journal's records say: decisions with their traces, labels and events, to bytes and back. No pickle.
+A locked file of records behind a header. Each record has its length, its CRC-32, and a digest over the record before it, so
+that a changed and a missing one are both noticed. The header says who owns the cell, up to where the store holds the
+records, and the newest entry of its ledger: a store that was cut off, or put back from a copy, does not hold that one.
 """
 
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
 import socket
 import struct
+import urllib.parse
 import weakref
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import StoreError
-from ..records import Action, Decision, Reason, Source
-from .records import NewLabel, StoredDecision
+from ..records import Decision
+from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
-LENGTH = struct.Struct("<I")  # of the JSON text, before it; a trace's samples follow it
-
-
-class JournalError(StoreError):
-    """The journal's own file cannot be written or read, whatever becomes of the store."""
+LENGTH = struct.Struct("<I")  # of a record's JSON text, before it; the samples of a trace or a point follow it
+RESERVE = 8 << 20  # bytes: 1,800 traces of 1000 samples, two and a half hours of cells that verify every part
+HEADER = 256  # bytes: what this file is, who owns it, and what the store holds of it
+MAGIC = b"dengine journal 2\n"
+MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
+FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, digest
+SYNC = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
 
 
 @dataclass(frozen=True, slots=True)
-class LateLabel:
-    """A label that the store has not taken yet; time : when it was reported, in seconds."""
+class TakenLabel:
+    """A label as it was reported.  time : when, in seconds.  content_hash, decided : of its decision, and when that was."""
 
     label: NewLabel
     time: float
+    content_hash: int
+    decided: float
 
 
-@dataclass(frozen=True, slots=True)
-class LateEvent:
-    """An event that the store has not taken yet."""
-
-    kind: str
-    text: str
-    time: float
-
-
-Record = StoredDecision | LateLabel | LateEvent
+Record = StoredDecision | TakenLabel | Event
 
 
 def to_bytes(record: Record) -> bytes:
-    """Return a record as a journal keeps it."""
+    """Return a record as a journal keeps it: its row in JSON, and the samples of its trace or point."""
+    rest: bytes | None = None
     if isinstance(record, StoredDecision):
-        about = {
-            "kind": "decision",
-            "decision": asdict(record.decision),
-            "shape": record.trace.shape,
-            "content_hash": record.content_hash,
-            "quarantined": record.quarantined,
-            "time": record.time,
-        }
-        return _framed(about, record.trace.astype("<f4", copy=False).tobytes())
-    if isinstance(record, LateLabel):
-        point = record.label.point
-        said = {
-            name: getattr(record.label, name) for name in ("decision_id", "success", "source", "model_version", "silent")
-        }
-        return _framed({"kind": "label", "time": record.time, "point": None if point is None else point.tolist()} | said)
-    return _framed({"kind": "event", "event": record.kind, "text": record.text, "time": record.time})
+        row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
+        rest = pack(record.trace)
+    elif isinstance(record, TakenLabel):
+        row = to_row(record.label) | {name: getattr(record, name) for name in ("time", "content_hash", "decided")}
+        rest = row.pop("point")
+        row["dim"] = None if rest is None else len(rest)
+    else:
+        row = to_row(record)
+    text = json.dumps([type(record).__name__, row]).encode()
+    return LENGTH.pack(len(text)) + text + (rest or b"")
 
 
 def from_bytes(blob: bytes) -> Record:
-    """Read what `to_bytes` wrote; StoreError for anything else, which its sum says was written so."""
+    """Read what `to_bytes` wrote; StoreError for anything else."""
     try:
         (length,) = LENGTH.unpack_from(blob)
-        text_end = LENGTH.size + length
-        about = json.loads(blob[LENGTH.size : text_end])
-        return _READERS[about["kind"]](about, blob[text_end:])
+        rest = blob[LENGTH.size + length :]
+        kind, row = json.loads(blob[LENGTH.size : LENGTH.size + length])
+        if kind == StoredDecision.__name__:
+            trace = unpack(rest).reshape(row["shape"])
+            return from_row(StoredDecision, row, decision=from_row(Decision, row), trace=trace)
+        if kind == TakenLabel.__name__:
+            label = from_row(NewLabel, row, point=None if row["dim"] is None else unpack(rest))
+            return TakenLabel(label, row["time"], row["content_hash"], row["decided"])
+        return from_row(Event, row)
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise JournalError(
+        raise StoreError(
             f"Expected a record of a journal, got what cannot be read ({error}); "
             "open the store with the dengine that wrote it."
         ) from error
 
 
-def _framed(about: dict[str, Any], rest: bytes = b"") -> bytes:
-    text = json.dumps(about, default=float).encode()
-    return LENGTH.pack(len(text)) + text + rest
-
-
-def _decision(about: dict[str, Any], samples: bytes) -> StoredDecision:
-    said = about["decision"]
-    embedding = None if said["embedding"] is None else tuple(tuple(point) for point in said["embedding"])
-    kinds = {"action": Action(said["action"]), "predicted": Action(said["predicted"]), "reason": Reason(said["reason"])}
-    decision = Decision(**(said | kinds | {"embedding": embedding}))
-    trace = np.frombuffer(samples, dtype="<f4").astype(np.float32).reshape(about["shape"])
-    return StoredDecision(decision, trace, about["content_hash"], about["quarantined"], about["time"])
-
-
-def _label(about: dict[str, Any], rest: bytes) -> LateLabel:
-    point = None if about["point"] is None else np.array(about["point"], dtype=np.float32)
-    source, version = Source(about["source"]), about["model_version"]
-    return LateLabel(
-        NewLabel(about["decision_id"], about["success"], source, version, point, about["silent"]), about["time"]
-    )
-
-
-def _event(about: dict[str, Any], rest: bytes) -> LateEvent:
-    return LateEvent(about["event"], about["text"], about["time"])
-
-
-_READERS: dict[str, Callable[[dict[str, Any], bytes], Record]] = {"decision": _decision, "label": _label, "event": _event}
-
-
-RESERVE = 8 << 20  # bytes: 1,800 traces of 1000 samples, two and a half hours of cells that verify every part
-HEADER = 256  # bytes: what this file is, and who owns it
-MAGIC = b"dengine journal 1\n"
-FRAME = struct.Struct("<II")  # of a record: length, CRC-32
-SYNC = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
-
-
 class Journal:
-    """An owned, locked journal.
+    """An owned, locked journal; one thread appends, and any may read.
 
-    path : of the file, which is made; a link is refused.
+    path : of the file, which is made; a link is refused.  end : offset behind the last record.
+    drained : offset up to which the store holds the records.
+    newest : number and digest of the newest entry of the ledger that was known; None: none yet.
     dropped : bytes of an unfinished record at the end, which a killed process left; they were never acknowledged.
-    damaged : offsets of records before the end that are not as they were written; the others are read all the same.
+    damaged : records that are not as they were written, or are missing; the others are read all the same.
 
     Raises StoreError where another process, or another engine of this one, owns it.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.drained, self.end, self.dropped, self.damaged = HEADER, HEADER, 0, 0
+        self.newest: tuple[int, str] | None = None
+        self._digest = bytes(16)
         self._fd = _locked(path)
-        self.damaged: list[int] = []
         try:
-            self._end, self.dropped = self._scan()
-            os.ftruncate(self._fd, self._end)
-            os.pwrite(self._fd, _header(), 0)
-            self._reserve()
-            os.fsync(self._fd)
-        except OSError as error:
-            os.close(self._fd)
-            raise _unusable(path, error) from error
+            with self._told():
+                self._scan()
+                os.ftruncate(self._fd, self.end)
+                self._begin()
         except StoreError:
             os.close(self._fd)
             raise
         _OPEN.add(self)
 
-    @property
-    def end(self) -> int:
-        """Offset behind the last record."""
-        return self._end
-
-    @property
-    def open(self) -> bool:
-        """Whether it was not closed."""
-        return self._fd >= 0
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise _unusable(self.path, error) from error
 
     @property
     def empty(self) -> bool:
-        """Whether nothing waits."""
-        return self._end == HEADER
+        """Whether the store holds all of it."""
+        return self.drained >= self.end
 
     def append(self, records: Sequence[bytes]) -> list[int]:
-        """Add records; they survive a killed process and lost power once this returns. Returns their offsets."""
-        offsets, framed = [], bytearray()
+        """Add records; they survive a killed process and lost power once this returns. Returns their offsets.
+
+        LostJournalError where the file is no longer the one at its path: what was written there, nobody will read.
+        """
+        offsets, framed, digest = [], bytearray(), self._digest
         for record in records:
-            offsets.append(self._end + len(framed))
-            framed += FRAME.pack(len(record), zlib.crc32(record)) + record
-        try:
-            written = os.pwrite(self._fd, framed, self._end)
-            if written < len(framed):
+            offsets.append(self.end + len(framed))
+            digest = _digest(digest, record)
+            framed += FRAME.pack(MARK, len(record), zlib.crc32(record), digest) + record
+        with self._told():
+            if (written := os.pwrite(self._fd, framed, self.end)) < len(framed):
                 raise OSError(f"only {written} of {len(framed)} bytes were written")
             SYNC(self._fd)
-        except OSError as error:
-            raise _unusable(self.path, error) from error
-        self._end += len(framed)
+        if not self._in_place():
+            raise LostJournalError(
+                f"The journal {self.path} was deleted, moved or replaced while it was open; leave it where it is."
+            )
+        self.end, self._digest = self.end + len(framed), digest
         return offsets
 
     def read(self, offset: int) -> bytes:
         """Return the record at an offset that `append` gave."""
-        length, crc = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))
-        record = os.pread(self._fd, length, offset + FRAME.size)
-        if zlib.crc32(record) != crc:
-            raise JournalError(f"Expected the record that was written to {self.path} at byte {offset}, found another.")
+        if (record := self._record(offset)) is None:
+            raise StoreError(f"Expected the record that was written to {self.path} at byte {offset}, found another.")
         return record
 
-    def records(self, begin: int = HEADER) -> Iterator[tuple[int, bytes]]:
-        """Return the records from an offset on, each with the offset behind it."""
-        while begin < self._end:
-            if begin in self.damaged:
-                begin = self._behind(begin)
-                continue
-            record = self.read(begin)
-            begin += FRAME.size + len(record)
-            yield begin, record
+    def records(self) -> Iterator[tuple[int, int, bytes]]:
+        """Return the records that are not drained: where each begins and ends, and the record."""
+        begin = self.drained
+        while (found := self._next(begin, self.end)) is not None:
+            at, record = found
+            begin = at + FRAME.size + len(record)
+            yield at, begin, record
+
+    def mark(self, drained: int, newest: tuple[int, str] | None) -> None:
+        """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
+        self.drained, self.newest = drained, newest
+        with self._told():
+            os.pwrite(self._fd, self._header(), 0)
 
     def clear(self) -> None:
         """Forget all records; the store holds them now."""
-        os.ftruncate(self._fd, HEADER)
-        self._end, self.damaged = HEADER, []
-        self._reserve()
-        os.fsync(self._fd)
+        with self._told():
+            os.ftruncate(self._fd, HEADER)
+            self.drained = self.end = HEADER
+            self._digest, self.damaged = bytes(16), 0
+            self._begin()
+
+    def remake(self) -> None:
+        """Make the lost file anew, with what is not drained where it was."""
+        lost, self._fd = self._fd, _locked(self.path)
+        try:
+            with self._told():
+                os.pwrite(self._fd, os.pread(lost, self.end - self.drained, self.drained), self.drained)
+                self._begin()
+        except StoreError:
+            lost, self._fd = self._fd, lost
+            raise
+        finally:
+            os.close(lost)
 
     def close(self) -> None:
-        """Give the cell free; an empty journal goes, one that holds something stays for the next engine."""
-        if not self.open:
-            return
-        if self.empty:
-            self.path.unlink(missing_ok=True)
-        else:
-            os.ftruncate(self._fd, self._end)
-        self.let_go()
+        """Give the cell free. The file stays: what it knows of the ledger is compared by the next engine."""
+        if self._fd >= 0:
+            with self._told():
+                os.ftruncate(self._fd, HEADER if self.empty else self.end)
+            self.let_go()
 
     def let_go(self) -> None:
         """Close the file and no more: in a forked child, which owns nothing."""
-        if self.open:
+        if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
-    def _scan(self) -> tuple[int, int]:
-        """Return where the last whole record ends, and how many bytes of an unfinished one follow."""
-        size = os.fstat(self._fd).st_size
-        if size == 0:
-            return HEADER, 0
-        if os.pread(self._fd, len(MAGIC), 0) != MAGIC:
-            raise StoreError(f"Expected a journal of dengine, found another file: {self.path}; move it away.")
-        begin = HEADER
-        while (whole := self._is_whole(begin)) or self._is_whole(self._behind(begin)):  # no process leaves one behind it
-            self.damaged += [] if whole else [begin]
-            begin = self._behind(begin)
-        left = os.pread(self._fd, size - begin, begin) if size > begin else b""
-        return begin, len(left.rstrip(b"\0"))
-
-    def _behind(self, offset: int) -> int:
-        """Return the offset behind a record, by what it says of its length; the same where no record begins."""
-        frame = os.pread(self._fd, FRAME.size, offset)
-        length = FRAME.unpack(frame)[0] if len(frame) == FRAME.size else 0
-        return offset + FRAME.size + length if length else offset
-
-    def _is_whole(self, offset: int) -> bool:
-        """Whether a record at an offset is there as it was written."""
-        left = os.fstat(self._fd).st_size - offset - FRAME.size
-        if left <= 0:
+    def _in_place(self) -> bool:
+        try:
+            return os.path.samestat(os.fstat(self._fd), self.path.lstat())
+        except FileNotFoundError:
             return False
-        length, crc = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))
-        return bool(0 < length <= left and zlib.crc32(os.pread(self._fd, length, offset + FRAME.size)) == crc)
 
-    def _reserve(self) -> None:
+    def _header(self) -> bytes:
+        known = json.dumps({"owner": owner()[:80], "drained": self.drained, "newest": self.newest})
+        return (MAGIC + known.encode()).ljust(HEADER, b"\0")
+
+    def _begin(self) -> None:
+        """Write the header, and reserve room."""
+        os.pwrite(self._fd, self._header(), 0)
         try:
             os.posix_fallocate(self._fd, 0, HEADER + RESERVE)
         except (AttributeError, OSError):  # no room, or no way to reserve it: then without, as far as it goes
-            os.ftruncate(self._fd, max(self._end, HEADER))
+            os.ftruncate(self._fd, max(self.end, HEADER))
+        os.fsync(self._fd)
+
+    def _scan(self) -> None:
+        """Find the end, and what is damaged on the way; all from where the store has the records."""
+        size = os.fstat(self._fd).st_size
+        if size == 0:
+            return
+        head = os.pread(self._fd, HEADER, 0)
+        if not head.startswith(MAGIC):
+            raise StoreError(f"Expected a journal of dengine, found another file: {self.path}; move it away.")
+        try:
+            self.drained, self.newest, _ = _known(head)
+        except (ValueError, KeyError, TypeError):  # all of it is drained again, which is harmless
+            self.damaged += 1
+        before: bytes | None = None  # of the first nothing is known: those before it may be gone
+        begin = self.drained = min(max(self.drained, HEADER), size)
+        while (found := self._next(begin, size)) is not None:
+            at, record = found
+            digest = self._digest_at(at)
+            follows = before is None or digest == _digest(before, record)
+            self.damaged += at > begin or not follows
+            before, begin = digest, at + FRAME.size + len(record)
+        left = os.pread(self._fd, size - begin, begin)
+        self.end, self.dropped, self._digest = begin, len(left.rstrip(b"\0")), before or bytes(16)
+
+    def _next(self, begin: int, end: int) -> tuple[int, bytes] | None:
+        """The first whole record from an offset on, and where it begins; None where there is none before the end."""
+        while begin < end:
+            if (record := self._record(begin)) is not None:
+                return begin, record
+            block = os.pread(self._fd, 1 << 20, begin + 1)
+            at = block.find(MARK)
+            if at < 0 and len(block) < 1 << 20:
+                return None
+            begin += 1 + (at if at >= 0 else len(block) - len(MARK))
+        return None
+
+    def _record(self, offset: int) -> bytes | None:
+        """The record at an offset; None where it is not as it was written."""
+        frame = os.pread(self._fd, FRAME.size, offset)
+        if len(frame) < FRAME.size or not frame.startswith(MARK):
+            return None
+        _, length, crc, _ = FRAME.unpack(frame)
+        if length > os.fstat(self._fd).st_size - offset - FRAME.size:
+            return None
+        record = os.pread(self._fd, length, offset + FRAME.size)
+        return record if zlib.crc32(record) == crc else None
+
+    def _digest_at(self, offset: int) -> bytes:
+        digest: bytes = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))[3]
+        return digest
+
+
+class LostJournalError(StoreError):
+    """The journal's file is not at its path any more."""
 
 
 _OPEN: weakref.WeakSet[Journal] = weakref.WeakSet()
@@ -268,6 +283,10 @@ def _let_all_go() -> None:
 
 
 os.register_at_fork(after_in_child=_let_all_go)  # or a worker that outlives its engine would keep the cell
+
+
+def _digest(before: bytes, record: bytes) -> bytes:
+    return blake2b(before + record, digest_size=16).digest()
 
 
 def _locked(path: Path) -> int:
@@ -283,16 +302,42 @@ def _locked(path: Path) -> int:
             if os.path.samestat(os.fstat(fd), path.lstat()):
                 return fd
         except BlockingIOError as error:
-            owner = os.pread(fd, HEADER, 0)[len(MAGIC) :].rstrip(b"\0").decode("utf-8", "replace")
+            head = os.pread(fd, HEADER, 0)
             os.close(fd)
-            raise owned_by(owner or "another engine", str(path)) from error
+            try:
+                holder = _known(head)[2]
+            except (ValueError, KeyError, TypeError):
+                holder = "another engine"
+            raise owned_by(holder, str(path)) from error
         except FileNotFoundError:
             pass  # its owner went, and took the file along, between the opening and the lock: once more
         os.close(fd)
 
 
-def _header() -> bytes:
-    return (MAGIC + owner().encode("utf-8", "replace"))[:HEADER].ljust(HEADER, b"\0")
+def journal_path(url: Any, cell_id: str) -> Path:
+    """Where a cell's journal lies: beside an SQLite file, else in the user's folder of state, `XDG_STATE_HOME`."""
+    name = urllib.parse.quote(cell_id, safe="")
+    if url.get_backend_name() == "sqlite":
+        return Path(f"{Path(str(url.database)).absolute()}.{name}.journal")
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "dengine"
+    where = hashlib.sha256(f"{url.host}:{url.port}/{url.database}/{cell_id}".encode()).hexdigest()[:12]
+    return state / f"{name[:60]}.{where}.journal"
+
+
+def newest_known(path: Path) -> tuple[int, str] | None:
+    """Number and digest of the ledger's newest entry that a journal knows, whoever owns it; None where it knows none."""
+    try:
+        with path.open("rb") as file:
+            return _known(file.read(HEADER))[1]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
+    """What a header says: the offset up to which the store has the records, its newest entry, the owner."""
+    known = json.loads(head[len(MAGIC) :].rstrip(b"\0"))
+    newest = known["newest"]
+    return int(known["drained"]), None if newest is None else (int(newest[0]), str(newest[1])), str(known["owner"])
 
 
 def owner() -> str:
@@ -308,5 +353,5 @@ def owned_by(holder: str, name: str) -> StoreError:
     )
 
 
-def _unusable(path: Path, error: OSError) -> JournalError:
-    return JournalError(f"Could not use the journal {path}: {error}; free some space there, or make its folder writable.")
+def _unusable(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"Could not use the journal {path}: {error}; free some space there, or make its folder writable.")

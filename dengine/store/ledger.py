@@ -19,7 +19,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .schema import CHAINED, LEDGER, RESERVED, SCHEMA_KEY, SETTING
+from .queries import Scope
+from .schema import CHAINED, LEDGER, RESERVED, SETTING
 
 START = bytes(32)  # what the first entry of a cell follows
 APART = {"sum", "state"}  # columns that a row's sum leaves out: itself, and a state, which may go: `state_sum` covers it
@@ -98,11 +99,11 @@ Row = Mapping[str, Any]
 class LedgerEntry:
     """The entry that a transaction under way will end with; nothing is asked or written where it adds no row.
 
-    cell_id : whose ledger.  clock : the time in seconds that the entry is stamped with.
+    scope : whose ledger.  clock : the time in seconds that the entry is stamped with.
     """
 
-    def __init__(self, cell_id: str, clock: Callable[[], float]) -> None:
-        self.cell_id = cell_id
+    def __init__(self, scope: Scope, clock: Callable[[], float]) -> None:
+        self._scope, self.cell_id = scope, scope.cell_id
         self._clock = clock
         self._number = 0  # 0: not begun
         self._previous = START
@@ -139,17 +140,15 @@ class LedgerEntry:
         """Lock the cell, before the newest entry is read: two processes may write to it."""
         if self._number:
             return
-        if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
-            mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-            connection.execute(sa.select(SETTING.c.key).where(mine).with_for_update())
+        self._scope.lock_cell(connection)
         newest = sa.select(LEDGER.c.number, LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
         last = connection.execute(newest.order_by(LEDGER.c.number.desc()).limit(1)).first()
         self._number, self._previous = (1, START) if last is None else (last.number + 1, last.digest)
 
-    def append(self, connection: sa.Connection) -> None:
-        """Write the entry, as the last of the transaction."""
+    def append(self, connection: sa.Connection) -> tuple[int, str] | None:
+        """Write the entry, as the last of the transaction; returns its number and digest, None where there is none."""
         if not self._number:
-            return
+            return None
         held = held_settings(connection, self.cell_id) if self._settings else None
         head = {
             "cell_id": self.cell_id,
@@ -158,7 +157,9 @@ class LedgerEntry:
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "settings": None if held is None else json.dumps(held, sort_keys=True),
         }
-        connection.execute(sa.insert(LEDGER), head | {"digest": entry_digest(self._previous, head, self._sums)})
+        digest = entry_digest(self._previous, head, self._sums)
+        connection.execute(sa.insert(LEDGER), head | {"digest": digest})
+        return self._number, digest.hex()
 
 
 def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..records import Action, Decision, Reason, RetrainReport, Source
-from .journal import Record
+from .base import Store
+from .journal import Record, TakenLabel
 from .records import (
     FORGOTTEN,
     KEEP,
@@ -51,7 +51,7 @@ from .records import (
     refuse_repeats,
     unknown_decision,
 )
-from .views import HistoryFilter, PastLabel, PastRetrain, Stretch, Tally, count_outcomes, stretch_of, summary, tally_of
+from .views import HistoryFilter, PastLabel, Stretch, Tally, count_outcomes, stretch_of, summary, tally_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class StoredLabel:
     given: NewLabel
 
 
-class MemoryStore:
+class MemoryStore(Store):
     """The contract of `Store` in plain dicts, for replays and trials: nothing outlives the process.
 
     Of decisions that were never reported only the newest 10,000 are kept, trace and all; an older one is counted
@@ -79,8 +79,8 @@ class MemoryStore:
         self.cell_id = cell_id
         self.product: str | None = None
         self.wait: float | None = None
-        self.remote = False
-        self._clock = clock
+        self.clock = clock
+        self.before_use: Callable[[], None] = lambda: None
         self._settings: dict[str, str] = {}
         self._open: dict[str, StoredDecision] = {}  # decisions without a label
         self._done: dict[str, StoredDecision] = {}  # and with one
@@ -90,7 +90,7 @@ class MemoryStore:
         self._silent: Counter[int] = Counter()  # by the version that answered when the label came
         self._kinds: Counter[tuple[Action, Reason, bool]] = Counter()
         self._times: tuple[float | None, float | None] = (None, None)
-        self._retrains: list[PastRetrain] = []
+        self._retrains: list[StoredVersion] = []
         self._states: dict[int, ModelVersion] = {}  # those that `keeps_state` keeps, the newest last
         self._events: list[Event] = []
         self._corrections: list[Correction] = []
@@ -105,7 +105,10 @@ class MemoryStore:
         self._settings = dict(settings)
 
     def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
-        item = checked_decision(decision, trace, content_hash, quarantined, self._clock())
+        self._put(checked_decision(decision, trace, content_hash, quarantined, self.clock()))
+
+    def _put(self, item: StoredDecision) -> None:
+        decision = item.decision
         if self._holds(decision.id):
             raise duplicate_id(decision.id)
         self._open[decision.id] = item
@@ -134,12 +137,6 @@ class MemoryStore:
     def decision_ids(self) -> list[str]:
         return [*self._open, *self._done]
 
-    def put_label(
-        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None,
-        *, silent: int = 0,
-    ) -> int:  # fmt: skip
-        return int(self.put_labels([NewLabel(decision_id, success, source, model_version, point, silent)])[0])
-
     def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
         given = [checked_label(label) for label in labels]
         known = {label.decision_id for label in given if self._holds(label.decision_id)}
@@ -151,9 +148,20 @@ class MemoryStore:
             self._take(label)
         return np.arange(first, first + len(given), dtype=np.int64)
 
+    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        arrived = []
+        for record in records:
+            if isinstance(record, StoredDecision):
+                self._put(record)
+            elif isinstance(record, TakenLabel):
+                arrived.append((record.label.decision_id, int(self.put_labels([record.label])[0])))
+            else:
+                self._events.append(replace(record, number=len(self._events) + 1))
+        return arrived
+
     def _take(self, given: NewLabel) -> None:
         item = self._done[given.decision_id] = self._open.pop(given.decision_id)
-        label = StoredLabel(len(self._labels) + 1, self._clock(), item, given)
+        label = StoredLabel(len(self._labels) + 1, self.clock(), item, given)
         self._labels.append(label)
         self._label_of[given.decision_id] = label
         self._count(item, None, -1)
@@ -260,8 +268,8 @@ class MemoryStore:
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
         """Record a retrain; of older versions few keep their states, as in a database. A dropped candidate has none."""
-        copies, now = check_state(report, state), self._clock()
-        self._retrains.append(PastRetrain(len(self._retrains) + 1, now, int(last_seq), report))
+        copies, now = check_state(report, state), self.clock()
+        self._retrains.append(StoredVersion(len(self._retrains) + 1, now, int(last_seq), report))
         if report.accepted and copies is not None:
             held = self._states | {report.version: ModelVersion(report.version, int(last_seq), copies)}
             self._states = {n: held[n] for n in held if keeps_state(n, report.version, KEEP)}
@@ -275,22 +283,15 @@ class MemoryStore:
             raise not_kept(version, self._states)
         return _copied(self._states[version])
 
-    def versions(self) -> list[StoredVersion]:
+    def versions(self, own: bool = False) -> list[StoredVersion]:
         found = []
-        for row in self._retrains:
-            of = row.report
-            kept = self._states.get(of.version) if of.accepted else None
+        for each in self._retrains:
+            kept = self._states.get(each.report.version) if each.report.accepted else None
             n_bytes = 0 if kept is None else sum(values.nbytes for values in kept.state.values())
-            found.append(StoredVersion(of.version, row.time, of.accepted, of.reason, n_bytes, kept is not None))
+            found.append(replace(each, n_bytes=n_bytes, kept=kept is not None))
         return found
 
-    def retrains(self) -> list[RetrainReport]:
-        return [row.report for row in self._retrains]
-
     # Events
-
-    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
-        self.record(Change(kind, text, data, author))
 
     def events(self, limit: int | None = None) -> list[Event]:
         return self._events[0 if limit is None else max(0, len(self._events) - limit) :]
@@ -298,7 +299,7 @@ class MemoryStore:
     # Corrections
 
     def record(self, change: Change) -> int:
-        number, now, author = len(self._events) + 1, self._clock(), as_text(change.author)
+        number, now, author = len(self._events) + 1, self.clock(), as_text(change.author)
         event = Event(number, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         for name in change.decisions:
             if name not in self._label_of:
@@ -371,9 +372,6 @@ class MemoryStore:
             found.append(PastLabel(*known, item.quarantined, of.silent, of.point if points else None, *bound))
         return found
 
-    def past_retrains(self) -> list[PastRetrain]:
-        return list(self._retrains)
-
     def tally(self, last: int | None = None) -> Tally:
         every = self._every()
         return tally_of(every if last is None else every[max(0, len(every) - last) :])
@@ -388,19 +386,19 @@ class MemoryStore:
     def own(self) -> None:
         return None
 
+    def doubt(self) -> str:
+        return ""
+
+    def newest_entry(self) -> None:
+        return None
+
+    def holds_entry(self, number: int, digest: str) -> bool:
+        return False
+
     def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
-        return [], []
-
     def let_go(self) -> None:
-        self.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
 

@@ -1,229 +1,43 @@
-"""A store that never makes the cell wait: every call has a time limit, and what a store cannot take waits in its journal.
+"""The one way into a store while a cell runs: decisions, labels and events go to a journal first, and from there into it.
 
-Where the store fails or does not answer in time, decisions and labels go to the journal beside it, which survives a killed
-process; a thread tries the store every second, and plays the journal back. A store without a journal is called directly.
+One thread writes and syncs the journal, another has the store take what is synced, and asks it what the engine wants to
+know. No call waits longer than the store's `wait`. How far the store lags behind is a number, `lag`: a store that is away
+and one that is slow are the same to the cell. Without a journal (in memory, for reading) the store is called directly.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import queue
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import suppress
 from dataclasses import replace
-from enum import Enum, auto
 from hashlib import blake2b
-from typing import Any, Generic, TypeVar
+from itertools import islice
+from typing import Any, TypeVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import StoreError
 from ..records import RetrainReport
 from .base import Store
-from .journal import HEADER, RESERVE, Journal, JournalError, LateEvent, LateLabel, Record, from_bytes, to_bytes
-from .records import NewLabel, StoredDecision, already_reported
+from .journal import LostJournalError, Record, TakenLabel, from_bytes, to_bytes
+from .records import Event, NewLabel, StoredDecision, already_reported, as_text, checked_decision, checked_label
 
+log = logging.getLogger("dengine")
 T = TypeVar("T")
-Committing = Callable[[Callable[[], bool]], AbstractContextManager[None]]
-
-
-class SlowStoreError(StoreError):
-    """The store did not answer in time."""
-
-
-class Fault(Enum):
-    """Why a store cannot be written."""
-
-    STORE = auto()
-    SLOW = auto()  # it did not answer in time
-    RETURNING = auto()  # it is there again, and is to take what its journal holds
-    JOURNAL = auto()  # the journal cannot be written either
-
-    @classmethod
-    def of(cls, error: Exception) -> Fault:
-        """The kind of what a store, or its journal, raised."""
-        kinds = ((JournalError, cls.JOURNAL), (SlowStoreError, cls.SLOW))
-        return next((kind for raised, kind in kinds if isinstance(error, raised)), cls.STORE)
-
-
-class Asked(Generic[T]):
-    """A call on its way: given up before its commit begins, it writes nothing; afterwards it can't be given up any more.
-
-    wait : seconds from now on that its result is waited for; None: as long as it takes.
-    more : seconds beyond them for a commit that is under way by then, for it may succeed.
-    lasting : it is made to its end, whether somebody waits for it or not.
-    then : called once its result was taken.
-    """
-
-    def __init__(
-        self,
-        work: Callable[[], T],
-        wait: float | None = None,
-        more: float = 0.0,
-        lasting: bool = False,
-        then: Callable[[], object] = lambda: None,
-    ) -> None:
-        self._work, self._wait, self._more, self._then = work, wait, more, then
-        self._began = time.monotonic()
-        self._future: Future[T] = Future()  # runs from the moment of its commit on; until then it can be cancelled
-        if lasting:
-            self._future.set_running_or_notify_cancel()
-
-    def run(self, committing: Committing) -> None:
-        """Make the call, unless it was given up; what it raises is raised where its result is asked for."""
-        if self._future.cancelled():
-            return
-        try:
-            with committing(self._wanted):
-                result = self._work()
-        except BaseException as error:
-            if self._wanted():
-                self._future.set_exception(error)
-        else:
-            if self._wanted():
-                self._future.set_result(result)
-
-    @property
-    def due(self) -> bool:
-        """Whether its result is there, or is not waited for any longer."""
-        return self._future.done() or (self._wait is not None and time.monotonic() - self._began >= self._wait)
-
-    def result(self) -> T:
-        """Return what the call returned. StoreError where it takes longer than it is waited for: then it is given up."""
-        left = None if self._wait is None else max(0.0, self._began + self._wait - time.monotonic())
-        result = self._result(left, self._more)
-        self._then()
-        return result
-
-    def _result(self, wait: float | None, more: float) -> T:
-        try:
-            return self._future.result(wait)
-        except TimeoutError as error:
-            if self._future.done():  # the call's own
-                raise
-            late = error
-        if not self._future.cancel() and more > 0.0:
-            return self._result(more, 0.0)
-        raise SlowStoreError(f"no answer from the store within {self._wait:g} s.") from late
-
-    def _wanted(self) -> bool:
-        future = self._future
-        return future.running() or (not future.cancelled() and future.set_running_or_notify_cancel())
-
-
-WAITING = 10_000  # decisions in memory, before they go to the journal while the store is away
-CHUNK = 500  # of a journal's records in one transaction
-
-
-class Backlog:
-    """Decisions and labels on their way to a store; used by the cell's thread and by the one that asks the store."""
-
-    def __init__(self, store: Store, journal: Journal) -> None:
-        self.store = store
-        self.journal = journal
-        self.lock = threading.RLock()
-        self._unsafe: dict[str, StoredDecision] = {}  # not known to be committed, and not in the journal
-        self._offsets: dict[str, int] = {}  # of decisions in the journal
-        self._labels: dict[str, NewLabel] = {}  # in the journal, by decision
-        self._arrived: list[tuple[str, int]] = []
-        self._played = HEADER  # offset up to which the store holds the journal
-
-    @property
-    def unsafe(self) -> list[str]:
-        """Ids of decisions that are not known to be on the disk."""
-        with self.lock:
-            return list(self._unsafe)
-
-    def add(self, item: StoredDecision) -> None:
-        """A decision was handed to the store, or waits for it."""
-        with self.lock:
-            self._unsafe[item.decision.id] = item
-
-    def committed(self, names: Sequence[str]) -> None:
-        """These decisions are in the store."""
-        with self.lock:
-            for name in names:
-                self._unsafe.pop(name, None)
-
-    def find(self, decision_id: str) -> StoredDecision | None:
-        """A decision that is in the journal, with its label."""
-        with self.lock:
-            offset, label = self._offsets.get(decision_id), self._labels.get(decision_id)
-            item = None if offset is None else from_bytes(self.journal.read(offset))
-        if not isinstance(item, StoredDecision):
-            return None
-        return item if label is None else replace(item, success=label.success, source=label.source)
-
-    def write(self, records: Sequence[Record]) -> None:
-        """Put records into the journal, after all decisions that are not safe yet; StoreError where that fails."""
-        with self.lock:
-            decisions = list(self._unsafe.values())
-            if not decisions and not records:
-                return
-            offsets = self.journal.append([to_bytes(record) for record in [*decisions, *records]])
-            names = [item.decision.id for item in decisions]
-            self._offsets |= dict(zip(names, offsets, strict=False))
-            self._labels |= {late.label.decision_id: late.label for late in records if isinstance(late, LateLabel)}
-            self.committed(names)
-
-    def write_beyond(self, n: int) -> None:
-        """Put decisions into the journal where more than n wait in memory."""
-        if len(self._unsafe) > n:
-            self.write([])
-
-    def take_arrived(self) -> list[tuple[str, int]]:
-        """The numbers of labels, by decision, that were played back since this was last asked."""
-        if not self._arrived:
-            return []
-        with self.lock:
-            arrived, self._arrived = self._arrived, []
-        return arrived
-
-    def play_back(self) -> list[str]:
-        """Have the store take a piece of what waits; returns what it refused, in words. StoreError where it is away."""
-        with self.lock:
-            batch, end = self._next()
-        arrived, refused = self.store.play_back(batch) if batch else ([], [])
-        with self.lock:
-            self._arrived += arrived
-            self._played = end
-            self.committed([record.decision.id for record in batch if isinstance(record, StoredDecision)])
-        return refused
-
-    def stored_upto(self, end: int) -> None:
-        """The store holds what the journal held up to this offset; what is all stored is cleared."""
-        with self.lock:
-            self._played = max(self._played, end)
-            self.cleared()
-
-    def cleared(self) -> bool:
-        """Empty the journal once the store has all of it; whether nothing is left to be played back."""
-        with self.lock:
-            if self._played < self.journal.end or self._unsafe:
-                return False
-            if not self.journal.empty:
-                self.journal.clear()
-            self._played, self._offsets, self._labels = HEADER, {}, {}
-            return True
-
-    def _next(self) -> tuple[list[Record], int]:
-        batch: list[Record] = []
-        end = self._played
-        for behind, blob in self.journal.records(end):
-            batch.append(from_bytes(blob))
-            end = behind
-            if len(batch) == CHUNK:
-                return batch, end
-        return batch + list(self._unsafe.values()), end  # the last of them never went to the journal
-
-
-MOST = 1_000
+LINGER = 0.05  # seconds that a decision waits for company before it is written, and before the store takes it
+BEAT = 1.0  # seconds between two tries of what failed
+LATE = 1.0  # seconds of lag that are a fault of the store
+COMMIT = 2.0  # seconds beyond `wait` for a commit that is under way by then, for it may succeed
+CLOSE = 5.0  # seconds that closing may take
+CHUNK = 500  # records that the store takes at once
+MOST = 1_000  # of the newest decisions, which are known without asking
+UNWRITTEN = 10_000  # decisions in memory while the disk does not answer; later ones are verified, and not recorded
 
 
 class TakenIds:
@@ -254,113 +68,109 @@ class TakenIds:
         return [int.from_bytes(digest[i : i + 4], "little") % self.BITS for i in range(0, len(digest), 4)]
 
 
-class RecentDecisions:
-    """The newest decisions, at most `MOST`."""
-
-    def __init__(self) -> None:
-        self._known: OrderedDict[str, StoredDecision] = OrderedDict()
-        self._taken: TakenIds | None = None
-        self._adding = threading.Lock()
-
-    def add(self, known: StoredDecision) -> StoredDecision:
-        """One more, in any thread; the oldest goes where there are too many. Returns the one that has its id: the first."""
-        with self._adding:
-            if (first := self._known.get(known.decision.id)) is not None:
-                return first
-            self._known[known.decision.id] = known
-            if self._taken is not None:
-                self._taken.add(known.decision.id)
-            if len(self._known) > MOST:
-                self._known.popitem(last=False)
-        return known
-
-    def know(self, ids: Iterable[str]) -> None:
-        """Learn which ids are taken by now."""
-        self._taken = TakenIds(ids)
-
-    def is_new(self, decision_id: str) -> bool:
-        """Whether an id is taken for certain by no decision; False where that is not known."""
-        return self._taken is not None and not self._taken.may_hold(decision_id)
-
-    def find(self, decision_id: str) -> StoredDecision | None:
-        """A decision with its label; None where it is not among the newest."""
-        return self._known.get(decision_id)
-
-    def label(self, labels: Sequence[NewLabel]) -> None:
-        """These labels were taken in."""
-        for label in labels:
-            if (known := self._known.get(label.decision_id)) is not None:
-                self._known[label.decision_id] = replace(known, success=label.success, source=label.source)
-
-    def refuse_repeats(self, labels: Sequence[NewLabel]) -> None:
-        """ReportError where one of these decisions has a label already."""
-        for label in labels:
-            known = self._known.get(label.decision_id)
-            if known is not None and known.success is not None and known.source is not None:
-                raise already_reported(known.decision.id, (known.success, known.source), (label.success, label.source))
-
-    def forget(self, decision_id: str) -> None:
-        """What was known of this one is no longer so."""
-        self._known.pop(decision_id, None)
-
-
-log = logging.getLogger("dengine")
-GRACE = 2.0  # seconds in which a store may be slow before its cell verifies everything
-BEAT = 1.0  # seconds between two tries, and between two looks at whether the store is there
-CLOSE = 5.0  # seconds that closing may take
-
-
 class Outbox:
-    """What an engine asks of its store while the cell runs.
+    """What an engine tells and asks its store while the cell runs.
 
     owning : claim the cell; else the store is read and nothing more.
     patient : wait as long as it takes: a replay that repeats exactly never looks at the clock.
-    fault : why the store cannot be written at present; "" where it can.
     """
 
     def __init__(self, store: Store, owning: bool = True, patient: bool = False) -> None:
         self.store = store
-        self.fault = ""
-        self._kind = Fault.STORE
-        self._fault_began = 0.0
-        self._beat_began: float | None = None
-        self.recent = RecentDecisions()
-        self._pid = os.getpid()
-        self._closed, self._reading, self._patient = False, not owning, patient
-        self._jobs: queue.SimpleQueue[Asked[Any] | None] = queue.SimpleQueue()
-        self._backlog: Backlog | None = None
-        self._grace = GRACE
-        if owning and (journal := store.own()) is not None:
-            self._grace = max(GRACE, store.wait or 0.0)
-            self._backlog = Backlog(store, journal)
-            self._begin(self._backlog)
+        self.limit = None if patient else store.wait
+        self._reading, self._pid, self._closed, self._ending = not owning, os.getpid(), False, False
+        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
+        self._taken: TakenIds | None = None
+        self._learning = False  # which ids are taken
+        self._unrecorded: set[str] = set()  # ids that were answered, and are recorded under no decision of theirs
+        self._arrived: list[tuple[str, int]] = []
+        self._changed = threading.Condition(threading.RLock())  # guards all that follows
+        self._unwritten: deque[Record] = deque()
+        self._open: dict[str, StoredDecision] = {}  # decisions that are not synced yet
+        self._where: dict[str, int] = {}  # offsets in the journal of those that are not drained
+        self._labels: dict[str, tuple[NewLabel, int]] = {}  # not drained, with their places
+        self._times: deque[float] = deque()  # when each record that is not drained was appended
+        self._appended = self._synced = self._drained = 0  # how many records so far
+        self._wanted = self._asked = self._tries = 0  # place that somebody waits for to be synced; questions; failures
+        self._drains = 0  # callers that wait for the store to have everything
+        self._jobs: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._sync_began: float | None = None
+        self._stuck = self._away = self._doubt = ""  # why the journal, why the store, took nothing; what is not as written
+        self._journal = store.own() if owning else None
+        if self._journal is not None:
+            self._begin()
 
-    def _begin(self, backlog: Backlog) -> None:
-        damaged = len(backlog.journal.damaged)
+    def _begin(self) -> None:
+        """Have the store take what an earlier process left, and begin."""
+        journal = self._journal
+        assert journal is not None
         try:
-            self._play_back(backlog)
-            if backlog.journal.dropped:
-                text = f"{backlog.journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
-                self.store.put_event("journal", text)
-            if damaged:
-                self.store.put_event("journal", f"{damaged} records that are not as they were written were left out")
+            for at, _, blob in journal.records():
+                self._appended, self._synced = self._appended + 1, self._synced + 1
+                self._times.append(time.monotonic())
+                if isinstance(record := from_bytes(blob), StoredDecision):
+                    self._where[record.decision.id] = at  # a later one of an id is in the place of an earlier one
+            while not self.drained:
+                self._take()
+            if journal.newest is not None and not self.store.holds_entry(*journal.newest):
+                text = f"the ledger lacks entry {journal.newest[0]}, which this cell's journal knows: the store was cut off"
+                self._note("lost", f"{text}, or put back from a copy; labels may be missing")
+            if journal.dropped:
+                text = f"{journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
+                self._note("journal", text)
+            if journal.damaged:
+                self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
+            journal.mark(journal.drained, self.store.newest_entry())
+            journal.clear()
+            if doubt := self.store.doubt():
+                self._doubt = f"{doubt}; see `dengine verify`, and restore the store from a copy."
+                log.error("every part is verified: %s", self._doubt)
         except BaseException:
-            backlog.journal.close()
+            journal.close()
             raise
-        backlog.take_arrived()  # what is resumed from the store knows them
-        self._thread = threading.Thread(target=self._serve, args=(backlog,), name="dengine-outbox", daemon=True)
-        self._thread.start()
+        self._arrived.clear()  # what is resumed from the store knows them
+        self.store.before_use = self._settle
+        self._threads = [
+            threading.Thread(target=work, name=f"dengine-{name}", daemon=True)
+            for name, work in (("journal", self._keep_writing), ("store", self._keep_draining))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _note(self, kind: str, text: str) -> None:
+        log.error("%s: %s", kind, text)
+        self.store.put_event(kind, text)
+
+    # How it is doing
 
     @property
     def away(self) -> str:
-        """Why the cell verifies everything; "" where it need not.
+        """Why the cell verifies everything: what is in force was changed, or the journal takes nothing; "" else."""
+        return self._doubt or self._hung
 
-        A store on a server may be away while the journal on this machine takes everything: then the cell goes on deciding.
-        """
-        if not self.fault or self._backlog is None or (self._backlog.store.remote and self._kind is not Fault.JOURNAL):
-            return ""
-        slow = self._kind in (Fault.SLOW, Fault.RETURNING) and time.monotonic() - self._fault_began < self._grace
-        return "" if slow else self.fault
+    @property
+    def _hung(self) -> str:
+        began = self._sync_began
+        if not self._stuck and began is not None and self.limit is not None and time.monotonic() - began > self.limit:
+            return f"the disk has not answered for {time.monotonic() - began:.1f} s."
+        return self._stuck
+
+    @property
+    def lag(self) -> float:
+        """Age in seconds of the oldest record that the store has not taken; 0.0 where it has all."""
+        with self._changed:
+            return time.monotonic() - self._times[0] if self._times else 0.0
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the store, or with the journal, at present; "" where nothing is."""
+        return self._doubt or self._blocked
+
+    @property
+    def _blocked(self) -> str:
+        """Why the store cannot be written, or asked, at present."""
+        late = self.limit is not None and self.lag > max(LATE, self.limit)
+        return self._hung or self._away or (f"no answer from the store for {self.lag:.1f} s." if late else "")
 
     @property
     def usable(self) -> bool:
@@ -379,196 +189,384 @@ class Outbox:
         if self._reading:
             raise StoreError("Expected an engine that owns its cell, got one that was opened for reading; open it without.")
 
-    # What the engine asks
+    # What the engine tells
 
-    def decided(self, item: StoredDecision) -> None:
-        """Take a decision and its trace without waiting."""
+    def decided(self, item: StoredDecision) -> StoredDecision:
+        """Record a decision without waiting, in any thread; returns the one that has its id: of two the first."""
         self.check()
-        if (backlog := self._backlog) is None:
-            self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
-            return
-        self._look_at_the_beat()
-        fault, kind = self.fault, self._kind
-        try:
-            if not fault:
-                self.store.put_decision(item.decision, item.trace, item.content_hash, item.quarantined)
-        except StoreError as error:
-            fault, kind = str(error), Fault.of(error)
-        with backlog.lock:  # what is here when the fault ends is played back
-            backlog.add(replace(item, time=time.time()))
-            if fault:
-                self._note(fault, kind)
-                self._spill(backlog)
+        made = checked_decision(item.decision, item.trace, item.content_hash, item.quarantined, self.store.clock())
+        id_ = made.decision.id
+        with self._changed:
+            if (first := self._recent.get(id_)) is not None:
+                return first
+            self._unrecorded.discard(id_)
+            if len(self._open) >= UNWRITTEN:
+                self._unrecorded.add(id_)
+                return made
+            self._append([made])
+            self._remember(made)
+        return made
+
+    def amend(self, item: StoredDecision) -> StoredDecision:
+        """Put a decision in the place of its id's, which nobody was told; returns that one if it is on the disk by now."""
+        with self._changed:
+            first = self._recent[item.decision.id]
+            if item.decision.id not in self._open:
+                return first
+            made = replace(item, time=first.time, trace=first.trace)
+            self._append([made])
+            self._remember(made)
+        return made
+
+    def _remember(self, made: StoredDecision) -> None:
+        self._recent[made.decision.id] = made
+        if self._taken is not None:
+            self._taken.add(made.decision.id)
+        if len(self._recent) > MOST:
+            self._recent.popitem(last=False)
+
+    def secure(self) -> bool:
+        """Wait until all that was decided so far is on the disk; False where that takes too long."""
+        if self._journal is None:
+            return True
+        with suppress(StoreError):
+            self._wait_synced(self._appended)
+            return True
+        return False
+
+    def labels(self, labels: Sequence[tuple[StoredDecision, NewLabel]], secure: bool = True) -> None:
+        """Record labels of decisions; where secure, they are on the disk when this returns. Numbers come with `arrived`.
+
+        ReportError for a second label of a decision. StoreError where they are not known to be taken: the same again is
+        harmless, the opposite is a ReportError.
+        """
+        with self._changed:
+            fresh: list[Record] = []
+            place = 0
+            for known, label in labels:
+                id_, now = known.decision.id, (label.success, label.source)
+                first, at = self._labels.get(id_, (None, 0))
+                if known.source is not None:
+                    raise already_reported(id_, (bool(known.success), known.source), now)
+                if first is not None and first.success != label.success:
+                    raise already_reported(id_, (first.success, first.source), now)
+                if first is None:
+                    fresh.append(TakenLabel(checked_label(label), self.store.clock(), known.content_hash, known.time))
+                place = max(place, at)
+            if fresh:
+                place = self._append(fresh)
+        if secure:
+            self._wait_synced(place)
+        with self._changed:
+            for _, label in labels:
+                self._say(label)
+
+    def _say(self, label: NewLabel) -> None:
+        if (known := self._recent.get(label.decision_id)) is not None:
+            self._recent[label.decision_id] = replace(known, success=label.success, source=label.source)
+
+    def event(self, kind: str, text: str) -> None:
+        """Record what happened, without waiting."""
+        with self._changed:
+            self._append([Event(0, self.store.clock(), as_text(kind), as_text(text))])
+
+    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> Future[int]:
+        """Begin to commit a retrain; its `result` is the version's number."""
+        return self._put(lambda: self.store.put_version(report, last_seq, state))
+
+    def _append(self, records: Sequence[Record]) -> int:
+        """Take records; returns the place of the last."""
+        if self._journal is None:
+            self._arrived += self.store.take(records)
+            return 0
+        now, self._appended = time.monotonic(), self._appended + len(records)
+        for place, record in enumerate(records, self._appended - len(records) + 1):
+            self._times.append(now)
+            if isinstance(record, StoredDecision):
+                self._open[record.decision.id] = record
+                self._where.pop(record.decision.id, None)
+            elif isinstance(record, TakenLabel):
+                self._labels[record.label.decision_id] = record.label, place
+        self._unwritten.extend(records)
+        self._changed.notify_all()
+        return self._appended
+
+    def _wait_synced(self, place: int) -> None:
+        """Return when the records up to a place are on the disk. StoreError where that takes too long, or fails."""
+        with self._changed:
+            self._wanted, self._asked, tries = max(self._wanted, place), self._asked + 1, self._tries
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, self.limit)
+            if self._synced < place:
+                why = self._stuck or f"the disk gave no answer within {self.limit:g} s."
+                raise StoreError(
+                    f"What was told is not known to be taken: {why} "
+                    "Say the same again; once the disk is well it is taken, and counts once."
+                )
+
+    # What the engine asks
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
-        if self._backlog is None:
+        if self._journal is None:
             return self.store.get_decision(decision_id)
-        known = self.recent.find(decision_id)
-        if known is None and ((known := self._backlog.find(decision_id)) is None or not (known.source or self.fault)):
-            known = self.ask(lambda: self.store.get_decision(decision_id)) or known  # its label may be there alone
+        with self._changed:
+            if decision_id in self._unrecorded:
+                raise StoreError(
+                    f"Expected a decision that is recorded, got {decision_id!r}, which could not be looked up, and was "
+                    "verified unrecorded; decide on the part again."
+                )
+            known = self._recent.get(decision_id) or self._open.get(decision_id)
+            if known is None and decision_id in self._where:
+                record = from_bytes(self._journal.read(self._where[decision_id]))
+                known = record if isinstance(record, StoredDecision) else None
+            label, place = self._labels.get(decision_id, (None, 0))
+        if known is None and not self._is_new(decision_id):
+            known = self.ask(lambda: self.store.get_decision(decision_id))
+        if known is not None and known.source is None and label is not None and place <= self._synced:
+            known = replace(known, success=label.success, source=label.source)
         return known
 
-    def labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
-        """Commit labels; returns their numbers, 0 for those that wait in the journal. ReportError as `Store.put_labels`."""
-        now = time.time()
-        self.recent.refuse_repeats(labels)
-        late = [LateLabel(label, now) for label in labels]
-        numbers = self._store(lambda: self.store.put_labels(labels), late)
-        self.recent.label(labels)
-        return np.zeros(len(labels), dtype=np.int64) if numbers is None else numbers
+    def decided_before(self, decision_id: str) -> StoredDecision | None:
+        """The decision that an id has; None: it is new. StoreError where that is not known: it stays unrecorded."""
+        with self._changed:
+            self._unrecorded.discard(decision_id)
+            if self._taken is None and self._journal is not None and not self._learning and not self._blocked:
+                self._learning = True
+                self._put(self.know)
+        try:
+            return None if self._is_new(decision_id) else self.find(decision_id)
+        except StoreError:
+            self._unrecorded.add(decision_id)
+            raise
 
-    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> Asked[int | None]:
-        """Begin to commit a retrain; the result, or a StoreError, is the version's number, where the store says it."""
-        return self._begin_commit(lambda: self.store.put_version(report, last_seq, state), GRACE)
+    def know(self) -> None:
+        """Learn which ids are taken by now, a second for a million, so that in an outage new ones are known to be new."""
+        taken = TakenIds(self.store.decision_ids())
+        with self._changed:
+            for id_ in (*self._recent, *self._open, *self._where):
+                taken.add(id_)
+            self._taken = taken
 
-    def event(self, kind: str, text: str) -> None:
-        """Record what happened, in the journal where the store is away."""
-        self._store(lambda: self.store.put_event(kind, text), [LateEvent(kind, text, time.time())])
-
-    def flush(self) -> None:
-        """Return when all that is known so far is on the disk: in the store, or in its journal."""
-        self._store(self.store.flush, [])
-
-    def secure(self) -> None:
-        """Return when all that was decided so far is on the disk: in the journal, which is quicker than the store."""
-        if self._backlog is None:
-            self.store.flush()
-        else:
-            self._spill(self._backlog, beyond=0)
-
-    def arrived(self) -> list[tuple[str, int]]:
-        """The numbers of labels, by their decisions, that waited in the journal until now; each once."""
-        return [] if self._backlog is None else self._backlog.take_arrived()
+    def _is_new(self, decision_id: str) -> bool:
+        """Whether an id is taken for certain by no decision; False where that is not known."""
+        return self._taken is not None and not self._taken.may_hold(decision_id)
 
     def forget(self, decision_id: str) -> None:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
-        self.recent.forget(decision_id)
+        self._recent.pop(decision_id, None)
+
+    def arrived(self) -> list[tuple[str, int]]:
+        """The numbers that the store has given labels, by their decisions; each once."""
+        if not self._arrived:
+            return []
+        with self._changed:
+            arrived, self._arrived = self._arrived, []
+        return arrived
+
+    @property
+    def drained(self) -> bool:
+        """Whether the store has all that was told."""
+        return self._drained == self._appended
+
+    def drain(self) -> None:
+        """Return when the store has all that was told so far. StoreError where it is away, or takes too long."""
+        with self._changed:
+            if self.drained:
+                return
+            place = self._appended
+            self._wanted, self._asked, self._drains = max(self._wanted, place), self._asked + 1, self._drains + 1
+            self._changed.notify_all()
+            try:
+                if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
+                    self._away = f"no answer from the store within {self.limit:g} s."
+            finally:
+                self._drains -= 1
+            if self._drained < place:
+                raise self._is_away()
+
+    def _is_away(self) -> StoreError:
+        return StoreError(f"The store is away: {self._blocked} Labels wait in its journal; try this again when it is back.")
+
+    def flush(self) -> None:
+        """Return when all that is known so far is in the store, or, where that is away, on the disk in the journal."""
+        if self._journal is not None:
+            self._wait_synced(self._appended)
+            with suppress(StoreError):
+                self.drain()
 
     def ask(self, work: Callable[[], T]) -> T:
         """Call the store with the time limit; StoreError where it is away."""
-        return work() if self._backlog is None else self._put(work).result()
+        return work() if self._journal is None else self.result(self._put(work))
 
-    def _put(self, work: Callable[[], T], more: float = 0.0, then: Callable[[], object] = lambda: None) -> Asked[T]:
-        assert self._backlog is not None  # the callers asked; for the type checker
-        if self.fault:
-            raise StoreError(f"The store is away: {self.fault} Labels wait in its journal; try this again when it is back.")
-        wait = None if self._patient else self._backlog.store.wait
-        self._jobs.put(asked := Asked(work, wait, more, then=then))
-        return asked
+    def result(self, future: Future[T]) -> T:
+        """What a call to the store returned. StoreError where it takes too long: it is given up, unless it commits."""
+        for wait in (self.limit, COMMIT):
+            try:
+                return future.result(wait)
+            except TimeoutError:
+                if future.done():  # the call's own
+                    raise
+            if future.cancel():
+                break
+        raise StoreError(f"no answer from the store within {self.limit:g} s.")
+
+    def _put(self, work: Callable[[], T]) -> Future[T]:
+        future: Future[T] = Future()
+        if self._journal is None:
+            future.set_result(work())
+            return future
+        with self._changed:
+            if self._blocked:
+                raise self._is_away()
+            self._jobs.append((future, work))
+            self._changed.notify_all()
+        return future
+
+    def _settle(self) -> None:
+        """Who uses the store itself sees all that was told."""
+        if not self._closed and threading.current_thread() is not self._threads[1]:
+            with suppress(StoreError):
+                self.drain()
 
     def close(self) -> None:
         """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
         if not self.usable:
             return
-        if (backlog := self._backlog) is None:
+        if self._journal is None:
             self.store.close()
             self._closed = True
             return
         self.flush()
-        self._closed = True
-        self._jobs.put(closing := Asked(lambda: self._let_store_go(backlog), CLOSE, lasting=True))
-        self._jobs.put(None)
-        try:
-            closing.result()
-            self._thread.join()
-        except StoreError as error:
-            log.warning("the store was left, its journal %s holds what it lacks: %s", backlog.journal.path, error)
-            backlog.store.let_go()  # else its writer, and its lease on the cell, would outlive the engine
-        backlog.journal.close()
+        with self._changed:
+            self._changed.wait_for(lambda: self.drained or bool(self._away), CLOSE)
+            self._closed = self._ending = True
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join(CLOSE)
+        if self.drained and not self._threads[1].is_alive():
+            self.store.close()
+        else:
+            log.warning("the store was left, its journal %s holds what it lacks: %s", self._journal.path, self.fault)
+            self.store.let_go()  # else its lease on the cell would outlive the engine
+        self._journal.close()
 
-    # Limits, and the journal
+    # The thread that writes the journal
 
-    def _store(self, work: Callable[[], T], late: Sequence[Record]) -> T | None:
-        """Commit, or put what is to be committed into the journal; then None. StoreError where both fail."""
-        if not self.fault or self._backlog is None:
-            try:
-                return self._begin_commit(work).result()
-            except StoreError as error:
-                if self._backlog is None:
-                    raise
-                self._note(str(error), Fault.of(error))
-        with self._backlog.lock:
-            try:
-                self._backlog.write(late)
-            except StoreError as error:
-                self._note(str(error), Fault.of(error))
-                raise
-            if not self.fault:
-                self._note("it is there again, and is to take what its journal holds.", Fault.RETURNING)
-        self._jobs.put(Asked(lambda: None))  # so that the store is tried now, not at the next beat
-        return None
-
-    def _begin_commit(self, work: Callable[[], T], more: float = 0.0) -> Asked[T]:
-        """Begin to call the store; where that succeeds, all decisions before it are committed as well."""
-        if self._backlog is None:
-            done = Asked(work)
-            done.run(lambda wanted: nullcontext())
-            return done
-        backlog, before = self._backlog, self._backlog.unsafe
-        return self._put(work, more, lambda: backlog.committed(before))
-
-    def _note(self, fault: str, kind: Fault) -> None:
-        if not self.fault:
-            self._fault_began = time.monotonic()
-            log.warning("labels wait in the journal beside the store: %s", fault)
-        self.fault, self._kind = fault, kind
-
-    def _look_at_the_beat(self) -> None:
-        began = self._beat_began
-        if not self.fault and began is not None and time.monotonic() - began > self._grace and not self._patient:
-            self._note(f"no answer from the store for {self._grace:g} s.", Fault.SLOW)
-
-    def _spill(self, backlog: Backlog, beyond: int = WAITING) -> None:
-        try:
-            backlog.write_beyond(beyond)
-        except StoreError as error:  # they wait in memory
-            self._note(str(error), Fault.of(error))
-
-    # The outbox's thread
-
-    def _serve(self, backlog: Backlog) -> None:
-        while backlog.journal.open:
-            try:
-                job = self._jobs.get(timeout=BEAT)
-            except queue.Empty:
-                self._beat(backlog)
-                continue
-            if job is None:
-                return
-            job.run(backlog.store.committing)
-            if self.fault or backlog.journal.end > RESERVE:  # a cell that never pauses would fill the disk
-                self._beat(backlog)
-
-    def _beat(self, backlog: Backlog) -> None:
-        """Look whether the store is there; where it was not, and now is, play the journal back."""
-        with backlog.lock:
-            before, end, well = backlog.unsafe, backlog.journal.end, not self.fault
-        if well and not before and backlog.journal.empty:
-            return
-        self._beat_began = time.monotonic()
-        try:
-            self.store.flush()
-            if self.fault:
-                self._play_back(backlog)
-            backlog.committed(before)
-            if well:  # what the journal held then are decisions, which the store was given as well
-                backlog.stored_upto(end)
-        except Exception as error:  # whatever it is, the cell goes on, and this thread too
-            self._note(str(error), Fault.of(error))
-        finally:
-            self._beat_began = None
-
-    def _let_store_go(self, backlog: Backlog) -> None:
-        self._beat(backlog)
-        self.store.close()
-
-    def _play_back(self, backlog: Backlog) -> None:
+    def _keep_writing(self) -> None:
         while True:
-            for text in backlog.play_back():
-                self.store.put_event("set aside", text)
-                log.error("set aside: %s", text)
-            with backlog.lock:  # nothing goes to the journal between the look and the word that it need not
-                if backlog.cleared():
-                    self.fault = ""
+            with self._changed:
+                self._changed.wait_for(lambda: self._unwritten or self._ending)
+                self._changed.wait_for(lambda: self._wanted > self._synced or self._ending, LINGER)
+                batch, asked = list(self._unwritten), self._asked
+                if not batch:
                     return
+                self._sync_began = time.monotonic()
+            try:
+                self._write(batch)
+            except Exception as error:  # whatever it is, the cell goes on, and this thread too
+                with self._changed:
+                    self._stuck, self._tries, self._sync_began = str(error), self._tries + 1, None
+                    self._changed.notify_all()
+                    if self._ending:
+                        return
+                    if self._asked == asked:
+                        self._changed.wait(BEAT)
+
+    def _write(self, batch: Sequence[Record]) -> None:
+        journal = self._journal
+        assert journal is not None
+        if journal.end > 8 << 20:
+            with self._changed:  # a cell that never pauses would fill the disk
+                if self._changed.wait_for(lambda: journal.empty, LINGER):
+                    journal.clear()
+        blobs = [to_bytes(record) for record in batch]
+        try:
+            offsets = journal.append(blobs)
+        except LostJournalError as error:
+            log.error("%s It is made anew with what the store lacks.", error)
+            with self._changed:  # nobody reads or marks it meanwhile
+                journal.remake()
+            offsets = journal.append(blobs)
+            self.event("journal", f"{error} It was made anew with what the store lacked.")
+        with self._changed:
+            for record, at in zip(batch, offsets, strict=True):
+                self._unwritten.popleft()
+                if isinstance(record, StoredDecision) and self._open.get(record.decision.id) is record:
+                    self._where[record.decision.id] = at
+                    del self._open[record.decision.id]
+            self._synced += len(batch)
+            self._stuck, self._sync_began = "", None
+            self._changed.notify_all()
+
+    # The thread that drains it into the store
+
+    def _keep_draining(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._jobs or self._drained < self._synced or self._ending)
+                self._changed.wait_for(lambda: self._jobs or self._drains or self._ending, LINGER)
+                job = self._jobs.popleft() if self._jobs else None
+            try:
+                while self._drained < self._synced:
+                    self._take()
+                self._away = ""
+            except Exception as error:  # whatever it is, the cell goes on, and this thread too
+                if not self._away:
+                    log.warning("labels wait in the journal beside the store: %s", error)
+                with self._changed:
+                    self._away = str(error)
+                    self._changed.notify_all()
+            if job is not None:
+                self._run(*job)
+            with self._changed:
+                if self._ending and (self._away or self._drained == self._synced) and not self._jobs:
+                    return
+                if self._away:
+                    self._changed.wait_for(lambda: self._jobs or self._ending, BEAT)
+
+    def _take(self) -> None:
+        """Have the store take a piece of what is synced."""
+        journal = self._journal
+        assert journal is not None
+        with self._changed:
+            n = min(CHUNK, self._synced - self._drained)
+        found = [(at, end, from_bytes(blob)) for at, end, blob in islice(journal.records(), n)]
+        with self._changed:
+            records = [
+                record
+                for at, _, record in found
+                if not isinstance(record, StoredDecision) or self._where.get(record.decision.id) == at
+            ]
+        arrived, newest = self.store.take(records), self.store.newest_entry()
+        with self._changed:
+            journal.mark(found[-1][1], newest)
+            self._arrived += arrived
+            for record in records:
+                if isinstance(record, StoredDecision):
+                    self._where.pop(record.decision.id, None)
+                elif isinstance(record, TakenLabel):
+                    self._labels.pop(record.label.decision_id, None)
+                    self._say(record.label)
+            for _ in range(min(n, len(self._times))):
+                self._times.popleft()
+            self._drained += n
+            self._changed.notify_all()
+
+    def _run(self, future: Future[Any], work: Callable[[], Any]) -> None:
+        """Make a call, unless it was given up; what it raises is raised where its result is asked for."""
+
+        def wanted() -> bool:
+            return future.running() or (not future.cancelled() and future.set_running_or_notify_cancel())
+
+        if future.cancelled():
+            return
+        try:
+            with self.store.committing(wanted):
+                result = work()
+        except BaseException as error:
+            if wanted():
+                future.set_exception(error)
+        else:
+            if wanted():
+                future.set_result(result)

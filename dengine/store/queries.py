@@ -10,9 +10,12 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .records import FORGOTTEN
+from ..records import Action, Reason
+from .records import FORGOTTEN, Key
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT_KEY, RESERVED, SCHEMA_KEY, SETTING, VERSION
+from .views import LABELS, HistoryFilter
 
+IN_TIME = (DECISION.c.time, DECISION.c.id)
 PRODUCT_LOCKS = 7236482515  # seed of the locks' numbers, so that they are nobody else's
 
 
@@ -49,9 +52,10 @@ class Scope:
         return max(version, (connection.execute(newest).scalar() or 0) + 1)
 
     def lock_cell(self, connection: sa.Connection) -> None:
-        # PostgreSQL; SQLite's BEGIN IMMEDIATE did it already.
-        mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
-        connection.execute(sa.select(SETTING).where(mine).with_for_update())
+        """Hold the cell until the transaction ends: two processes may write to it."""
+        if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
+            mine = (SETTING.c.cell_id == self.cell_id) & (SETTING.c.key == SCHEMA_KEY)
+            connection.execute(sa.select(SETTING.c.key).where(mine).with_for_update())
 
 
 def lock_product(connection: sa.Connection, product: str) -> None:
@@ -141,7 +145,7 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 def held_query(cell_id: str, ids: Sequence[str]) -> sa.Select[Any]:
     """What labels repeat of these decisions, and the labels that they have already."""
     label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, counted().label("counted"))
-    query = sa.select(*DECISION.c["id", "content_hash", "quarantined"], *label).select_from(WITH_LABELS)
+    query = sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(WITH_LABELS)
     return query.where(DECISION.c.cell_id == cell_id, DECISION.c.id.in_(ids))
 
 
@@ -149,3 +153,50 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
     """The labels that train, without their traces; along the index `label_training`."""
     query = sa.select(LABEL.c.seq, counted(corrected_to).label("success"), *LABEL.c["content_hash", "decision_id"])
     return query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), remembered(corrected_to))
+
+
+def decisions_query(cell_id: str, where: HistoryFilter, beyond: Key | None, newest: bool) -> sa.Select[Any]:
+    """Decisions that are meant, the newest or the oldest first; beyond : only those before, or after, this one."""
+    of = ((DECISION.c.action, where.action), (DECISION.c.predicted, where.predicted), (DECISION.c.reason, where.reason))
+    meant = [column == wanted.value for column, wanted in of if wanted is not None]
+    if where.part is not None:
+        meant.append(DECISION.c.part == where.part)
+    if where.label is not None:
+        label = LABELS[where.label]
+        meant.append(SAID.is_(None) if label is None else SAID.in_([int(label)]))
+    if where.since is not None:
+        meant.append(DECISION.c.time >= where.since)
+    if where.until is not None:
+        meant.append(DECISION.c.time < where.until)
+    if beyond is not None:
+        here, there = sa.tuple_(*IN_TIME), sa.tuple_(sa.literal(beyond[0], sa.Double), sa.literal(beyond[1]))
+        meant.append(here < there if newest else here > there)
+    return past_query(cell_id).where(*meant).order_by(*(column.desc() if newest else column for column in IN_TIME))
+
+
+def tally_query(cell_id: str, last: int | None) -> sa.Select[Any]:
+    """The newest decisions, all where it is None, counted by their kinds."""
+    columns = ("cell_id", "id", "time", "action", "predicted", "reason", "audit", "quarantined")
+    newest = sa.select(*DECISION.c[columns]).where(DECISION.c.cell_id == cell_id)
+    if last is not None:
+        newest = newest.order_by(*(column.desc() for column in IN_TIME)).limit(last)
+    some = newest.subquery("newest")
+    of = (LABEL.c.cell_id == some.c.cell_id) & (LABEL.c.decision_id == some.c.id)
+    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], SAID.label("success"))
+    times = (sa.func.min(some.c.time).label("first"), sa.func.max(some.c.time).label("last"))
+    return sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of)).group_by(*kind)
+
+
+def stretches_query(cell_id: str, length: int) -> sa.Select[Any]:
+    """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`."""
+    number = sa.func.row_number().over(order_by=IN_TIME) - 1
+    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
+    every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
+    of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
+    accepted = every.c.action == Action.ACCEPT.value
+    verified, novel = every.c.action == Action.VERIFY.value, every.c.reason == Reason.NOVEL.value
+    which = (verified, novel, accepted, accepted & (SAID == 0))
+    counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
+    query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
+    stretch = every.c.number - every.c.number % length
+    return query.group_by(stretch).order_by(stretch)

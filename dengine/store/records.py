@@ -35,6 +35,7 @@ SHARES = ("lower", "upper", "propensity")
 NUMBER = int | float | np.integer | np.floating
 KINDS = {"action": Action, "predicted": Action, "reason": Reason}
 RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
+OF_DECISION = ("content_hash", "quarantined", "time")  # of a `StoredDecision`, beside the decision itself
 Key = tuple[float, str]  # of a decision in its history: time and id
 
 
@@ -454,18 +455,18 @@ class VersionError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class StoredVersion:
-    """A retrain as a store lists it.
+    """A retrain as a store lists it: 1, 2, ... in each cell, or product.
 
-    version : its number; of a dropped candidate that of the version which went on answering.  time : in seconds.
+    time : in seconds.  last_seq : the newest label that it knew of.
     n_bytes : of its state; 0 where none is kept.  kept : whether `load_version` can load it.
     """
 
-    version: int
+    number: int
     time: float
-    accepted: bool
-    reason: str
-    n_bytes: int
-    kept: bool
+    last_seq: int
+    report: RetrainReport
+    n_bytes: int = 0
+    kept: bool = False
 
 
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:

@@ -15,14 +15,26 @@ from numpy.typing import NDArray
 from ..errors import DataError, StoreError
 from ..files import read_archive
 from ..records import Decision, RetrainReport
-from .records import NO_TRACE, Correction, Event, NewLabel, StoredDecision, columns, from_row, pack, to_row, unpack
+from .journal import TakenLabel
+from .records import (
+    NO_TRACE,
+    OF_DECISION,
+    Correction,
+    Event,
+    NewLabel,
+    StoredDecision,
+    columns,
+    from_row,
+    pack,
+    to_row,
+    unpack,
+)
 
 SCHEMA = "1"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
 PRODUCT_KEY = "product"  # a row of `setting` for every cell that shares what it learns
 OWNER_KEY = "owner"  # a row of `setting` for every cell that an engine drives, where the store keeps one
 RESERVED = (SCHEMA_KEY, PRODUCT_KEY, OWNER_KEY)  # rows of `setting` that are the store's own
-OF_DECISION = ("content_hash", "quarantined", "time")  # of a `StoredDecision`, beside the decision itself
 CHUNK = 500  # rows sent or fetched at a time
 
 METADATA = sa.MetaData()
@@ -198,7 +210,7 @@ def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
         raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error
 
 
-def label_row(cell_id: str, label: NewLabel, seq: int, time: float, content_hash: int, quarantined: bool) -> dict[str, Any]:
-    """The row of the table `label`; the last two are those of its decision."""
-    of = {"content_hash": content_hash, "quarantined": quarantined}
-    return {"cell_id": cell_id, "seq": seq, "time": time, **of, **to_row(label)}
+def label_row(cell_id: str, taken: TakenLabel, seq: int, of: Any) -> dict[str, Any]:
+    """The row of the table `label`; of : the row of its decision, of which some columns are repeated."""
+    repeated = {"content_hash": of.content_hash, "quarantined": of.quarantined}
+    return {"cell_id": cell_id, "seq": seq, "time": taken.time, **repeated, **to_row(taken.label)}

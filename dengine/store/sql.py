@@ -3,23 +3,19 @@
     store = SqlStore("engine.db", cell_id="cell-7")
     store = SqlStore("postgresql+psycopg://user:password@host/database", cell_id="cell-7")
 
-What a returned call promises, given a disk that keeps what it synced: all that is put is committed, but for `put_decision`:
-its row is queued, and committed within about 50 ms by a writer thread, by `flush`, or together with the next label.
+What a returned call promises, given a disk that keeps what it synced: all that is put is committed. An engine does not put
+what it decides: that goes into a journal first, and from there, by `take`, into the database.
 """
 
 from __future__ import annotations
 
-import hashlib
+import json
 import math
 import os
 import time
-import urllib.parse
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
-from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -27,22 +23,24 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError, shortened
 from ..records import Action, Decision, Reason, RetrainReport, Source
+from .base import Store
 from .connections import Database
-from .journal import Journal, LateEvent, LateLabel, Record
-from .ledger import row_sum, state_sum
+from .journal import Journal, Record, TakenLabel, journal_path
+from .ledger import plain_row, row_sum, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
-    SAID,
     WITH_LABELS,
     Scope,
     cells_of,
     counted,
-    held_query,
+    decisions_query,
     lock_product,
     newest_of,
     past_query,
     remembered,
+    stretches_query,
+    tally_query,
     training_query,
 )
 from .records import (
@@ -63,10 +61,8 @@ from .records import (
     StoredVersion,
     VersionError,
     as_data,
-    as_hash,
     as_label,
     as_text,
-    check_decision,
     check_import,
     check_state,
     checked_decision,
@@ -90,30 +86,30 @@ from .schema import (
     DECISION,
     EVENT,
     LABEL,
+    LEDGER,
     RESERVED,
     SETTING,
     TRACE,
     VERSION,
     chunks,
     from_npz,
-    label_row,
     read_decision,
     to_npz,
 )
-from .views import LABELS, HistoryFilter, Kind, PastLabel, PastRetrain, Stretch, Tally, count_outcomes, summary
+from .views import HistoryFilter, Kind, PastLabel, Stretch, Tally, count_outcomes, summary
 
 if TYPE_CHECKING:
     from .verification import HistoryReport
 
-WAIT = 0.4  # seconds that an engine waits for the database
+WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 NAMED = 20  # decisions that an event names
+IN_FORCE = 10_000  # newest labels that are held to their sums when an engine opens the store
 INSERTED = {"sqlite": "decision.rowid", "postgresql": "decision.ctid"}  # in the order of insertion: rows never change
-IN_TIME = (DECISION.c.time, DECISION.c.id)
 REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
 
-class SqlStore:
+class SqlStore(Store):
     """The contract of `Store` in a database.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
@@ -121,17 +117,13 @@ class SqlStore:
     clock : the time in seconds that rows are stamped with.
     product : what the cell makes; cells of one product share labels and versions. None: as a known cell has it, or
         nothing is shared.
-    wait : seconds that a cell's engine waits for the database at most; what takes longer goes to the journal beside it.
-        None: as the environment's DENGINE_STORE_WAIT says, or 0.4.
+    wait : seconds that a cell's engine waits for its disk, and for the database, at most. None: as the environment's
+        DENGINE_STORE_WAIT says, or 0.4.
     keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
         None: all keep them. A retrain itself stays listed for ever.
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
     cell: label numbers stay unique and increasing. Engines own their cell (`own`): a second one is refused.
-
-    A write that fails leaves its decisions in the queue; it is tried again every second and by each following
-    `flush` or report, which raises `StoreError` if it fails again. `status()["write_failures"]` counts failures.
-    The queue holds 64 MB of traces; beyond that `put_decision` writes them itself, or says that it cannot.
     """
 
     def __init__(
@@ -144,7 +136,7 @@ class SqlStore:
         wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
-        """Open or create the store, and start its writer thread."""
+        """Open or create the store."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
@@ -154,11 +146,12 @@ class SqlStore:
             )
         self.keep_versions = keep_versions
         self.wait: float | None = _checked_wait(wait)
-        self._clock = clock
-        self._database = Database(str(url), cell_id, clock, product)
-        self._read, self._look, self._scope = self._database.read, self._database.look, self._database.scope
+        self.clock = clock
+        self.before_use: Callable[[], None] = lambda: None
+        self._database = Database(str(url), cell_id, clock, product, lambda: self.before_use())
+        self._read, self._scope = self._database.read, self._database.scope
         self.product = self._scope.product
-        self.remote = self._database.url.get_backend_name() != "sqlite"
+        self._remote = self._database.url.get_backend_name() != "sqlite"
         self._journal: Journal | None = None
 
     # Settings
@@ -201,15 +194,20 @@ class SqlStore:
     # Decisions
 
     def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
-        self._database.put(checked_decision(decision, trace, content_hash, quarantined, self._clock()))
+        item = checked_decision(decision, trace, content_hash, quarantined, self.clock())
+
+        def add(connection: sa.Connection) -> None:
+            if self._database.held(connection, [decision.id]):
+                raise duplicate_id(decision.id)
+            self._database.insert(connection, [item])
+
+        self._database.write(add)
 
     def flush(self) -> None:
-        self._database.flush()
+        self._database.check_open()
+        self.before_use()
 
     def get_decision(self, decision_id: str) -> StoredDecision | None:
-        item = self._database.queued(decision_id)
-        if item is not None:
-            return replace(item, trace=item.trace.copy())
         same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
         stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
         query = past_query(self.cell_id).add_columns(*TRACE.c["channels", "samples", "data"], *stored)
@@ -218,7 +216,7 @@ class SqlStore:
             return None
         row = rows[0]
         values = {"cell_id": row.cell_id, "decision_id": row.id, "channels": row.channels, "samples": row.samples}
-        if not _is_sound(values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
+        if not _is_sound(TRACE.name, values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
             raise StoreError(
                 f"Expected the trace of decision {row.id!r} as it was stored in {self._database.name}, its bytes have "
                 "changed; see `dengine verify`, and restore the store from a copy."
@@ -226,42 +224,21 @@ class SqlStore:
         return read_decision(row)
 
     def decision_ids(self) -> list[str]:
-        self.flush()
         return [row.id for row in self._read(sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id))]
 
     # Labels
 
-    def put_label(
-        self, decision_id: str, success: bool, source: Source, model_version: int, point: NDArray[np.float32] | None,
-        *, silent: int = 0,
-    ) -> int:  # fmt: skip
-        return int(self.put_labels([NewLabel(decision_id, success, source, model_version, point, silent)])[0])
-
     def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
-        given, now = [checked_label(label) for label in labels], self._clock()
+        given, now = [checked_label(label) for label in labels], self.clock()
 
-        def add(connection: sa.Connection) -> NDArray[np.int64]:
-            first = self._scope.next_number(connection, LABEL.c.seq)
-            held = self._held(connection, [label.decision_id for label in given])
+        def add(connection: sa.Connection) -> list[int]:
+            held = self._database.held(connection, [label.decision_id for label in given])
             said = {name: (row.success, Source(row.source)) for name, row in held.items() if row.source is not None}
             refuse_repeats(given, held, said)
-            of = [(held[label.decision_id].content_hash, held[label.decision_id].quarantined) for label in given]
-            return self._add_labels(connection, first, given, of, now)
+            taken = [TakenLabel(each, now, 0, 0.0) for each in given]
+            return self._database.insert_labels(connection, taken, held)
 
-        return self._database.write(add)
-
-    def _held(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """What is stored of decisions and their labels, by id; the cell is locked by then."""
-        return {row.id: row for part in chunks(ids) for row in connection.execute(held_query(self.cell_id, part))}
-
-    def _add_labels(
-        self, connection: sa.Connection, first: int, labels: Sequence[NewLabel], of: Sequence[tuple[int, bool]], now: float
-    ) -> NDArray[np.int64]:
-        """Insert labels from number `first` on; of : content hash and quarantine of their decisions."""
-        for part in chunks(range(len(labels))):
-            rows = [label_row(self.cell_id, labels[i], first + i, now, *of[i]) for i in part]
-            connection.execute(sa.insert(LABEL), rows)
-        return np.arange(first, first + len(labels), dtype=np.int64)
+        return np.array(self._database.write(add), dtype=np.int64)
 
     def put_labelled(
         self,
@@ -271,23 +248,17 @@ class SqlStore:
         labels: NDArray[np.int8],
         source: Source,
     ) -> NDArray[np.int64]:
-        traces, now = check_import(decisions, traces, hashes, labels), self._clock()
-        given, of = imported_labels(decisions, labels, source), [(as_hash(each), False) for each in hashes]
-        for decision in decisions:
-            check_decision(decision)
-            if self._database.queued(decision.id) is not None:
-                raise duplicate_id(decision.id)
+        traces, now, ids = check_import(decisions, traces, hashes, labels), self.clock(), [each.id for each in decisions]
+        items = [checked_decision(*each, False, now) for each in zip(decisions, traces, hashes, strict=True)]
+        taken = [TakenLabel(each, now, 0, 0.0) for each in imported_labels(decisions, labels, source)]
 
-        def load(connection: sa.Connection) -> NDArray[np.int64]:
-            first = self._scope.next_number(connection, LABEL.c.seq)
-            for name in self._held(connection, [decision.id for decision in decisions]):
+        def load(connection: sa.Connection) -> list[int]:
+            for name in self._database.held(connection, ids):
                 raise duplicate_id(name)
-            for part in chunks(range(len(decisions))):
-                items = [StoredDecision(decisions[i], traces[i], *of[i], now) for i in part]
-                self._database.insert(connection, items)
-            return self._add_labels(connection, first, given, of, now)
+            self._database.insert(connection, items)
+            return self._database.insert_labels(connection, taken, self._database.held(connection, ids))
 
-        return self._database.write(load)
+        return np.array(self._database.write(load), dtype=np.int64)
 
     # Training
 
@@ -341,7 +312,7 @@ class SqlStore:
         query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
         query = query.where(LABEL.c.seq.between(*((rows[0].seq, rows[-1].seq) if rows else (1, 0))))
         for row in connection.execute(query.execution_options(yield_per=CHUNK)):
-            if row.seq not in at or not _is_sound(dict(zip(TRACE.c.keys(), row, strict=False))):
+            if row.seq not in at or not _is_sound(TRACE.name, dict(zip(TRACE.c.keys(), row, strict=False))):
                 continue
             if not kept.any():
                 traces = np.empty((len(rows), row.channels, row.samples), dtype=np.float32)
@@ -387,11 +358,12 @@ class SqlStore:
         return Evidence.of((*row[:4], row.reason == Reason.NOVEL, row.silent) for row in rows)
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
-        self.flush()
         mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
         query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        inserted: sa.ColumnElement[Any] = sa.literal_column(INSERTED["postgresql" if self.remote else "sqlite"])
-        return [row.id for row in self._read(query.where(_since(DECISION, since_version)).order_by(IN_TIME[0], inserted))]
+        inserted: sa.ColumnElement[Any] = sa.literal_column(INSERTED["postgresql" if self._remote else "sqlite"])
+        return [
+            row.id for row in self._read(query.where(_since(DECISION, since_version)).order_by(DECISION.c.time, inserted))
+        ]
 
     def silent_total(self, since_version: int = 0) -> int:
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
@@ -399,7 +371,6 @@ class SqlStore:
         return int(self._read(query.where(mine, _since(LABEL, since_version)))[0][0])
 
     def outcomes(self, since_version: int = 0) -> Outcomes:
-        self.flush()
         kind = (*DECISION.c["action", "predicted", "audit"], counted().label("success"))
         certain = ((DECISION.c.action != Action.VERIFY.value) | DECISION.c.audit) & _since(DECISION, since_version)
         mine = DECISION.c.cell_id == self.cell_id
@@ -408,7 +379,6 @@ class SqlStore:
         return count_outcomes(tuple(row) for row in rows)
 
     def status(self) -> dict[str, Any]:
-        self.flush()
         kind = DECISION.c["action", "reason", "quarantined"]
         times = (sa.func.min(DECISION.c.time).label("first"), sa.func.max(DECISION.c.time).label("last"))
         query = sa.select(*kind, sa.func.count(), *times).where(DECISION.c.cell_id == self.cell_id)
@@ -436,7 +406,7 @@ class SqlStore:
     # Model versions
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
-        row = self._version_row(report, last_seq, state, self._clock())
+        row = self._version_row(report, last_seq, state, self.clock())
         return self._database.write(lambda connection: self._add_version(connection, row))
 
     def _version_row(
@@ -498,20 +468,17 @@ class SqlStore:
             state = without_rule(state) | {"told_to": np.array(0)}
         return ModelVersion(row.version, row.last_seq, state)
 
-    def versions(self) -> list[StoredVersion]:
-        size = sa.func.length(VERSION.c.state)
-        query = sa.select(*VERSION.c["version", "time", "accepted", "reason"], size)
-        rows = self._read(query.where(self._scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
-        return [StoredVersion(row[0], row[1], row[2], row[3], row[4] or 0, row[4] is not None) for row in rows]
-
-    def retrains(self) -> list[RetrainReport]:
-        query = sa.select(*VERSION.c[REPORT]).where(self._scope.shared(VERSION.c.cell_id))
-        return [RetrainReport(*row) for row in self._read(query.order_by(VERSION.c.retrain))]
+    def versions(self, own: bool = False) -> list[StoredVersion]:
+        size = sa.func.length(VERSION.c.state).label("size")
+        columns = (*VERSION.c["retrain", "time", "last_seq"], size, *VERSION.c[REPORT])
+        mine = VERSION.c.cell_id == self.cell_id if own else self._scope.shared(VERSION.c.cell_id)
+        rows = self._read(sa.select(*columns).where(mine).order_by(VERSION.c.retrain))
+        return [
+            StoredVersion(row.retrain, row.time, row.last_seq, RetrainReport(*row[4:]), row.size or 0, row.size is not None)
+            for row in rows
+        ]
 
     # Events and corrections
-
-    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
-        self.record(Change(kind, text, data, author))
 
     def _note(self, kind: str, text: str) -> None:
         """Commit an event, unless one of these very words is there."""
@@ -524,7 +491,7 @@ class SqlStore:
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def record(self, change: Change) -> int:
-        now, author = self._clock(), as_text(change.author)
+        now, author = self.clock(), as_text(change.author)
         said = Event(0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         version = None if change.version is None else self._version_row(*change.version, now)
 
@@ -545,7 +512,7 @@ class SqlStore:
         return self._database.write(add)
 
     def _correct(self, connection: sa.Connection, change: Change, event: Mapping[str, Any]) -> None:
-        held = self._held(connection, change.decisions)
+        held = self._database.held(connection, change.decisions)
         for name in change.decisions:
             if name not in held:
                 raise unknown_decision(name)
@@ -573,26 +540,11 @@ class SqlStore:
     def decisions(
         self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
     ) -> list[StoredDecision]:
-        of = ((DECISION.c.action, where.action), (DECISION.c.predicted, where.predicted), (DECISION.c.reason, where.reason))
-        meant = [column == wanted.value for column, wanted in of if wanted is not None]
-        if where.part is not None:
-            meant.append(DECISION.c.part == where.part)
-        if where.label is not None:
-            label = LABELS[where.label]
-            meant.append(SAID.is_(None) if label is None else SAID.in_([int(label)]))
-        if where.since is not None:
-            meant.append(DECISION.c.time >= where.since)
-        if where.until is not None:
-            meant.append(DECISION.c.time < where.until)
-        if beyond is not None:
-            here, there = sa.tuple_(*IN_TIME), sa.tuple_(sa.literal(beyond[0], sa.Double), sa.literal(beyond[1]))
-            meant.append(here < there if newest else here > there)
-        order = [column.desc() if newest else column for column in IN_TIME]
-        rows = self._look(past_query(self.cell_id).where(*meant).order_by(*order).limit(limit))
+        rows = self._read(decisions_query(self.cell_id, where, beyond, newest).limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def past_decision(self, decision_id: str) -> StoredDecision | None:
-        rows = self._look(past_query(self.cell_id).where(DECISION.c.id == decision_id))
+        rows = self._read(past_query(self.cell_id).where(DECISION.c.id == decision_id))
         return read_decision(rows[0]) if rows else None
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
@@ -601,60 +553,31 @@ class SqlStore:
         decided = (DECISION.c.time.label("decided"), *DECISION.c["lower", "upper", "reason"])
         query = sa.select(*of_label, point, *decided).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
-        rows = self._look(query if upto is None else query.where(LABEL.c.seq <= upto))
+        rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 
-    def past_retrains(self) -> list[PastRetrain]:
-        query = sa.select(*VERSION.c["retrain", "time", "last_seq"], *VERSION.c[REPORT])
-        rows = self._look(query.where(VERSION.c.cell_id == self.cell_id).order_by(VERSION.c.retrain))
-        return [PastRetrain(row[0], row[1], row[2], RetrainReport(*row[3:])) for row in rows]
-
     def tally(self, last: int | None = None) -> Tally:
-        columns = ("cell_id", "id", "time", "action", "predicted", "reason", "audit", "quarantined")
-        newest = sa.select(*DECISION.c[columns]).where(DECISION.c.cell_id == self.cell_id)
-        if last is not None:
-            newest = newest.order_by(*(column.desc() for column in IN_TIME)).limit(last)
-        some = newest.subquery("newest")
-        of = (LABEL.c.cell_id == some.c.cell_id) & (LABEL.c.decision_id == some.c.id)
-        kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], SAID.label("success"))
-        times = (sa.func.min(some.c.time).label("first"), sa.func.max(some.c.time).label("last"))
-        query = sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of))
-        rows = self._look(query.group_by(*kind))
+        rows = self._read(tally_query(self.cell_id, last))
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
         return Tally(kinds, min((r.first for r in rows), default=None), max((r.last for r in rows), default=None))
 
     def stretches(self, n: int) -> list[Stretch]:
-        mine = DECISION.c.cell_id == self.cell_id
-        length = max(1, -(-int(self._look(sa.select(sa.func.count()).where(mine))[0][0]) // n))
-        number = sa.func.row_number().over(order_by=IN_TIME) - 1
-        columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
-        every = sa.select(*columns).where(mine).subquery("every")
-        of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
-        accepted = every.c.action == Action.ACCEPT.value
-        verified, novel = every.c.action == Action.VERIFY.value, every.c.reason == Reason.NOVEL.value
-        which = (verified, novel, accepted, accepted & (SAID == 0))
-        counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
-        query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
-        stretch = every.c.number - every.c.number % length
-        rows = self._look(query.group_by(stretch).order_by(stretch))
+        every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
+        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n))))
         return [Stretch(int(row[0]), float(row[1]), *(int(each) for each in row[2:])) for row in rows]
 
     def verify(self, expect: str | None = None) -> HistoryReport:
-        """Check this cell's history against its ledger; what is queued is written first. See `verify_history`."""
+        """Check this cell's history against its ledger. See `verify_history`."""
         from .verification import verify_history
 
-        self.flush()
         return verify_history(self._database.url.render_as_string(hide_password=False), self.cell_id, expect)
 
     # The one engine that owns the cell
 
-    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
-        return self._database.committing(wanted)
-
     def own(self) -> Journal:
-        journal = Journal(_journal_path(self._database.url, self.cell_id))
+        journal = Journal(journal_path(self._database.url, self.cell_id))
         try:
-            if self.remote:
+            if self._remote:
                 self._database.lease()
         except StoreError:
             journal.close()
@@ -662,59 +585,39 @@ class SqlStore:
         self._journal = journal
         return journal
 
-    def play_back(self, records: Sequence[Record]) -> tuple[list[tuple[str, int]], list[str]]:
-        def write(connection: sa.Connection) -> tuple[list[tuple[str, int]], list[str]]:
-            decisions = [record for record in records if isinstance(record, StoredDecision)]
-            self._database.insert_new(connection, decisions)
-            number = self._scope.next_number(connection, EVENT.c.number)
-            for late in (record for record in records if isinstance(record, LateEvent)):
-                same = (EVENT.c.cell_id == self.cell_id) & (EVENT.c.time == late.time) & (EVENT.c.kind == late.kind)
-                held = connection.execute(sa.select(EVENT.c.number).where(same, EVENT.c.text == late.text)).first()
-                if held is None:
-                    row = to_row(Event(number, late.time, late.kind, late.text))
-                    connection.execute(sa.insert(EVENT), {"cell_id": self.cell_id} | row)
-                    number += 1
-            return self._play_labels(connection, [record for record in records if isinstance(record, LateLabel)])
+    def newest_entry(self) -> tuple[int, str] | None:
+        return self._database.newest_entry()
 
-        return self._database.write(write)
+    def holds_entry(self, number: int, digest: str) -> bool:
+        return self._database.holds_entry(number, digest)
 
-    def _play_labels(
-        self, connection: sa.Connection, labels: Sequence[LateLabel]
-    ) -> tuple[list[tuple[str, int]], list[str]]:
-        number = self._scope.next_number(connection, LABEL.c.seq)
-        held = self._held(connection, [late.label.decision_id for late in labels])
-        numbers = {name: row.seq for name, row in held.items() if row.seq is not None}
-        said: dict[str, tuple[bool, str]] = {name: (held[name].success, held[name].source) for name in numbers}
-        arrived: list[tuple[str, int]] = []
-        refused: list[str] = []
-        for late in labels:
-            name, now = late.label.decision_id, (late.label.success, late.label.source.value)
-            if name not in held:
-                refused.append(f"a label on {name!r}, which the store does not hold: {_words(*now)}")
-            elif said.setdefault(name, now) != now:
-                refused.append(f"a second label on {name!r}: {_words(*now)} after {_words(*said[name])}")
-            else:
-                if name not in numbers:  # what is stored already was written, and its answer lost
-                    of = (held[name].content_hash, held[name].quarantined)
-                    connection.execute(sa.insert(LABEL), label_row(self.cell_id, late.label, number, late.time, *of))
-                    numbers[name], number = number, number + 1
-                arrived.append((name, numbers[name]))
-        return arrived, refused
+    def doubt(self) -> str:
+        newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == self.cell_id, LEDGER.c.settings.is_not(None))
+        chained = self._read(newest.order_by(LEDGER.c.number.desc()).limit(1))
+        if chained and json.loads(chained[0].settings) != self.settings():
+            return "the settings are not those of the ledger"
+        labels = sa.select(LABEL).where(LABEL.c.cell_id == self.cell_id).order_by(LABEL.c.seq.desc()).limit(IN_FORCE)
+        corrections = sa.select(CORRECTION).where(CORRECTION.c.cell_id == self.cell_id)
+        for table, query in ((LABEL, labels), (CORRECTION, corrections)):
+            for row in self._read(query):
+                if not _is_sound(table.name, dict(zip(table.c.keys(), row, strict=True))):
+                    return f"the {table.name} of decision {row.decision_id!r} is not as it was written"
+        return ""
+
+    def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        return self._database.take(records)
+
+    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
+        return self._database.committing(wanted)
 
     def let_go(self) -> None:
-        self._database.let_go()
+        self._database.close(waiting=False)
 
     def close(self) -> None:
-        """Flush, stop the writer and disconnect; if the flush fails the store stays open, so close it again later."""
+        """Disconnect, and give the cell free."""
         self._database.close()
         if self._journal is not None:
             self._journal.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
 
 def _checked_wait(wait: float | None) -> float:
@@ -729,25 +632,11 @@ def _checked_wait(wait: float | None) -> float:
     return seconds
 
 
-def _journal_path(url: sa.URL, cell_id: str) -> Path:
-    """Return where a cell's journal lies: beside an SQLite file, else in the user's folder of state, `XDG_STATE_HOME`."""
-    name = urllib.parse.quote(cell_id, safe="")
-    if url.get_backend_name() == "sqlite":
-        return Path(f"{Path(str(url.database)).absolute()}.{name}.journal")
-    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "dengine"
-    where = hashlib.sha256(f"{url.host}:{url.port}/{url.database}/{cell_id}".encode()).hexdigest()[:12]
-    return state / f"{name[:60]}.{where}.journal"
-
-
-def _is_sound(row: dict[str, Any]) -> bool:
-    """Whether a row of `trace` is as it was stored; one that an earlier dengine wrote has no sum, and passes."""
-    return row["sum"] is None or row_sum(TRACE.name, row) == row["sum"]
+def _is_sound(table: str, row: dict[str, Any]) -> bool:
+    """Whether a row is as it was stored."""
+    return bool(row_sum(table, plain_row(row)) == row["sum"])
 
 
 def _since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
     """Rows by model versions from this one on."""
     return sa.true() if version <= 0 else table.c.model_version >= int(version)
-
-
-def _words(success: bool, source: str) -> str:
-    return f"{'success' if success else 'failure'} from {source}"

@@ -24,6 +24,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import advice, make_engine
+from .journal import journal_path, newest_known
 from .ledger import START, entry_digest, held_settings, row_sum, state_sum
 from .schema import (
     CHAINED,
@@ -354,6 +355,10 @@ def verify_history(
         checks = [CellCheck(connection, cell, on_rows or (lambda n: None)) for cell in chosen_cells(connection, cell_id)]
         for check in checks:
             faults += check.run()
+            known = newest_known(journal_path(connection.engine.url, check.cell_id))
+            if known is not None and known[1] not in check.digests:
+                what = "is not there, though the cell's journal knows it: the history was cut off, or put back from a copy"
+                faults.append(HistoryFault(check.cell_id, LEDGER.name, f"entry {known[0]}", what))
     if wanted and not any(digest.startswith(wanted) for check in checks for digest in check.digests):
         what = "is in no entry: the history was cut off before it, or made anew"
         faults.append(HistoryFault(cell_id or "", "ledger", f"digest {wanted}", what))

@@ -144,16 +144,6 @@ class PastLabel:
 
 
 @dataclass(frozen=True, slots=True)
-class PastRetrain:
-    """A retrain as it was recorded: 1, 2, ... in each cell, when, and the newest label that it knew of."""
-
-    number: int
-    time: float
-    last_seq: int
-    report: RetrainReport
-
-
-@dataclass(frozen=True, slots=True)
 class Kind:
     """How many decisions of one kind there are; fields as in `StoredDecision`."""
 

@@ -19,8 +19,7 @@ from hypothesis.extra import numpy as hnp
 
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, open_store
-from dengine.store import connections as sql_queue
+from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, StoredDecision, open_store
 from tests.support.plans import plans
 
 C, T = 2, 30
@@ -51,31 +50,34 @@ def report(version: int, accepted: bool = True) -> RetrainReport:
 # Decisions
 
 
-def test_a_store_satisfies_the_protocol(store: Store) -> None:
-    assert isinstance(store, Store)
-
-
-def test_a_decision_is_found_at_once_and_after_the_flush(store: Store) -> None:
+def test_a_decision_is_found_as_it_was_put(store: Store) -> None:
+    assert store.get_decision("a") is None
     values = trace()
-    given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02)
+    given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02, "Stück 7\\0")
     store.put_decision(given, values, -(2**63), False)
-    for _ in range(2):
-        found = store.get_decision("a")
-        assert found is not None
-        assert (found.decision.id, found.decision.action, found.decision.predicted, found.decision.audit) == (
-            "a",
-            Action.VERIFY,
-            Action.ACCEPT,
-            True,
-        )
-        assert (found.decision.reason, found.decision.model_version, found.content_hash) == (Reason.AUDIT, 3, -(2**63))
-        assert (found.quarantined, found.success, found.source) == (False, None, None)
-        np.testing.assert_array_equal(found.trace, values)
-        store.flush()
+    store.put_decision(decision("flat"), values[0], 1, False)
+    found = store.get_decision("a")
+    assert (found.decision, found.content_hash, found.quarantined) == (given, -(2**63), False)
+    assert (found.success, found.source) == (None, None)
+    np.testing.assert_array_equal(found.trace, values)
+    assert store.get_decision("flat").trace.shape == (1, T)
 
 
-def test_an_unknown_decision_is_none(store: Store) -> None:
-    assert store.get_decision("nobody") is None
+@pytest.mark.parametrize(
+    ("part", "content_hash", "error"),
+    [
+        ("SN\0", 1, "part's number"),
+        ("\ud800", 1, "part's number"),
+        (42, 1, "part's number"),
+        (None, 2**63, "signed 64 bits"),
+    ],
+)
+def test_what_no_database_holds_is_refused_and_not_stored(
+    store: Store, part: object, content_hash: int, error: str
+) -> None:
+    with pytest.raises(StoreError, match=error):
+        store.put_decision(replace(decision("a"), part=part), trace(), content_hash, False)
+    assert store.status()["decisions"] == 0
 
 
 def test_the_callers_buffer_may_change_after_put_decision(store: Store) -> None:
@@ -86,52 +88,12 @@ def test_the_callers_buffer_may_change_after_put_decision(store: Store) -> None:
     np.testing.assert_array_equal(store.get_decision("a").trace, expected)
 
 
-def test_a_flat_trace_is_stored_as_one_channel(store: Store) -> None:
-    store.put_decision(decision("a"), trace(0, (T,)), 1, False)
-    store.flush()
-    assert store.get_decision("a").trace.shape == (1, T)
-
-
 def test_a_second_decision_of_one_id_is_refused_and_the_first_stands(store: Store) -> None:
     first = put(store, "a", seed=1)
-    store.flush()
-    with pytest.raises(StoreError, match="'a'"):  # noqa: PT012 - a database notices at its next write
+    with pytest.raises(StoreError, match="'a'"):
         put(store, "a", seed=2)
-        with pytest.raises(StoreError):
-            store.flush()
-        store.flush()
     np.testing.assert_array_equal(store.get_decision("a").trace, first)
     assert store.status()["decisions"] == 1
-
-
-def test_an_unsigned_hash_is_refused_before_it_is_queued(store: Store) -> None:
-    with pytest.raises(StoreError, match="signed 64 bits"):
-        store.put_decision(decision("a"), trace(), 2**63, False)
-    store.flush()
-
-
-@pytest.mark.parametrize("part", [None, "", "SN-0042", "Stück 7\\0"])
-def test_the_number_of_the_part_returns_before_and_after_the_flush(store: Store, part: str | None) -> None:
-    store.put_decision(replace(decision("a"), part=part), trace(), 1, False)
-    for _ in range(2):
-        assert store.get_decision("a").decision.part == part
-        store.flush()
-    store.put_label("a", True, Source.VERIFICATION, 0, None)
-    assert store.get_decision("a").decision.part == part
-
-
-def test_a_decision_without_a_part_has_none(store: Store) -> None:
-    put(store, "a")
-    store.flush()
-    assert store.get_decision("a").decision.part is None
-
-
-@pytest.mark.parametrize("part", ["SN\0", "\ud800", 42])
-def test_a_part_that_no_database_holds_is_refused_before_it_is_queued(store: Store, part: object) -> None:
-    with pytest.raises(StoreError, match="part's number"):
-        store.put_decision(replace(decision("a"), part=part), trace(), 1, False)
-    store.flush()
-    assert store.status()["decisions"] == 0
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -183,14 +145,6 @@ def test_a_second_report_names_id_first_label_and_source_and_the_first_stands(st
     assert store.put_label("b", True, Source.VERIFICATION, 0, None) == 2
 
 
-def test_a_refused_report_loses_no_queued_decision(store: Store) -> None:
-    put(store, "a")
-    with pytest.raises(ReportError):
-        store.put_label("nobody", True, Source.VERIFICATION, 0, None)
-    store.flush()
-    assert store.get_decision("a") is not None
-
-
 def test_labels_in_one_batch_are_numbered_in_the_order_given(store: Store) -> None:
     for name in "abcd":
         put(store, name)
@@ -231,8 +185,7 @@ def test_a_silence_below_minus_one_is_refused(store: Store) -> None:
 
 def test_a_batch_longer_than_a_chunk_is_taken_whole(store: Store) -> None:
     names = [str(i) for i in range(1203)]
-    for name in names:
-        store.put_decision(decision(name), np.zeros((1, 2), np.float32), int(name), False)
+    store.take([StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0) for name in names])
     assert store.put_labels([label(name, silent=1) for name in names]).tolist() == list(range(1, 1204))
     assert store.labelled().hashes.tolist() == list(range(1203))
     assert store.silent_total() == 1203
@@ -247,6 +200,7 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
     assert every.labels.tolist() == [1, 0, 1, 1]
     assert every.hashes.tolist() == [104, 101, 100, 103]
     np.testing.assert_array_equal(every.traces, np.stack([traces[name] for name in "ebad"]))
+    assert len(store.labelled(0).seq) == 0
     newest = store.labelled(2)
     assert newest.seq.tolist() == [4, 5]
     np.testing.assert_array_equal(newest.traces, every.traces[2:])
@@ -258,14 +212,8 @@ def test_an_empty_store_has_empty_arrays(store: Store, limit: int | None) -> Non
     found = store.labelled(limit)
     assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
     assert store.points_since(0, 1).points.shape == (0, 0)
-    assert store.last_version() is None
-    assert store.retrains() == []
-
-
-def test_a_limit_of_zero_returns_nothing(store: Store) -> None:
-    put(store, "a")
-    store.put_label("a", True, Source.AUDIT, 0, None)
-    assert len(store.labelled(0).seq) == 0
+    assert (store.last_version(), store.retrains()) == (None, [])
+    assert (store.unreported_accepts(), store.silent_total(), store.outcomes()) == ([], 0, Outcomes())
 
 
 def test_traces_of_two_shapes_are_an_error_that_names_both(store: Store) -> None:
@@ -296,7 +244,9 @@ def test_an_import_is_labelled_and_numbered_after_what_was_there(store: Store) -
     put(store, "a")
     store.put_label("a", True, Source.VERIFICATION, 0, None)
     traces, hashes, labels = trace(1, (3, C, T)), np.array([5, -5, 6]), np.array([1, 0, 1], dtype=np.int8)
-    seqs = store.put_labelled([decision(name) for name in "bcd"], traces, hashes, labels, Source.VERIFICATION)
+    decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
+    seqs = store.put_labelled(decisions, traces, hashes, labels, Source.VERIFICATION)
+    assert [store.get_decision(name).decision for name in "bcd"] == decisions
     assert seqs.tolist() == [2, 3, 4]
     found = store.labelled(3)
     np.testing.assert_array_equal(found.traces, traces)
@@ -333,13 +283,6 @@ def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quaran
     assert len(store.evidence_since(4).seq) == 0
 
 
-def test_an_import_keeps_the_number_of_each_part(store: Store) -> None:
-    parts, traces, hashes, labels = ["x", None, "z"], trace(1, (3, C, T)), np.arange(3), np.ones(3, dtype=np.int8)
-    decisions = [replace(decision(name), part=part) for name, part in zip("abc", parts, strict=True)]
-    store.put_labelled(decisions, traces, hashes, labels, Source.VERIFICATION)
-    assert [store.get_decision(name).decision.part for name in "abc"] == parts
-
-
 def test_an_import_with_a_bad_part_adds_nothing(store: Store) -> None:
     decisions = [replace(decision("a"), part="x"), replace(decision("b"), part="y\0")]
     with pytest.raises(StoreError, match="plain text"):
@@ -363,14 +306,9 @@ def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Sto
 # What became of decisions
 
 
-def test_a_new_store_has_heard_of_everything_and_nothing_happened(store: Store) -> None:
-    assert (store.unreported_accepts(), store.silent_total(), store.events()) == ([], 0, [])
-    assert store.outcomes() == Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
-
-
 def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store) -> None:
     names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
-    store._clock = iter([5.0, 5.0, 5.0, 7.0, 7.0, 7.0, *range(8, 20)]).__next__
+    store.clock = iter([5.0, 5.0, 5.0, 7.0, 7.0, 7.0, *range(8, 20)]).__next__
     for name in names:
         store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
     store.put_decision(decision("verified"), trace(), 1, False)
@@ -379,13 +317,6 @@ def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store)
     store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
     assert store.unreported_accepts() == ["amy", "kim", "ann"]
     assert sorted(store.decision_ids()) == sorted([*names, "verified", "rejected"])
-
-
-def test_unreported_accepts_are_oldest_first_when_the_clock_went_back(store: Store) -> None:
-    store._clock = iter([3.0, 1.0, 2.0]).__next__
-    for name in "abc":
-        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
-    assert store.unreported_accepts() == ["b", "c", "a"]
 
 
 def test_the_silent_total_leaves_out_quarantined_labels(store: Store) -> None:
@@ -458,7 +389,7 @@ def test_counts_grow_by_what_was_put_and_agree_with_each_other(
 
 
 def test_events_are_numbered_from_one_and_returned_oldest_first(store: Store) -> None:
-    store._clock = iter([1.5, 2.5, 3.5]).__next__
+    store.clock = iter([1.5, 2.5, 3.5]).__next__
     for kind in ("started", "safe_mode", "left"):
         store.put_event(kind, f"was {kind}: ±")
     every = store.events()
@@ -477,7 +408,7 @@ def test_an_event_writes_what_every_database_refuses_with_escapes(store: Store) 
 
 def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store: Store) -> None:
     assert (store.status()["events"], store.status()["last_label_time"]) == ([], None)
-    store._clock = iter(float(i) for i in range(20)).__next__
+    store.clock = iter(float(i) for i in range(20)).__next__
     for i in range(7):
         store.put_event("note", str(i))
     assert store.status()["events"] == [{"kind": "note", "text": str(i), "time": float(i)} for i in range(2, 7)]
@@ -547,43 +478,23 @@ def test_status_counts_what_was_put(store: Store) -> None:
 # Memory
 
 
-def test_memory_forgets_old_unreported_decisions_and_says_so() -> None:
+def test_memory_forgets_old_unreported_decisions_says_so_and_counts_them() -> None:
     class Small(MemoryStore):
         KEEP_UNLABELLED = 3
-
-    store = Small()
-    put(store, "kept")
-    store.put_label("kept", True, Source.VERIFICATION, 0, None)
-    for name in "abcd":
-        put(store, name)
-    assert store.get_decision("a") is None
-    assert store.get_decision("b") is not None
-    assert store.get_decision("kept") is not None
-    assert store.status()["decisions"] == 5
-    with pytest.raises(ReportError, match="newest 3"):
-        store.put_label("a", True, Source.VERIFICATION, 0, None)
-
-
-def test_memory_counts_the_accepts_that_it_forgot() -> None:
-    class Small(MemoryStore):
-        KEEP_UNLABELLED = 3
-
-    store = Small()
-    for name in "abcde":
-        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
-    store.put_label("e", False, Source.STOP, 0, None)
-    assert store.unreported_accepts() == ["c", "d"]
-    assert (store.outcomes().accepted, store.outcomes().stops) == (5, 1)
-
-
-def test_memory_forgets_nothing_of_an_import() -> None:
-    class Small(MemoryStore):
-        KEEP_UNLABELLED = 1
 
     store = Small()
     names = [str(i) for i in range(5)]
     store.put_labelled([decision(n) for n in names], trace(0, (5, C, T)), np.arange(5), np.ones(5), Source.VERIFICATION)
-    assert len(store.labelled().seq) == 5
+    for name in "abcde":
+        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    assert [store.get_decision(name) is None for name in ("0", "a", "b", "c")] == [False, True, True, False]
+    assert store.status()["decisions"] == 10
+    with pytest.raises(ReportError, match="newest 3"):
+        store.put_label("a", True, Source.VERIFICATION, 0, None)
+    store.put_label("e", False, Source.STOP, 0, None)
+    assert store.unreported_accepts() == ["c", "d"]
+    assert (store.outcomes().accepted, store.outcomes().stops) == (5, 1)
+    assert len(store.labelled().seq) == 6
 
 
 def test_open_store_takes_nothing_a_file_or_a_store(tmp_path: Path) -> None:
@@ -653,13 +564,16 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
 
 
-def test_label_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str, str]) -> None:
+def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(
+    place: tuple[str, str],
+) -> None:
     seqs: list[int] = []
 
     def label(store: SqlStore, prefix: str) -> None:
         for i in range(15):
             put(store, f"{prefix}{i}")
             seqs.append(store.put_label(f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
+            store.put_event("note", f"{prefix}{i}")
 
     with SqlStore(*place) as one, SqlStore(*place) as two:
         threads = [threading.Thread(target=label, args=pair) for pair in ((one, "x"), (two, "y"))]
@@ -669,82 +583,7 @@ def test_label_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str,
             thread.join()
         assert sorted(seqs) == list(range(1, 31))
         assert one.labelled().seq.tolist() == list(range(1, 31))
-
-
-def test_event_numbers_stay_unique_with_two_stores_on_one_cell(place: tuple[str, str]) -> None:
-    def log(store: SqlStore) -> None:
-        for i in range(15):
-            store.put_event("note", str(i))
-
-    with SqlStore(*place) as one, SqlStore(*place) as two:
-        threads = [threading.Thread(target=log, args=(store,)) for store in (one, two)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert [event.number for event in one.events()] == list(range(1, 31))
-
-
-def test_an_event_is_committed_when_it_returns(place: tuple[str, str]) -> None:
-    with SqlStore(*place) as store, SqlStore(*place) as other:
-        store.put_event("note", "now")
-        assert [event.text for event in other.events()] == ["now"]
-
-
-def test_the_writer_commits_without_being_asked(place: tuple[str, str]) -> None:
-    with SqlStore(*place) as store, SqlStore(*place) as other:
-        put(store, "a")
-        deadline = threading.Event()
-        for _ in range(100):
-            if other.get_decision("a") is not None:
-                break
-            deadline.wait(0.05)
-        assert other.get_decision("a") is not None
-
-
-def test_a_failed_write_is_told_kept_and_written_later(place: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    with SqlStore(*place) as store:
-        real = store._database.insert
-
-        def full(connection: sa.Connection, batch: object) -> None:
-            raise sa.exc.OperationalError("INSERT", {}, sqlite3.OperationalError("database or disk is full"))
-
-        monkeypatch.setattr(store._database, "insert", full)
-        put(store, "a")
-        with pytest.raises(StoreError, match=r"disk is full.*Free some space.*1 decisions wait"):
-            store.flush()
-        with pytest.raises(StoreError):
-            store.put_label("a", True, Source.VERIFICATION, 0, None)
-        assert store.get_decision("a") is not None
-        monkeypatch.setattr(store._database, "insert", real)
-        assert store.put_label("a", True, Source.VERIFICATION, 0, None) == 1
-        assert store.status()["write_failures"] >= 2
-        assert store.status()["decisions"] == 1
-
-
-def test_a_commit_whose_answer_was_lost_is_not_written_twice(
-    place: tuple[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with SqlStore(*place) as store:
-        with monkeypatch.context() as patch:
-            patch.setattr(store._database, "_forget", lambda batch: None)  # committed, and still queued
-            put(store, "a")
-            store.flush()
-        store._database._doubtful = True
-        store.flush()
-        assert store.status()["decisions"] == 1
-        assert store._database._queue_bytes == 0
-
-
-def test_a_full_queue_is_written_by_put_decision_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql_queue, "LINGER", 60.0)
-    monkeypatch.setattr(sql_queue, "QUEUE_BYTES", 3 * C * T * 4)
-    with SqlStore(str(tmp_path / "a.db")) as store:
-        for i in range(20):
-            put(store, str(i))
-            assert len(store._database._queue) <= 4
-        store.flush()
-        assert store.status()["decisions"] == 20
+        assert [event.number for event in two.events()] == list(range(1, 31))
 
 
 def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:
@@ -775,9 +614,19 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
 
 
 def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:
-    with SqlStore(str(tmp_path / "a.db")) as store, store._database.transaction(write=False) as connection:
-        assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
-        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2
+    asked: list[tuple[object, ...]] = []
+
+    def ask(connection: object, *_: object) -> None:
+        asked.append(tuple(connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("journal_mode", "synchronous")))
+
+    sa.event.listen(sa.pool.Pool, "checkout", ask)
+    try:
+        with SqlStore(str(tmp_path / "a.db")) as store:
+            put(store, "a")
+    finally:
+        sa.event.remove(sa.pool.Pool, "checkout", ask)
+    assert asked
+    assert set(asked) == {("wal", 2)}
 
 
 # What cannot be opened

@@ -36,9 +36,9 @@ def test_the_same_report_twice_is_no_error_and_another_one_is(service: CellServi
             await service.report("unknown", True)
         with pytest.raises(TraceError):
             await service.decide(stream.X[0][:10], "order-1")
+        assert (await service.look(lambda store: store.status()))["labels"] == 1
 
     asyncio.run(cell())
-    assert service.reading.status()["labels"] == 1
 
 
 def test_a_late_answer_is_on_the_disk_when_it_leaves(service: CellService, stream: Dataset, tmp_path: Path) -> None:

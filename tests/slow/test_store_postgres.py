@@ -45,13 +45,10 @@ def test_cells_that_open_an_empty_database_at_once_all_succeed() -> None:
 
 
 def test_a_lost_connection_loses_nothing() -> None:
-    with SqlStore(URL, uuid.uuid4().hex) as store:
-        with store._database.transaction(write=False) as connection:
-            victims = connection.execute(sa.text("SELECT pg_backend_pid()")).scalar_one()
-        admin = sa.create_engine(URL)
-        with admin.connect() as connection:
-            connection.execute(sa.text("SELECT pg_terminate_backend(:pid)"), {"pid": victims})
-        admin.dispose()
+    name = uuid.uuid4().hex
+    with SqlStore(f"{URL}?application_name={name}", name) as store:
+        assert store.settings() == {}
+        assert cut(name)
         store.put_decision(decision("a"), np.zeros((1, 5), np.float32), 1, False)
         assert store.put_label("a", True, Source.VERIFICATION, 0, None) == 1
 
@@ -75,7 +72,20 @@ def test_other_programs_tables_may_stand_beside_ours() -> None:
     SqlStore(URL, uuid.uuid4().hex).close()
 
 
+def cut(name: str) -> list[bool]:
+    """End the server's processes for a program."""
+    admin = sa.create_engine(URL)
+    with admin.connect() as connection:
+        named = sa.text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name LIKE :name")
+        ended = list(connection.execute(named, {"name": f"{name}%"}).scalars())
+    admin.dispose()
+    return ended
+
+
 # ---------------------------------------------------------------------------------------------- an engine on a server
+
+
+OWN = f"dengine process {os.getpid()} on"  # what an engine of this process writes through is called
 
 
 @pytest.fixture
@@ -95,17 +105,18 @@ def engine_of(cell: str) -> DataEngine:
 
 def until_back(engine: DataEngine) -> None:
     end = time.monotonic() + 30
-    while engine._outbox.fault:
-        assert time.monotonic() < end, engine._outbox.fault
+    while engine.store_fault:
+        assert time.monotonic() < end, engine.store_fault
         time.sleep(0.05)
 
 
-def backend_of(engine: DataEngine) -> int:
+def backend() -> int:
     """The server's process that the engine writes through."""
-    database = engine.store._database
-    with database._writing, database._connected(write=True) as connection:
-        pid = connection.execute(sa.text("SELECT pg_backend_pid()")).scalar()
-        connection.rollback()
+    admin = sa.create_engine(URL)
+    with admin.connect() as connection:
+        named = sa.text("SELECT pid FROM pg_stat_activity WHERE application_name LIKE :name")
+        (pid,) = connection.execute(named, {"name": f"{OWN}%"}).scalars()
+    admin.dispose()
     return int(pid)
 
 
@@ -125,7 +136,7 @@ def test_a_frozen_server_makes_nobody_wait_and_each_cell_goes_on_deciding(make_d
     data = make_data(400, samples=60, seed=3)
     with engine_of(cell) as engine:
         list(engine.run(ReplayCell(data, np.arange(200)), 200))
-        pid = backend_of(engine)
+        pid = backend()
         try:
             os.kill(pid, signal.SIGSTOP)
         except PermissionError:
@@ -138,6 +149,7 @@ def test_a_frozen_server_makes_nobody_wait_and_each_cell_goes_on_deciding(make_d
             os.kill(pid, signal.SIGCONT)
         assert seconds < 10  # without a limit: for ever
         assert any(cycle.decision.action is Action.ACCEPT for cycle in cycles)
+        assert Reason.NO_STORE not in {cycle.decision.reason for cycle in cycles}
         until_back(engine)
         for each in cycles:
             if each.success is not None:
@@ -149,10 +161,7 @@ def test_a_lost_connection_is_made_again_with_its_lease_and_loses_no_label(make_
     with engine_of(cell) as engine:
         cycles = list(engine.run(ReplayCell(data, np.arange(100)), 100))
         for first in range(100, 200, 25):
-            admin = sa.create_engine(URL)
-            with admin.connect() as connection:
-                connection.execute(sa.text("SELECT pg_terminate_backend(:pid)"), {"pid": backend_of(engine)})
-            admin.dispose()
+            assert cut(OWN)
             cycles += engine.run(ReplayCell(data, np.arange(first, first + 25)), 25)
             until_back(engine)
         expected = [engine.decide(x).lower for x in data.X[-20:]]
@@ -166,7 +175,7 @@ def test_an_engine_closed_while_its_server_was_frozen_leaves_the_cell_to_the_nex
     data = make_data(400, samples=60, seed=3)
     engine = engine_of(cell)
     cycles = list(engine.run(ReplayCell(data, np.arange(60)), 60))
-    pid = backend_of(engine)
+    pid = backend()
     try:
         os.kill(pid, signal.SIGSTOP)
     except PermissionError:
@@ -176,8 +185,10 @@ def test_an_engine_closed_while_its_server_was_frozen_leaves_the_cell_to_the_nex
         engine.close()
     finally:
         os.kill(pid, signal.SIGCONT)
-    engine.store._database._writer.join(20.0)
-    assert not engine.store._database._writer.is_alive()
+    for thread in threading.enumerate():
+        if thread.name == "dengine-store":
+            thread.join(20.0)
+            assert not thread.is_alive()
     end = time.monotonic() + 10.0
     while True:
         try:

@@ -6,6 +6,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -373,3 +374,24 @@ def test_a_decision_that_waits_is_on_the_disk_when_it_returns(data: Dataset, tmp
     with sqlite3.connect(tmp_path / "engine.db") as other:
         assert other.execute("SELECT id FROM decision").fetchall() == [(decision.id,)]
     engine.close()
+
+
+def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
+    entered, leave = Event(), Event()
+
+    class Slow(Counting):
+        def predict_interval(self, X):
+            entered.set()
+            assert leave.wait(60)
+            return super().predict_interval(X)
+
+    engine = DataEngine(model=Slow())
+    engine.report(engine.decide(data.X[0]).id, True)
+    engine.retrain()
+    with ThreadPoolExecutor(1) as pool:
+        deciding = pool.submit(engine.decide, data.X[1])
+        assert entered.wait(60)
+        with pytest.raises(StoreError, match="another thread"):
+            engine.decide(data.X[2])
+        leave.set()
+        assert deciding.result().action is Action.VERIFY

@@ -78,17 +78,17 @@ def test_a_late_stop_whose_write_failed_is_counted_once_when_it_is_told_again(st
     play(engine, stream, 0, 300)
     decision = accepted(engine, stream)
     engine.decide(stream.X[0])  # takes it for confirmed
-    whole = engine.store.put_labels
+    whole = engine.store.take
 
-    def full(labels):
-        if any(label.decision_id == decision.id for label in labels):
+    def full(records):
+        if any(getattr(each, "label", None) and each.label.decision_id == decision.id for each in records):
             raise StoreError("the disk is full")
-        return whole(labels)
+        return whole(records)
 
-    monkeypatch.setattr(engine.store, "put_labels", full)
+    monkeypatch.setattr(engine.store, "take", full)
     with pytest.raises(StoreError):
         engine.report(decision.id, False)
-    monkeypatch.setattr(engine.store, "put_labels", whole)
+    monkeypatch.setattr(engine.store, "take", whole)
     engine.report(decision.id, False)
     evidence_ = engine.store.evidence_since(0)
     members = engine.model.rule.evidence.members[0, 0, 0].tolist()  # of LB's own level

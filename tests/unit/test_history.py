@@ -15,8 +15,8 @@ from dengine.errors import SettingError, StoreError
 from dengine.history.status import beside, history, interleaved
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import MemoryStore, Store
-from dengine.store.records import Event, StoredDecision
-from dengine.store.views import HistoryFilter, PastRetrain, stretch_of, tally_of
+from dengine.store.records import Event, StoredDecision, StoredVersion
+from dengine.store.views import HistoryFilter, stretch_of, tally_of
 from tests.support.plans import plans
 
 POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES")
@@ -179,7 +179,7 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: Stor
 
 
 def test_retrains_have_their_times_and_newer_versions_are_kept(store: Store) -> None:
-    retrains = store.past_retrains()
+    retrains = store.versions(own=True)
     assert [each.report for each in retrains] == store.retrains()
     assert [each.number for each in retrains] == list(range(1, 7))
     assert [each.time for each in retrains] == sorted(each.time for each in retrains)
@@ -194,7 +194,7 @@ def test_retrains_and_events_stand_where_they_happened(store: Store) -> None:
     merged = list(interleaved(whole, beside(store)))
     assert [each.time for each in merged] == sorted(each.time for each in merged)
     assert [each for each in merged if isinstance(each, StoredDecision)] == whole
-    assert sum(isinstance(each, PastRetrain) for each in merged) == 6
+    assert sum(isinstance(each, StoredVersion) for each in merged) == 6
     assert [each.text[:5] for each in merged if isinstance(each, Event)] == ["too m", "fresh"]
     late = beside(store, since=whole[-1].time)
     assert [len(each) for each in late.values()] == [1, 2]

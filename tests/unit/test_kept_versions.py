@@ -48,7 +48,7 @@ def put(store: Store, versions: int) -> None:
 
 
 def kept(store: Store) -> list[int]:
-    return [row.version for row in store.versions() if row.kept]
+    return [row.report.version for row in store.versions() if row.kept]
 
 
 def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(store: Store) -> None:
@@ -88,14 +88,14 @@ def test_every_retrain_is_listed_for_ever(store: Store) -> None:
     put(store, 7)
     store.put_version(report(7, accepted=False), 9, None)
     rows = store.versions()
-    assert [(row.version, row.accepted, row.kept) for row in rows] == [
+    assert [(row.report.version, row.report.accepted, row.kept) for row in rows] == [
         (1, True, True),
         (2, True, False),
         *((version, True, True) for version in range(3, 8)),
         (7, False, False),
     ]
     assert {row.time for row in rows} == {7.5}
-    assert [row.reason for row in rows[-2:]] == ["improved", "the gate held"]
+    assert [row.report.reason for row in rows[-2:]] == ["improved", "the gate held"]
     assert [row.n_bytes > 0 for row in rows] == [row.kept for row in rows]
 
 

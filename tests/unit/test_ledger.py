@@ -111,8 +111,9 @@ def test_every_transaction_is_an_entry_and_an_empty_one_is_none(place: tuple[str
         store.flush()
         assert store.verify().cells[0].entries == 1
         store.put_decision(decision("a"), np.zeros(T, np.float32), 1, False)
-        store.put_label("a", True, Source.VERIFICATION, 0, None)
         assert store.verify().cells[0].entries == 2
+        store.put_label("a", True, Source.VERIFICATION, 0, None)
+        assert store.verify().cells[0].entries == 3
 
 
 def test_a_transaction_that_fails_leaves_no_entry(place: tuple[str, str]) -> None:

@@ -7,8 +7,6 @@ import pytest
 from dengine import DataEngine
 from dengine.errors import StoreError
 from dengine.store import SqlStore, open_store
-from dengine.store.journal import JournalError
-from dengine.store.outbox import Fault
 
 
 @pytest.mark.parametrize(
@@ -39,8 +37,3 @@ def test_an_engine_that_is_opened_hands_its_wait_to_the_store(tmp_path: Path) ->
         assert engine.store.wait == 3.0
     with DataEngine.open(tmp_path / "a.db", wait=4.0) as engine:
         assert engine.store.wait == 4.0
-
-
-def test_a_store_that_is_called_journal_is_no_fault_of_the_journal() -> None:
-    assert Fault.of(StoreError("connection to database journal failed")) is Fault.STORE
-    assert Fault.of(JournalError("no space left")) is Fault.JOURNAL

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from . import kills
 from .harness import Outcome, Place
-from .kinds import ON_POSTGRES, ON_SQLITE
+from .kinds import ON_DISKS, ON_POSTGRES, ON_SQLITE
 
 Fault = Callable[[Outcome, Place], None]
 
@@ -50,7 +50,7 @@ def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Consol
 
 def faults(arguments: argparse.Namespace) -> list[tuple[str, str, Fault, int]]:
     """Where, what in words, the fault, and how many trials."""
-    found = [("SQLite", title(each), each, arguments.trials) for each in ON_SQLITE]
+    found = [("SQLite", title(each), each, arguments.trials) for each in (*ON_SQLITE, *ON_DISKS)]
     killed = {
         "SIGKILL of the cell": partial(kills.kill_cells, times=arguments.kills),
         "SIGKILL, mostly as a version is stored": partial(kills.kill_cells, times=arguments.others, child=kills.often),

@@ -13,9 +13,10 @@ import numpy as np
 
 from dengine import Action, DataEngine, Dataset, Policy, Recipe, RetrainReport, load_dataset
 from dengine.store import SqlStore, Store
+from dengine.store.journal import HEADER
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
-WAIT = 0.2  # seconds that the engine may wait for its store
+WAIT = 1.0  # seconds that the engine may wait for a disk that others use too
 PROBE = 20  # traces by whose decisions two engines are compared
 PATIENCE = 60.0  # seconds for a store to come back
 
@@ -62,10 +63,11 @@ class Place:
 
     url: str
     cell: str = "cell"
+    wait: float = WAIT
 
     def store(self) -> SqlStore:
         """Open it."""
-        return SqlStore(self.url, self.cell, wait=WAIT)
+        return SqlStore(self.url, self.cell, wait=self.wait)
 
 
 class Cell:
@@ -117,7 +119,8 @@ class Cell:
             self.outcome.lost += missing(again.store, self.acknowledged)
             self.outcome.wrong += sum(a != b for a, b in zip(before, bounds(again), strict=True))
         if "://" not in self.place.url:
-            self.outcome.must(not list(Path(self.place.url).parent.glob("*.journal")), "a journal is left")
+            (journal,) = Path(self.place.url).parent.glob(f"{Path(self.place.url).name}.*.journal")
+            self.outcome.must(journal.stat().st_size == HEADER, "the journal holds what the store has")
 
 
 def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import sqlite3
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -21,11 +20,12 @@ from dengine import Reason
 from dengine.engine import trainer
 from dengine.errors import StoreError
 
+from .disk import closed_while_hung, failing_disk, hung_disk
 from .harness import Cell, Outcome, Place, stream
 
 BEFORE, DURING, AFTER = 100, 40, 60  # parts; a version is stored after 40 labels
 OUTAGE = 0.5  # seconds that a fault goes on after the parts that met it
-AWAY = 2.2  # seconds after which a store is not slow, but away
+AWAY = 1.5  # seconds after which a store is not slow, but away
 ODD = "no-database-takes-it"
 
 
@@ -38,7 +38,8 @@ def during(cell: Cell, fault: Any, away: bool = False) -> None:
         time.sleep(AWAY if away else OUTAGE)
         if away:
             decisions = [cell.engine.decide(x) for x in stream().X[:5]]
-            cell.outcome.must({d.reason for d in decisions} == {Reason.NO_STORE}, "decided while the store was away")
+            cell.outcome.must(Reason.NO_STORE not in {d.reason for d in decisions}, "verified, though the journal is well")
+            cell.outcome.must(bool(cell.engine.store_fault), "nobody was told that the store is away")
     cell.until_back()
     cell.play(AFTER)
     cell.finish()
@@ -104,21 +105,21 @@ def _statements(react: Callable[[str, Any], None]) -> Iterator[None]:
         sa.event.remove(sa.Engine, "before_cursor_execute", before)
 
 
-def slow(outcome: Outcome, place: Place) -> None:
-    """A disk that does not answer."""
-    release = threading.Event()
-
-    def wait(statement: str, parameters: Any) -> None:
-        if statement.startswith(("INSERT", "UPDATE")):
-            release.wait(60)
-
-    @contextlib.contextmanager
-    def hanging() -> Iterator[None]:
-        with _statements(wait):
-            yield
-            release.set()
-
-    during(Cell(place, outcome), hanging())
+def lost_journal(outcome: Outcome, place: Place) -> None:
+    """The journal deleted, moved, or its folder removed, while the store is locked."""
+    cell = Cell(place, outcome)
+    cell.play(BEFORE)
+    journal = Path(f"{place.url}.{place.cell}.journal")
+    with lock(place):
+        for lose in (Path.unlink, lambda file: file.rename(f"{file}.away")):
+            cell.play(10)
+            lose(journal)
+            outcome.injected += 1
+            cell.play(10)
+            outcome.must(journal.exists(), "the journal was not made anew")
+    cell.until_back()
+    outcome.must(any("made anew" in event.text for event in cell.engine.store.events()), "nobody was told")
+    cell.finish()
 
 
 def no_room_for_versions(outcome: Outcome, place: Place) -> None:
@@ -297,6 +298,7 @@ def forked(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-OF_STORES = (locked, full, no_room_for_versions, slow, moved, replaced, deleted, unstorable)
+OF_STORES = (locked, full, no_room_for_versions, moved, replaced, deleted, unstorable, lost_journal)
+ON_DISKS = (hung_disk, failing_disk, closed_while_hung)
 ON_SQLITE = (*OF_STORES, killed_executor, hung_executor, interrupted, forked)
 ON_POSTGRES = (frozen, cut_off)

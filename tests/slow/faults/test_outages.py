@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import shutil
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -13,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Source
-from dengine.errors import ReportError, StoreError
-from dengine.store import NewLabel
-from dengine.store.journal import HEADER, Journal, LateEvent, LateLabel, from_bytes, to_bytes
+from dengine import Action, DataEngine, Decision, Reason, Source
+from dengine.errors import ReportError, StoreError, TraceError
+from dengine.store import Event, NewLabel, StoredDecision, verify_history
+from dengine.store.journal import FRAME, Journal, LostJournalError, TakenLabel, from_bytes, to_bytes
 from tests.slow.faults import kills
 from tests.slow.faults.harness import RECIPE, Cell, Outcome, Place, stream
-from tests.slow.faults.kinds import ON_SQLITE, Hung, lock, moved_away
+from tests.slow.faults.kinds import ON_DISKS, ON_SQLITE, Hung, lock, moved_away
 
 KILLS = {
     "cell": partial(kills.kill_cells, times=3),
@@ -29,16 +31,27 @@ KILLS = {
 }
 
 
+def must_cost_nothing(fault: Callable[[Outcome, Place], None], place: Place) -> None:
+    outcome = Outcome()
+    fault(outcome, place)
+    assert (outcome.lost, outcome.wrong, outcome.raised) == (0, 0, 0), outcome.told
+    assert outcome.injected > 0
+    assert outcome.labels > 0 or fault in KILLS.values()  # it may be killed before its first one
+    assert outcome.longest < 20.0  # seconds: without a limit it would be a minute
+
+
 @pytest.mark.parametrize("fault", [*ON_SQLITE, *KILLS.values()], ids=[*(f.__name__ for f in ON_SQLITE), *KILLS])
 def test_a_fault_costs_no_label_raises_nothing_keeps_nobody_waiting_and_changes_no_decision(
     fault: Callable[[Outcome, Place], None], tmp_path: Path
 ) -> None:
-    outcome = Outcome()
-    fault(outcome, Place(str(tmp_path / "engine.db")))
-    assert (outcome.lost, outcome.wrong, outcome.raised) == (0, 0, 0), outcome.told
-    assert outcome.injected > 0
-    assert outcome.labels > 0 or fault in KILLS.values()  # it may be killed before its first one
-    assert outcome.longest < 20.0  # seconds: a disk that does not answer takes 60
+    must_cost_nothing(fault, Place(str(tmp_path / "engine.db")))
+
+
+@pytest.mark.merge
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="the library between this process and its disk needs gcc")
+@pytest.mark.parametrize("fault", ON_DISKS, ids=lambda fault: fault.__name__)
+def test_a_sync_that_hangs_or_fails_costs_nothing(fault: Callable[[Outcome, Place], None], tmp_path: Path) -> None:
+    must_cost_nothing(fault, Place(str(tmp_path / "engine.db")))
 
 
 @pytest.fixture
@@ -60,6 +73,7 @@ def labels_of(place: Place) -> dict[str, bool]:
 
 def test_a_version_that_took_too_long_to_store_is_not_stored_later(place: Place, cell: Cell) -> None:
     cell.play(100)
+    cell.engine.flush()
     before = cell.engine.version
     with lock(place):
         report = cell.engine.retrain()
@@ -152,23 +166,42 @@ def test_an_executor_that_was_shut_down_is_replaced_by_retrains_in_line(place: P
     assert cell.outcome.raised == 0
 
 
-def test_a_changed_byte_in_a_journal_costs_its_record_and_none_behind_it(tmp_path: Path) -> None:
+def left(path: Path) -> tuple[list[bytes], int, bool]:
+    """What a journal holds when it is opened again, how much of it is damaged, and whether its end was dropped."""
+    with contextlib.closing(Journal(path)) as again:
+        return [record for _, _, record in again.records()], again.damaged, again.dropped > 0
+
+
+@pytest.mark.parametrize(
+    ("damage", "kept", "damaged"),
+    [
+        (lambda content, at: flipped(content, at[1] + FRAME.size + 5), "ACDE", 1),  # a record
+        (lambda content, at: flipped(content, at[1] + 5), "ACDE", 1),  # its length
+        (lambda content, at: flipped(content, at[1] + FRAME.size - 3), "ABCDE", 2),  # its digest
+        (lambda content, at: content[: at[1]] + content[at[2] :], "ACDE", 1),  # one is missing
+    ],
+    ids=["record", "length", "digest", "missing"],
+)
+def test_what_is_damaged_in_a_journal_is_noticed_and_costs_none_behind_it(
+    tmp_path: Path, damage: Callable[[bytes, list[int]], bytes], kept: str, damaged: int
+) -> None:
     path = tmp_path / "a.journal"
     journal = Journal(path)
     offsets = journal.append([bytes([65 + i]) * 50 for i in range(5)])
     journal.let_go()
-    content = bytearray(path.read_bytes())
-    content[offsets[1] + 20] ^= 1
-    path.write_bytes(content)
+    path.write_bytes(damage(path.read_bytes(), offsets))
+    for _ in range(2):  # and goes on behind what is there
+        records, found, dropped = left(path)
+        assert ("".join(chr(record[0]) for record in records), found, dropped) == (kept, damaged, False)
     with contextlib.closing(Journal(path)) as again:
-        assert again.damaged == [offsets[1]]
-        assert again.dropped == 0
-        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E"]
         again.append([b"F" * 50])
-        assert [record[:1] for _, record in again.records()] == [b"A", b"C", b"D", b"E", b"F"]
-        again.clear()
-        assert again.empty
-        assert not again.damaged
+    assert [record[:1] for record in left(path)[0]][-1] == b"F"
+
+
+def flipped(content: bytes, place: int) -> bytes:
+    changed = bytearray(content)
+    changed[place] ^= 1
+    return bytes(changed)
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 30])
@@ -181,10 +214,25 @@ def test_an_unfinished_record_at_the_end_is_dropped_and_counted(tmp_path: Path, 
     journal.let_go()
     with path.open("r+b") as file:
         file.truncate(end + cut)
+    assert left(path) == ([b"first", b"second record"], 0, True)
+
+
+@pytest.mark.parametrize("lose", [Path.unlink, lambda file: file.rename(f"{file}.away")], ids=["deleted", "moved"])
+def test_a_journal_that_is_lost_is_noticed_by_the_next_append_and_made_anew(
+    tmp_path: Path, lose: Callable[[Path], object]
+) -> None:
+    path = tmp_path / "a.journal"
+    with contextlib.closing(Journal(path)) as journal:
+        behind = journal.append([b"stored", b"not stored"])[1]
+        journal.mark(behind, (7, "ab"))
+        lose(path)
+        with pytest.raises(LostJournalError, match="deleted, moved or replaced"):
+            journal.append([b"new"])
+        journal.remake()
+        journal.append([b"new"])
+        assert journal.read(behind) == b"not stored"
     with contextlib.closing(Journal(path)) as again:
-        assert [blob for _, blob in again.records()] == [b"first", b"second record"]
-        assert again.dropped > 0
-        assert again.end == end > HEADER
+        assert ([record for _, _, record in again.records()], again.newest) == ([b"not stored", b"new"], (7, "ab"))
 
 
 def test_another_file_is_not_taken_for_a_journal(tmp_path: Path) -> None:
@@ -201,13 +249,108 @@ def test_another_file_is_not_taken_for_a_journal(tmp_path: Path) -> None:
 
 def test_a_label_and_an_event_in_a_journal_return_bit_for_bit(tmp_path: Path) -> None:
     point = np.array([0.1, -7e-30], dtype=np.float32)
-    label = LateLabel(NewLabel("part 7", True, Source.CONFIRMED, 3, point, 5), 12.25)
-    event = LateEvent("safe mode", "began: ä", 3.5)
-    with contextlib.closing(Journal(tmp_path / "a.journal")) as journal:
-        journal.append([to_bytes(record) for record in (label, event)])
-        (back, event_back) = (from_bytes(blob) for _, blob in journal.records())
-        journal.clear()
+    label = TakenLabel(NewLabel("part 7", True, Source.CONFIRMED, 3, point, 5), 12.25, -(2**63), 0.1)
+    event = Event(0, 3.5, "safe mode", "began: ä", {"a": [1, None]})
+    back, event_back = (from_bytes(to_bytes(record)) for record in (label, event))
     np.testing.assert_array_equal(back.label.point, point)
-    assert replace(back.label, point=None) == replace(label.label, point=None)
+    assert replace(back, label=replace(back.label, point=None)) == replace(label, label=replace(label.label, point=None))
     assert event_back == event
-    assert not (tmp_path / "a.journal").exists()
+
+
+def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its_label(place: Place) -> None:
+    def record(x: np.ndarray, time: float) -> StoredDecision:
+        made = Decision("part 7", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
+        return StoredDecision(made, x, 1, False, time)
+
+    first, other = (record(np.full((1, 5), i, dtype=np.float32), float(i)) for i in range(2))
+    label = NewLabel("part 7", False, Source.VERIFICATION, 0, None)
+    with place.store() as store:
+        for _ in range(2):  # the same again is taken, and counts once
+            assert store.take([first]) == []
+        assert store.take([other, TakenLabel(label, 5.0, 1, other.time)]) == []
+        assert (store.get_decision("part 7").success, store.status()["labels"]) == (None, 0)
+        texts = [event.text for event in store.events()]
+        assert [event.kind for event in store.events()] == ["set aside", "set aside"]
+        assert "data" in texts[0]
+        assert "another decision" in texts[1]
+        for _ in range(2):
+            assert store.take([TakenLabel(label, 6.0, 1, first.time)]) == [("part 7", 1)]
+        assert store.take([TakenLabel(replace(label, success=True), 7.0, 1, first.time)]) == []
+        assert "a second label" in store.events()[-1].text
+
+
+def test_a_store_that_was_put_back_from_a_copy_is_told_from_its_journal(place: Place, cell: Cell) -> None:
+    cell.play(30)
+    cell.engine.flush()
+    with contextlib.closing(sqlite3.connect(place.url)) as connection:
+        connection.execute("VACUUM INTO ?", (f"{place.url}.copy",))
+    cell.play(30)
+    cell.engine.close()
+    Path(f"{place.url}.copy").replace(place.url)
+    for suffix in ("-wal", "-shm"):
+        Path(place.url + suffix).unlink(missing_ok=True)
+    assert [fault.table for fault in verify_history(place.url).faults] == ["ledger"]
+    for _ in range(2):  # said once
+        with DataEngine.open(place.store()) as again:
+            assert [event.kind for event in again.store.events()].count("lost") == 1
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        "UPDATE setting SET value = replace(value, 'lower_bound = 0.9', 'lower_bound = 0.8') WHERE key = 'recipe'",
+        "UPDATE label SET success = 1 - success WHERE seq = 3",
+        "UPDATE correction SET success = 1 - success",
+    ],
+    ids=["setting", "label", "correction"],
+)
+def test_where_what_is_in_force_is_not_what_was_written_every_part_is_verified(
+    place: Place, cell: Cell, changed: str
+) -> None:
+    cell.play(60)
+    cell.engine.correct(next(iter(cell.acknowledged)), not next(iter(cell.acknowledged.values())))
+    cell.engine.close()
+    with contextlib.closing(sqlite3.connect(place.url)) as connection, connection:
+        assert connection.execute(changed).rowcount == 1
+    with DataEngine.open(place.store()) as again:
+        assert "see `dengine verify`" in again.store_fault
+        decision = again.decide(stream().X[0])
+        assert (decision.action, decision.reason) == (Action.VERIFY, Reason.NO_STORE)
+        again.report(decision.id, True)
+        assert again.find(decision.id).success is True
+
+
+def until(held: Callable[[], object]) -> None:
+    end = time.monotonic() + 30
+    while not held():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_an_id_that_cannot_be_looked_up_is_verified_unrecorded_and_a_new_one_is_decided(place: Place, cell: Cell) -> None:
+    x = stream().X
+    cell.engine.decide(x[0], decision_id="old")
+    cell.engine.close()
+    cell.engine = DataEngine.open(place.store())
+    with moved_away(Path(place.url)):
+        cell.engine.report(cell.engine.decide(x[1]).id, True)
+        until(lambda: cell.engine.store_fault)
+        assert cell.engine.decide(x[2], decision_id="unknown").reason is Reason.NO_STORE
+        with pytest.raises(StoreError, match="unknown"):
+            cell.engine.report("unknown", True)
+    cell.until_back()
+    cell.engine.know_ids()
+    with moved_away(Path(place.url)):
+        cell.engine.report(cell.engine.decide(x[3]).id, True)
+        until(lambda: cell.engine.store_fault)
+        again = cell.engine.decide(x[2], decision_id="old")  # on another part: whether it is, nobody can say
+        assert again.reason is Reason.NO_STORE
+        with pytest.raises(StoreError, match="old"):
+            cell.engine.report("old", True)
+        fresh = cell.engine.decide(x[4], decision_id="fresh")
+        assert fresh.reason is not Reason.NO_STORE
+        cell.engine.report("fresh", True)
+    cell.until_back()
+    with pytest.raises(TraceError):
+        cell.engine.decide(x[2], decision_id="old")
+    assert (cell.engine.find("old").success, cell.engine.find("fresh").success) == (None, True)

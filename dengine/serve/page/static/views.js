@@ -280,8 +280,8 @@ function asCsv(decisions) {
 
 async function actions(get, _, doing) {
   const { versions } = await get("versions");
-  const back = versions.filter((each) => each.accepted && each.kept && each.version !== doing.version).reverse();
-  const choices = back.map((each) => [each.version, `${each.version}: ${moment(each.time)}`]);
+  const back = versions.filter(({ report, kept }) => report.accepted && kept && report.version !== doing.version).reverse();
+  const choices = back.map(({ report, time }) => [report.version, `${report.version}: ${moment(time)}`]);
   const block = (name, action, off = false, because = "") => el("section", { class: "card act", "aria-labelledby": `act-${name}` }, el("h2", { id: `act-${name}` }, action.title),
     el("p", {}, action.what), off && small(because), el("p", { class: "buttons" }, act.button(`do-${name}`, action.title, action, off)));
   const shown = el("div", { class: "acts", id: "actions", "data-part": true },
