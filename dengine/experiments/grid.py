@@ -83,7 +83,7 @@ class KeptReplays:
         handed_in = [] if by_name else [described(own), _digest_of_reducer(own)]
         how = [task.seed, task.cycles, task.shuffle, task.confirm, who.rival, sorted(who.params.items())]
         said = [self._of_data, _digest_of_source(), *map(_source_of, parts), *handed_in, who.recipe.to_toml(), str(how)]
-        return self.folder / f"{hashlib.sha256('\n'.join(said).encode()).hexdigest()[:32]}.npz"
+        return self.folder / f"{hashlib.sha256(' | '.join(said).encode()).hexdigest()[:32]}.npz"
 
     def get(self, task: Task) -> Replay | None:
         """The replay, under the contender's present name; None where it is not there, or damaged."""
