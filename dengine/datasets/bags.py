@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import must_fit, reading
 from . import labels
-from .dataset import Asked, Collected, Dataset, Fault, UnreadableError, as_dataset
+from .dataset import Asked, Collected, Dataset, Fault, UnreadableError, as_dataset, must
 from .tables import natural
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
@@ -147,8 +147,7 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
         raise DataError(f"Expected a trigger that cuts {path} into insertions, as 'contact=5' or 'register@/phase'.")
     trigger, channels = as_trigger(asked.trigger), asked.channels or ("FZ",)
     for channel in channels:
-        if axis_of(channel) < 0:
-            raise DataError(f"Expected a channel among {', '.join(AXES)} of a wrench, got {channel}.")
+        must(axis_of(channel) >= 0, f"a channel among {', '.join(AXES)} of a wrench", channel)
     files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
     if not files:
         raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
@@ -160,8 +159,7 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
         if topic not in have:
             raise DataError(f"Expected the topic {topic} in {path}, found {listed(have) or 'none'}.")
     messages = _messages(files, wrench, topics)
-    if len(messages.logged) < 2:
-        raise DataError(f"Expected messages of {wrench} in {path}, found {len(messages.logged)}.")
+    must(len(messages.logged) >= 2, f"messages of {wrench} in {path}", len(messages.logged))
     return _dataset(messages, trigger, channels, name, asked)
 
 

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NEAR = 0.03  # of the others' rate
+must = partial(expect, error=DataError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +106,7 @@ class Dataset:
     def cut(self, samples: int) -> Dataset:
         """The first `samples` samples of every trace: an earlier, harder moment to decide at."""
         have = self.X.shape[-1]
-        if not 1 <= samples <= have:
-            raise DataError(f"Expected 1 to {have} samples of {self.name}, got {samples}.")
+        must(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
         if samples < have and self.fit == "resample":
             raise DataError(f"The traces of {self.name} are resampled: give the samples where they are loaded.")
         fit = "cut" if samples < have and self.fit == "pad" else self.fit
@@ -135,29 +136,23 @@ def make_dataset(
 ) -> Dataset:
     """A `Dataset` from arrays; DataError where they do not fit together."""
     X, y = _real(X), np.asarray(y)
-    if X.ndim not in (2, 3) or y.shape != (len(X),):
-        raise DataError(f"Expected X (n, T) or (n, C, T) with n labels, got X {X.shape} and y {y.shape}.")
-    if not len(y):
-        raise DataError("Expected at least one trace, got none.")
+    must(X.ndim in (2, 3) and y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", (X.shape, y.shape))
+    must(len(y) > 0, "at least one trace", 0)
     if X.ndim == 3 and X.shape[1] > X.shape[2]:
         raise DataError(
             f"Expected X (n, channels, samples), got {X.shape[1]} channels of {X.shape[2]} samples, which looks "
             "transposed; pass X.transpose(0, 2, 1)."
         )
-    if not np.isin(y, (0, 1)).all():
-        raise DataError(f"Expected labels 1 (success) and 0 (failure), got {sorted(set(map(str, y.tolist())))[:5]}.")
-    if not 0 < rate_hz < np.inf:
-        raise DataError(f"Expected a rate above 0 Hz, got {rate_hz}.")
+    must(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", sorted(set(map(str, y.tolist()))))
+    must(0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
-    if channels and len(channels) != n_channels:
-        raise DataError(f"Expected a name for each of {n_channels} channels, got {', '.join(channels)}.")
+    must(not channels or len(channels) == n_channels, f"a name for each of {n_channels} channels", channels)
     if part is not None:
         part = np.asarray(part)
-        if part.shape != y.shape or part.dtype.kind not in "iuUS":
-            raise DataError(f"Expected {len(y)} parts' numbers, texts or integers, got {part.shape} of {part.dtype}.")
+        fit = part.shape == y.shape and part.dtype.kind in "iuUS"
+        must(fit, f"{len(y)} parts' numbers, texts or integers", (part.shape, part.dtype))
         part = part.astype(np.str_)
-    if cause is not None and np.shape(cause) != y.shape:
-        raise DataError(f"Expected {len(y)} causes, one a trace, got {np.shape(cause)}.")
+    must(cause is None or np.shape(cause) == y.shape, f"{len(y)} causes, one a trace", np.shape(cause))
     return Dataset(X, y.astype(np.int8), rate_hz=rate_hz, channels=channels, part=part, cause=cause, **about)
 
 
@@ -178,10 +173,10 @@ class Asked:
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
             raise DataError("Expected a pattern of the labels (label) or a file of them (labels), got both; leave one out.")
-        expect(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit, error=DataError)
-        expect(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz, error=DataError)
-        expect(self.samples is None or self.samples >= 1, "1 or more samples", self.samples, error=DataError)
-        expect(len(set(self.channels)) == len(self.channels), "each channel once", self.channels, error=DataError)
+        must(self.fit in (None, *FITS), f"fit to be one of {', '.join(FITS)}", self.fit)
+        must(self.rate_hz is None or self.rate_hz > 0, "a rate above 0 Hz", self.rate_hz)
+        must(self.samples is None or self.samples >= 1, "1 or more samples", self.samples)
+        must(len(set(self.channels)) == len(self.channels), "each channel once", self.channels)
 
 
 def names_of(channel: str | Sequence[str] | None) -> tuple[str, ...]:

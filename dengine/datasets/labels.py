@@ -150,18 +150,16 @@ def _alike(one: Sequence[str], other: Sequence[str]) -> bool:
 def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
     try:
         table = read_table(Path(path))
-        cells = table.frame(as_text=True).to_numpy().tolist()
     except (OSError, UnreadableError) as error:
         raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    header, lines = table.header, table.lines
+    header, cells, lines = table.header, table.rows, table.lines
     if header[0].lower().endswith(".csv"):
         cells, lines, header = [header, *cells], [1, *lines], ["file", "label", *header[2:]]
     of_file, of_label = _columns(header, path)
     if part != "part" and part not in header:
         raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
     rows: dict[tuple[str, ...], _Row] = {}
-    for line, row in zip(lines, cells, strict=True):
-        said = [str(word).strip() for word in row]
+    for line, said in zip(lines, cells, strict=True):
         words = _words(said[of_file])
         if words in rows:
             what = f"Expected each file once, {said[of_file]} came before"

@@ -22,7 +22,7 @@ from ..files import must_fit, reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import header_of, is_number, numbers, read_recording, read_table
+from .text import floats, header_of, numbers, read_recording, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,13 +87,16 @@ def _recordings(paths: dict[str, Path], found: Collected, timed: bool) -> Iterat
 
 def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
     """One wide CSV file with a header."""
+    import pandas as pd
+
     try:
         table = read_table(path)
-        if 2 * sum(is_number(word) and not word.isdecimal() for word in table.header) > len(table.header) > 2:
+        told = pd.Series([word for word in table.header if not word.isdecimal()], dtype=object)
+        if 2 * (len(told) - len(floats(told)[1])) > len(table.header) > 2:
             raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
         if not table.rows:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
-        frame = table.frame().set_axis(table.header, axis=1)
+        frame = pd.DataFrame(table.rows, columns=table.header)
     except UnreadableError as error:
         raise DataError(f"Cannot read {path}: {error.fault(path.name)}.") from error
     return from_frame(frame, asked, name, path.name, table.faults, table.lines)

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..datasets.dataset import must
 from ..datasets.importing import CHUNK, ImportReport
 from ..decision.policy import Policy
 from ..errors import DataError, StoreError
@@ -85,9 +86,8 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         kind, *words = _words(raw, where)
         if kind == "part":
             line = _part(words, spec, where)
-            if line.decision.id in parts:
-                again = f"Expected one line of the part {line.decision.id}, {where} is another"
-                raise DataError(f"{again}; the journal was pasted together.")
+            again = line.decision.id in parts
+            must(not again, f"one line of each part, in {where}", line.decision.id, "the journal was pasted together")
             lines += last  # the next part comes: no sooner is an accepted one counted of which nothing was heard
             last = [line] if line.label is None else []
         else:
@@ -112,18 +112,17 @@ def _words(raw: bytes, where: str) -> list[str]:
         words = said.decode("utf-8").split(",")
     except UnicodeDecodeError as error:
         raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
-    if words[0] not in ("part", "label"):
-        raise DataError(f"Expected a line that begins with part or label in {where}, got {words[0][:20]!r}.")
+    must(words[0] in ("part", "label"), f"a line that begins with part or label in {where}", words[0])
     return words
 
 
 def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
     """An earlier part with its label."""
-    if len(words) != 2 or words[0] not in parts or words[1] not in LABELS:
-        raise DataError(f"Expected an earlier part's id and a label of 1 or 0 in {where}, got {','.join(words)[:60]!r}.")
+    held = len(words) == 2 and words[0] in parts and words[1] in LABELS
+    must(held, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
     known = parts[words[0]]
-    if known.decision.action is Action.REJECT or known.label is not None:
-        raise DataError(f"Expected one label of a part that was not rejected in {where}, got another of {words[0]}.")
+    held = known.decision.action is not Action.REJECT and known.label is None
+    must(held, f"one label of a part that was not rejected in {where}", words[0])
     return replace(known, label=LABELS[words[1]])
 
 
@@ -134,11 +133,11 @@ def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
         bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
     except ValueError as error:
         raise DataError(f"The decision in {where} cannot be read: {error}.") from error
-    if not (0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT):
-        raise DataError(f"Expected bounds between 0 and 1 and counts in {where}, got {','.join(decided[3:7])[:60]!r}.")
+    held = 0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT
+    must(held, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
     rejected = action is Action.REJECT
-    if not id_ or (label not in LABELS and label != "") or (rejected and label != ""):
-        raise DataError(f"Expected an id, and a label of 1, 0 or nothing in {where}, got {id_[:20]!r}, {label[:20]!r}.")
+    held = id_ != "" and (label == "" or (label in LABELS and not rejected))
+    must(held, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
     trace = np.zeros((1, 0), dtype=np.float32) if rejected else _trace(words[10:], spec, where)
     known = (*bound, None, 0, reason, reason is Reason.AUDIT, 1.0, part or None)
     return JournalLine(Decision(id_, action, predicted, *known), trace, LABELS.get(label))
@@ -146,8 +145,8 @@ def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
 
 def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
     expected = spec.channels * spec.samples
-    if len(words) != expected and (spec.fit == "strict" or not words or len(words) % spec.channels):
-        raise DataError(f"Expected {expected} samples in {where}, got {len(words)}; it is damaged, or of another cell.")
+    held = len(words) == expected or (spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0)
+    must(held, f"{expected} samples in {where}", len(words), "it is damaged, or of another cell")
     try:
         with np.errstate(over="ignore"):
             values = np.array([float(word) for word in words]).astype(np.float32)

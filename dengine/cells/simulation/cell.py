@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from ...errors import DengineError, SettingError
+from ...errors import DengineError, expect
 from ...records import Outcome
 from .conditions import CHANNELS, RATE_HZ, CellParameters, Conditions, draw_conditions, find_scenario
 from .world import DEPTH_MM, TIME_STEP_S, Push, push
@@ -173,10 +173,8 @@ class SimulatedCell:
         channels: str = "z",
         cycles: int = 600,
     ) -> None:
-        if channels not in CHANNELS:
-            raise SettingError(f"Expected channels of {', '.join(CHANNELS)}; got {channels!r}; choose one of these.")
-        if cycles < 1:
-            raise SettingError(f"Expected cycles of at least 1, got {cycles}; give the length of the run.")
+        expect(channels in CHANNELS, f"channels of {', '.join(CHANNELS)}", channels, "choose one of these")
+        expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()
         self.scenario, self.seed, self.channels, self.cycles = scenario, seed, channels, cycles
         self.clock = 0.0

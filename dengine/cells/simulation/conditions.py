@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from ...errors import SettingError
+from ...errors import expect
 
 Range = tuple[float, float]  # (low, high) of a uniform draw
 
@@ -107,14 +107,12 @@ class CellParameters:
         for name in (each.name for each in fields(self)):
             value = getattr(self, name)
             low, high = value if isinstance(value, tuple) else (value, value)
-            if not low <= high:
-                raise SettingError(f"Expected {name} as (low, high) with low <= high, got {value}; swap them.")
-            if name in _PROBABILITIES and not 0 <= low <= 1:
-                raise SettingError(f"Expected {name} as a probability from 0 to 1, got {value}; give a share of 1.")
-            if name not in _SIGNED and low < 0:
-                raise SettingError(f"Expected {name} to be at least 0, got {value}; the unit is in its name.")
-        if (faults := self.missed_grasp + self.weak_grip + self.debris + self.wrong_part) > 1:
-            raise SettingError(f"Expected fault probabilities that sum to at most 1, got {faults:g}; lower one.")
+            expect(low <= high, f"{name} as (low, high) with low <= high", value, "swap them")
+            probable = name not in _PROBABILITIES or 0 <= low <= 1
+            expect(probable, f"{name} as a probability from 0 to 1", value, "give a share of 1")
+            expect(name in _SIGNED or low >= 0, f"{name} to be at least 0", value, "the unit is in its name")
+        faults = self.missed_grasp + self.weak_grip + self.debris + self.wrong_part
+        expect(faults <= 1, "fault probabilities that sum to at most 1", faults, "lower one")
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +221,7 @@ SCENARIOS: dict[str, Scenario] = {"nominal": nominal, "wear": wear, "variant": v
 
 def find_scenario(name: str) -> Scenario:
     """The scenario of this name."""
-    if name not in SCENARIOS:
-        raise SettingError(f"Expected a scenario of {', '.join(SCENARIOS)}; got {name!r}; choose one of these.")
+    expect(name in SCENARIOS, f"a scenario of {', '.join(SCENARIOS)}", name, "choose one of these")
     return SCENARIOS[name]
 
 

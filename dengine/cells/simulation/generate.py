@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import SettingError
+from ...errors import expect
 from ...files import write_output
 from .cell import Insertion, insert_once
 from .conditions import CHANNELS, RATE_HZ, CellParameters, find_scenario
@@ -36,10 +36,8 @@ def simulate(
     """
     from joblib import Parallel, delayed
 
-    if n < 1:
-        raise SettingError(f"Expected at least 1 trace to simulate, got {n}; raise n.")
-    if channels not in CHANNELS:
-        raise SettingError(f"Expected channels of {', '.join(CHANNELS)}; got {channels!r}; choose one of these.")
+    expect(n >= 1, "at least 1 trace to simulate", n, "raise n")
+    expect(channels in CHANNELS, f"channels of {', '.join(CHANNELS)}", channels, "choose one of these")
     base, change = CellParameters(), find_scenario(scenario)
     tasks = (delayed(insert_once)(change(base, cycle, n), seed, cycle, channels, time_step_s) for cycle in range(n))
     insertions: list[Insertion] = []

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DengineError, SettingError
+from ...errors import DengineError, SettingError, expect
 from .conditions import RATE_HZ, SAMPLES, Conditions
 
 TIME_STEP_S = 0.0005
@@ -50,8 +50,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     except ImportError as error:
         raise DengineError("Expected MuJoCo for the simulated cell, found none: pip install dengine[sim]") from error
     steps = round(1 / RATE_HZ / time_step_s)
-    if not math.isclose(steps * time_step_s, 1 / RATE_HZ):
-        raise SettingError(f"Expected a time step that divides 2 ms, got {time_step_s} s; take 0.0005 or half of it.")
+    divides = math.isclose(steps * time_step_s, 1 / RATE_HZ)
+    expect(divides, "a time step in seconds that divides 2 ms", time_step_s, "take 0.0005 or half of it")
     try:
         model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
     except ValueError as error:
