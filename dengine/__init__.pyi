@@ -31,9 +31,9 @@ from .records import Source as Source
 from .records import TraceSpec as TraceSpec
 from .reducers import REDUCERS as REDUCERS
 from .reducers import make_reducer as make_reducer
+from .reducers.base import CrossFitted as CrossFitted
 from .reducers.base import Reducer as Reducer
 from .reducers.conv import ConvReducer as ConvReducer
-from .reducers.cross_fitting import CrossFitted as CrossFitted
 from .reducers.pca import PcaReducer as PcaReducer
 from .reducers.rocket import RocketReducer as RocketReducer
 from .reducers.umap import UmapReducer as UmapReducer

@@ -27,8 +27,7 @@ from .decision.rule import script
 from .engine.engine import DataEngine
 from .folds import content_fold
 from .recipe import Recipe
-from .reducers.base import Floats, Ints, Reducer, StopRule
-from .reducers.cross_fitting import as_reducer
+from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer
 
 N, SAMPLES, FOLDS = 100, 120, 2
 SHAPES = ((1, 152), (1, 800), (3, 90))  # channels, samples

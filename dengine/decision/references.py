@@ -161,7 +161,9 @@ class ReferenceRing(nn.Module):
             limit = min(limit, self.farthest)
         if int(self.repeats.item()) > 0:
             return self.votes(distances <= limit)
-        inside = distances.clone().le_(limit)  # 1.0 or 0.0, without a mask in between
+        # 1.0 or 0.0, without a mask in between; of a copy, as a rule may look twice, and scripted, le_ right after a sum
+        # gave wrong counts (917 for 586).
+        inside = distances.clone().le_(limit)
         counts: list[float] = torch.mv(self.labels[:, :n], inside).tolist()  # exact below 2**24 points
         return int(counts[1]), int(counts[0]) - int(counts[1])
 
@@ -328,16 +330,11 @@ class RadiusIndex:
         """The index that `get_state` was taken from: the same points in the same places."""
         index = cls(len(state["points"]), capacity)
         ring, n = index.ring, state["points"].shape[1]
-        for name, own in (
-            ("points", ring.points),
-            ("labels", ring.labels[1]),
-            ("spaces", ring.spaces),
-            ("parts", ring.parts),
-        ):
+        held = {"points": ring.points, "labels": ring.labels[1], "spaces": ring.spaces, "parts": ring.parts}
+        for name, own in held.items():
             own[..., :n] = torch.from_numpy(np.array(state[name]))
         ring.agreement.fill_(float(state["agreement"]))
-        if "numbers" in state:
-            index._numbers[:n] = state["numbers"]
+        index._numbers[:n] = state["numbers"]
         ring.total.fill_(int(state["total"]))
         index._gather_parts()
         return index

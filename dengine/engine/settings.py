@@ -11,9 +11,8 @@ from typing import Any, Self
 from .. import __version__
 from ..decision.policy import Policy
 from ..errors import SettingError, StoreError, shortened
-from ..model.base import EngineModel, Model
+from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
-from ..model.rival import as_engine_model
 from ..recipe import OBJECT, Recipe, described
 from ..records import TraceSpec, is_whole, trace_in
 from ..store.outbox import Outbox

@@ -1,10 +1,11 @@
 """Two contracts: what a rival method must give (`Model`), and what the engine drives (`EngineModel`).
 
-`rival.RivalAdapter` makes an `EngineModel` of a rival; our own, `neighbours.ModelPrediction`, is both.
+`RivalAdapter` makes an `EngineModel` of a rival; our own, `neighbours.ModelPrediction`, is both.
 """
 
 from __future__ import annotations
 
+import copy
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.policy import Policy
-from ..errors import ExportError
+from ..errors import ExportError, SettingError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, TraceSpec
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
@@ -93,9 +94,8 @@ class EngineModel(ABC):
     ) -> Self:
         """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
 
-    def look_ahead(self, X: NDArray[np.float32]) -> int:
+    def look_ahead(self, X: NDArray[np.float32]) -> None:  # noqa: B027  # a default: nothing to begin with
         """Begin with a training on traces (n, C, T) as far as no label is read; see `Reducer.look_ahead`."""
-        return 0
 
     @abstractmethod
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
@@ -181,7 +181,7 @@ class EngineModel(ABC):
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
         """`look_ahead`, or nothing where it fails."""
-        _guarded(lambda: self.look_ahead(X), 0, "traces could not be looked at ahead of a retrain")
+        _guarded(lambda: self.look_ahead(X), None, "traces could not be looked at ahead of a retrain")
 
     def tell_safely(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
@@ -214,6 +214,50 @@ def _guarded(call: Callable[[], T], otherwise: T, failed: str) -> T:
     except Exception:
         log.exception(failed)
         return otherwise
+
+
+def as_engine_model(model: Model) -> EngineModel:
+    """A model as the engine drives it: our own as it is, a rival adapted. SettingError for what is no model."""
+    if isinstance(model, EngineModel):
+        return model
+    if isinstance(model, type) or not isinstance(model, Model):
+        raise SettingError(f"Expected a model with fit, add, count, predict_interval and decide, got {model!r}.")
+    return RivalAdapter(model)
+
+
+class RivalAdapter(EngineModel):
+    """Makes an `EngineModel` of a rival. It decides by its own rule, and it is trained on a deep copy."""
+
+    keeps_references = False
+
+    def __init__(self, model: Model) -> None:
+        self.model = self.user_model = model
+        self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
+
+    def train(self, X: NDArray[np.float32], y: NDArray[Any], *_: object, **__: object) -> Self:
+        self.model.fit(X, y)
+        return self
+
+    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+        """The rival's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
+        X = x[None]
+        (lower,), (upper,) = self.model.predict_interval(X)
+        (n_success,), (n_failure,) = self.model.count(X)
+        action = Action(self.model.decide(X)[0])
+        reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
+        counts = int(n_success), int(n_failure)
+        if counts != (n_success, n_failure):
+            raise ValueError(f"Expected whole numbers of labels, got {shortened((n_success, n_failure))}.")
+        return Prediction(action, float(lower), float(upper), *counts, None, reason)
+
+    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
+        return x
+
+    def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
+        self.model.add(point, y)
+
+    def successor(self) -> RivalAdapter:
+        return RivalAdapter(copy.deepcopy(self.model))
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,7 @@ from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
 from ..reducers import make_reducer, reducer_of
-from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, part, space_scale
-from ..reducers.cross_fitting import as_reducer
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, part, space_scale
 from ..traces import as_traces
 from .base import Embedding, EngineModel, Exportable, Prediction
 
@@ -245,15 +244,14 @@ class ModelPrediction(EngineModel):
         self._predictor = None  # built by `prepare`, or when it is asked
         return self
 
-    def look_ahead(self, X: NDArray[np.float32]) -> int:
+    def look_ahead(self, X: NDArray[np.float32]) -> None:
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
-        done, blank = self.spaces.look_ahead(X), self.spaces.blank(X)
+        blank = self.spaces.look_ahead(X)
         if blank is not None and self.rule.scriptable and "index" not in vars(self):
             gate = NoveltyGate(*X.shape[1:])
             gate.asleep = not self.novelty
             around = self.classifier.around(RadiusIndex(blank.dim, self.classifier.capacity), self.rule)
             mould_of(Predictor(blank, torch.ones(self.n_spaces), gate, around).eval(), X.shape[1:])
-        return done
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model, and be compiled."""

@@ -15,16 +15,15 @@ from ..recipe import Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
-    from .base import Reducer
+    from .base import CrossFitted, Reducer
     from .conv import ConvReducer
-    from .cross_fitting import CrossFitted
     from .pca import PcaReducer
     from .rocket import RocketReducer
     from .umap import UmapReducer
 
 # The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
 _NAMED = {"conv": "ConvReducer", "umap": "UmapReducer", "pca": "PcaReducer", "rocket": "RocketReducer"}
-_LAZY = {"base": ["Reducer"], "cross_fitting": ["CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
+_LAZY = {"base": ["Reducer", "CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer
 

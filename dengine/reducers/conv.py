@@ -114,6 +114,8 @@ class ConvReducer(FeatureReducer):
     random_state : of all that is drawn; None draws anew at each fit.
     """
 
+    sizes = ("kernels", "dilations", "regions", "width")
+
     def __init__(
         self,
         *,
@@ -138,6 +140,8 @@ class ConvReducer(FeatureReducer):
         self.random_state = random_state
 
     def make_features(self, channels: int, samples: int) -> ConvEncoder:
+        if self.regions > 16:
+            raise SettingError(f"Expected regions <= 16, got {self.regions!r}.")
         return ConvEncoder(channels, samples, self.average_, self.kernels, self.dilations, self.regions)
 
     def _start(self, traces: Floats) -> None:
@@ -150,16 +154,6 @@ class ConvReducer(FeatureReducer):
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         self.average_ = int(state["average"])
         return super().set_state(state)
-
-    def check(self) -> None:
-        """Raise SettingError for a parameter out of its range."""
-        super().check()
-        for name in ("kernels", "dilations", "width", "regions"):
-            value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < 1:
-                raise SettingError(f"Expected {name} >= 1, an integer, got {value!r}.")
-        if self.regions > 16:
-            raise SettingError(f"Expected regions <= 16, got {self.regions!r}.")
 
 
 def averaging(traces: Tensor) -> int:

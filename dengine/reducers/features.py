@@ -201,6 +201,7 @@ class FeatureReducer(Reducer):
     uses_labels = True
     own_unit = True  # a radius of 0.05 is five in a hundred, never rescaled
     width = 128  # W
+    sizes: tuple[str, ...] = ()  # parameters of a kind that are whole numbers
     n_components: int
     folds: int
     l2: float
@@ -239,18 +240,15 @@ class FeatureReducer(Reducer):
         with torch.inference_mode():
             return own_places(self.net_.places(f).numpy(), folds)
 
-    def look_ahead(self, X: Floats) -> int:
+    def look_ahead(self, X: Floats) -> FeatureEmbedding:
         """Compute the features of traces that a store brings: in the first retrain it would take too long."""
-        if len(X) < MIN_TRACES:
-            return 0
-        with torch.no_grad():
-            return len(self.raw_features(self._begun(X)))
-
-    def blank(self, X: Floats) -> FeatureEmbedding:
-        new = self if "net_" in vars(self) else clone(self)
-        new._begun(X)
-        found: FeatureEmbedding = new.net_
-        return found
+        enough = len(X) >= MIN_TRACES
+        new: Self = self if enough or "net_" in vars(self) else clone(self)
+        traces = new._begun(X)
+        if enough:
+            with torch.no_grad():
+                self.raw_features(traces)
+        return new.net_
 
     def _begun(self, X: Floats) -> Floats:
         """The traces, checked, once there are features for them: the first ones that come set these."""
@@ -376,14 +374,14 @@ class FeatureReducer(Reducer):
 
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range."""
-        for name in ("n_components", "folds", "max_iter"):
-            if not isinstance(getattr(self, name), int | np.integer):
-                raise SettingError(f"Expected {name} to be an integer, got {getattr(self, name)!r}.")
+        for name in ("n_components", "folds", "max_iter", *self.sizes):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < 1:
+                raise SettingError(f"Expected {name} >= 1, an integer, got {value!r}.")
         for fits, expected, value in (
-            (self.n_components in (1, 2), "n_components 1 or 2", self.n_components),
+            (self.n_components <= 2, "n_components 1 or 2", self.n_components),
             (self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2),
             (self.folds >= 2, "folds >= 2 where labels are used", self.folds),
-            (self.max_iter >= 1, "max_iter >= 1", self.max_iter),
         ):
             if not fits:
                 raise SettingError(f"Expected {expected}, got {value!r}.")

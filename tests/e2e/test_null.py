@@ -12,8 +12,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import DataEngine, Dataset, ModelPrediction, Policy, Recipe, Replay, WilsonRadiusClassifier, replay
 from dengine.recipe import RECIPES
-from dengine.reducers.base import as_points
-from dengine.reducers.cross_fitting import LabelFree
+from dengine.reducers.base import LabelFree, as_points
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
 CYCLES = 1503

@@ -1,10 +1,8 @@
 """Every public estimator keeps scikit-learn's habits: its own checks, and what they do not ask of traces."""
 
-import warnings
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from sklearn.base import clone
@@ -17,8 +15,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from dengine import ConvReducer, CrossFitted, PcaReducer, RocketReducer, UmapReducer, WilsonRadiusClassifier
 from dengine.errors import SettingError
-from dengine.reducers.base import Reducer
-from dengine.reducers.cross_fitting import LabelFree
+from dengine.reducers.base import LabelFree, Reducer
 from dengine.reducers.umap import _Contained
 
 ESTIMATORS = (
@@ -88,11 +85,6 @@ def traces(n: int = 80, channels: int = 1, samples: int = 30, seed: int = 0) -> 
     return (ramp + rng.normal(0.0, 1.0, (n, channels, samples))).astype(np.float32), y
 
 
-def frame(X: np.ndarray) -> pd.DataFrame:
-    rows = X[:, 0]
-    return pd.DataFrame(rows, columns=[f"t{i}" for i in range(rows.shape[1])], index=[f"part{i}" for i in range(len(rows))])
-
-
 @every_reducer
 def test_one_channel_may_be_left_out_of_the_shape(name: str) -> None:
     X, y = traces()
@@ -113,20 +105,6 @@ def test_random_state_is_none_an_integer_or_a_random_state(name: str) -> None:
     assert np.isfinite(fits[4]).all()
     with pytest.raises(ValueError, match="RandomState"):
         clone(SMALL[name]).set_params(random_state=np.random.default_rng(0)).fit(X, y)
-
-
-@every_reducer
-def test_a_table_goes_in_and_a_table_comes_out_with_names(name: str) -> None:
-    X, y = traces()
-    table, reducer = frame(X), clone(SMALL[name]).set_output(transform="pandas")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", UserWarning)  # names are neither lost on the way nor missing
-        Z = reducer.fit(table, pd.Series(y, index=table.index)).transform(table)
-    assert list(reducer.feature_names_in_) == list(table.columns)
-    assert list(Z.columns) == list(reducer.get_feature_names_out())
-    assert list(Z.index) == list(table.index)
-    np.testing.assert_array_equal(Z.to_numpy(), clone(SMALL[name]).fit(X, y).transform(X))
-    assert type(reducer.embed(X)) is np.ndarray
 
 
 @every_reducer
@@ -178,15 +156,6 @@ def test_a_transform_places_a_trace_bit_for_bit_whatever_is_beside_it(name: str)
     Z, order = reducer.transform(X), np.random.default_rng(0).permutation(len(X))
     np.testing.assert_array_equal(reducer.transform(X[order]), Z[order])
     np.testing.assert_array_equal(np.concatenate([reducer.transform(x[None]) for x in X]), Z)
-
-
-@every_reducer
-def test_a_transform_is_the_mean_over_the_spaces_of_the_embedding(name: str) -> None:
-    X, y = traces()
-    reducer = clone(SMALL[name]).fit(X, y)
-    Z = reducer.embed(X)
-    assert Z.shape[:2] == (80, reducer.n_spaces)
-    np.testing.assert_allclose(reducer.transform(X), Z.mean(axis=1), rtol=1e-5, atol=1e-5)
 
 
 def test_threads_that_numba_set_in_a_umap_are_put_back_for_others() -> None:

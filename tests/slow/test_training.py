@@ -71,11 +71,6 @@ def test_a_rival_without_a_bound_says_so_in_its_row(run: Run, tiny: Path, tmp_pa
     assert bounds["always"].startswith("no error")
 
 
-def test_choosing_among_tries_that_are_never_certain_says_so(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ["choose", "--data", tiny, "--cycles", 10, "--reducers", "pca", "--seeds", "0:1", "--n-jobs", 1]
-    assert "Chosen of pca: none" in run("compare_reducers", *words, "--out", tmp_path)
-
-
 def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import time
 

@@ -69,13 +69,14 @@ def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does(shares) 
     assert [scripted(q) for q in queries] == [model.neighbours_(q) for q in queries]
 
 
-def test_learning_in_parts_is_learning_at_once() -> None:
+def test_learning_in_parts_is_learning_at_once_and_knows_the_classes_of_the_first_call() -> None:
     Z, y = blobs()
-    whole = WilsonRadiusClassifier().fit(Z, y)
-    parts = WilsonRadiusClassifier()
+    whole, parts = WilsonRadiusClassifier().fit(Z, y), WilsonRadiusClassifier()
     for start in range(0, len(Z), 37):
         parts.partial_fit(Z[start : start + 37], y[start : start + 37], classes=[0, 1])
     np.testing.assert_array_equal(parts.count(Z), whole.count(Z))
+    with pytest.raises(ValueError, match="Expected labels among"):
+        parts.partial_fit(Z[:1], [2])
 
 
 @pytest.mark.parametrize(("label", "counts"), [(1, (5, 0)), (0, (0, 5))])
@@ -92,12 +93,6 @@ def test_labels_of_three_classes_or_none_are_refused_in_scikit_learns_words(lear
     ):
         with pytest.raises(ValueError, match=message):
             getattr(WilsonRadiusClassifier(), learn)(np.zeros((3, 2)), labels)
-
-
-def test_a_label_that_the_first_call_did_not_name_is_refused() -> None:
-    model = WilsonRadiusClassifier().fit(np.zeros((2, 2)), [0, 1])
-    with pytest.raises(ValueError, match="Expected labels among"):
-        model.partial_fit(np.zeros((1, 2)), [2])
 
 
 @pytest.mark.parametrize(

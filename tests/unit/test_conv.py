@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -58,15 +56,6 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
         assert np.array_equal(a[:, k], b[:, k])
         assert one.holdout_losses_[k] == two.holdout_losses_[k]
         assert not np.array_equal(a, b)  # the other spaces did see them
-
-
-def test_space_k_stays_the_same_where_a_step_limit_ends_the_fit():
-    X, y = traces()
-    folds = content_fold(X, 2)
-    other = np.where(folds == 0, 1 - y, y)
-    stop = StopRule(max_steps=2)
-    a, b = (ConvReducer(folds=2).fit(X, labels, folds=folds, stop=stop).embed(X) for labels in (y, other))
-    assert np.array_equal(a[:, 0], b[:, 0])
 
 
 def test_embedding_in_the_own_space_picks_row_i_of_space_folds_i():
@@ -224,17 +213,6 @@ def test_what_answers_is_the_components_and_then_the_heads(kind: type) -> None:
     assert g.var(0).sum() == pytest.approx(150.0, rel=0.05)  # what a ridge of 1 is weighed against
 
 
-def test_features_kept_under_other_biases_are_not_read_again() -> None:
-    X, y = traces()
-    reducer = RocketReducer(random_state=0).fit(X, y)
-    first = reducer.net_.features.bias.clone()
-    reducer.set_params(random_state=5).fit(X, y)
-    assert not np.array_equal(reducer.net_.features.bias, first)
-    fresh = RocketReducer(random_state=5).fit(X, y)
-    np.testing.assert_array_equal(reducer.raw_features(X), fresh.net_.features.raw(torch.from_numpy(X)))
-    np.testing.assert_array_equal(reducer.embed(X), fresh.embed(X))
-
-
 def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
     X, y = traces(90)
     reducer, folds, computed = RocketReducer(), content_fold(X, 5), []
@@ -244,18 +222,6 @@ def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkey
         computed.append(0)
         reducer.train(X[first:last], y[first:last], folds[first:last])
     assert computed == [0, 60, 0, 30, 0, 0, 30]
-
-
-def test_traces_in_small_units_are_not_taken_for_one_another() -> None:
-    X, y = traces()
-    small, folds = X * np.float32(2.0**-30), content_fold(X, 5)  # a power of two: the same digits, another exponent
-    fitted = RocketReducer().fit(X, y, folds=folds)
-    np.testing.assert_array_equal(RocketReducer().fit(small, y, folds=folds).embed(small), fitted.embed(X))
-
-
-def test_a_pickled_rocket_grows_as_its_traces_do_and_not_as_their_square() -> None:
-    sizes = [len(pickle.dumps(RocketReducer().fit(*traces(n)))) for n in (100, 400)]
-    assert sizes[1] < 4 * sizes[0]
 
 
 def test_the_features_are_the_same_whatever_the_labels() -> None:

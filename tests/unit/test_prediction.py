@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+import torch
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 
-from dengine import Dataset, ModelPrediction, WilsonRadiusClassifier
+from dengine import DataEngine, Dataset, ModelPrediction, WilsonRadiusClassifier
 from dengine.errors import SettingError
 from dengine.folds import content_fold, content_hash
+from dengine.model import neighbours
 
 
 def classifier(**changes) -> WilsonRadiusClassifier:
@@ -135,3 +137,12 @@ def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements
     assert not any(name.startswith("reducer.") for name in state)
     restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
     assert restored.predict_many(data.X) == model.predict_many(data.X)
+
+
+def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(data: Dataset, monkeypatch) -> None:
+    with DataEngine("conv", replaying=True) as engine:
+        for x, y in zip(data.X, data.y, strict=True):
+            engine.report(engine.decide(x).id, bool(y))
+            monkeypatch.setattr(neighbours, "script", None)  # in a retrain there is no time for that
+        assert engine.retrain().accepted
+        assert isinstance(engine.model.predictor, torch.jit.ScriptModule)

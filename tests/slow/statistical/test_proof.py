@@ -23,12 +23,6 @@ def test_planted_labels_come_as_often_as_their_truth_says(truth: str) -> None:
     assert abs(excess.mean()) < 4.0 * excess.std() / np.sqrt(len(excess)) + 1e-12
 
 
-def test_a_mirrored_stream_swaps_good_and_bad() -> None:
-    stream = planted("step", 100, 0.9, 0)
-    np.testing.assert_array_equal(stream.mirrored().data.y, 1 - stream.data.y)
-    np.testing.assert_allclose(stream.mirrored().p, 1.0 - stream.p)
-
-
 def test_the_pooled_guarantee_accepts_and_keeps_the_tolerance(proof_repeats: int) -> None:
     rows = [judge(seed, SOFT) for seed in range(proof_repeats)]
     assert np.mean([row["accepted"] for row in rows]) > 30
