@@ -1,5 +1,6 @@
 """What a user installs: small to import, complete, and nothing but `dengine`."""
 
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -12,11 +13,9 @@ import pytest
 import dengine
 
 
-def fresh(code: str, **options) -> str:
+def fresh(code: str, *flags: str, cwd: Path | None = None) -> str:
     """What code prints in a fresh interpreter."""
-    done = subprocess.run(
-        [sys.executable, *options.pop("flags", ()), "-c", code], capture_output=True, text=True, **options
-    )
+    done = subprocess.run([sys.executable, *flags, "-c", code], capture_output=True, text=True, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
@@ -43,8 +42,6 @@ def test_the_version_is_the_projects(repo: Path) -> None:
 
 @pytest.fixture(scope="module")
 def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import shutil
-
     # From a copy: setuptools leaves build/ behind and must not meet an old one.
     source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
     shutil.copytree(repo / "dengine", source / "dengine", ignore=shutil.ignore_patterns("__pycache__"))
@@ -82,7 +79,7 @@ def test_the_wheel_works_where_there_is_no_checkout(wheel: Path, repo: Path, tmp
         "data = load_dataset('insertion'); print(len(data), data.X.shape[1])\n"
         "print(len(replay(data, 'pca', cycles=60).action))"
     )
-    where, size, played = fresh(code, flags=("-I", "-S"), cwd=tmp_path).splitlines()
+    where, size, played = fresh(code, "-I", "-S", cwd=tmp_path).splitlines()
     assert Path(where).is_relative_to(target)
     assert not Path(where).is_relative_to(repo)
     assert (size, played) == ("1503 1000", "60")

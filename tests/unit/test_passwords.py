@@ -14,7 +14,7 @@ from dengine import DataEngine
 from dengine import errors as all_errors
 from dengine.cli import main
 from dengine.cli.output import progress
-from dengine.errors import DengineError, StoreError, shortened, without_password
+from dengine.errors import DengineError, StoreError, without_password
 from dengine.records import plain
 from dengine.store import SqlStore
 from dengine.store.connections import make_engine
@@ -126,8 +126,3 @@ def test_the_environment_gives_the_password_and_a_used_store_is_shown_without_it
     with admin.connect() as connection:
         connection.execute(sa.text(f"DROP DATABASE {name}"))
     admin.dispose()
-
-
-def test_a_value_is_shown_in_a_line() -> None:
-    assert shortened("short") == "'short'"
-    assert len(shortened("x" * 10**6)) < 100

@@ -48,15 +48,6 @@ def text(cell: Any) -> str:
     return "".join(out.get("text", out.get("data", {}).get("text/plain", "")) for out in cell.outputs)
 
 
-def shorten(notebook: Any, name: str) -> None:
-    """Make a notebook's long cells quick; each replacement has to be found, and in no exact cell."""
-    left = [cell for cell in notebook.cells if cell.cell_type == "code" and cell not in exact(notebook)]
-    for long, short in SMALLER[name].items():
-        assert any(long in cell.source for cell in left), f"{name}: {long} is in no cell that may be shorter"
-        for cell in left:
-            cell.source = cell.source.replace(long, short)
-
-
 def exact(notebook: Any) -> list[Any]:
     """The cells whose output depends on no machine: seeded counts, files that are read, and no model."""
     return [cell for cell in notebook.cells if "exact" in cell.metadata.get("tags", [])]
@@ -80,10 +71,14 @@ def test_a_notebook_runs_anew_and_its_exact_cells_say_what_they_said(path: Path)
     nbclient = pytest.importorskip("nbclient")
     committed = read(path)
     notebook = copy.deepcopy(committed)
-    for cell in notebook.cells:
-        if cell.cell_type == "code":
-            cell.outputs = []
-    shorten(notebook, path.stem)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    for cell in code:
+        cell.outputs = []
+    left = [cell for cell in code if cell not in exact(notebook)]
+    for long, short in SMALLER[path.stem].items():
+        assert any(long in cell.source for cell in left), f"{long} is in no cell that may be shorter"
+        for cell in left:
+            cell.source = cell.source.replace(long, short)
     there = {"metadata": {"path": str(FOLDER)}}
     done = nbclient.NotebookClient(notebook, timeout=240, kernel_name="python3", resources=there).execute()  # raises
     assert any("image/png" in out.get("data", {}) for out in outputs(done))
