@@ -8,7 +8,6 @@ socket and uvicorn's own protocol; `auth.Guard` tells it when a request has come
 from __future__ import annotations
 
 import asyncio
-import socket
 from collections import Counter
 from http import HTTPStatus
 from typing import Any
@@ -57,10 +56,6 @@ class Connection(asyncio.Protocol):
         """Take a connection, or say that there are too many."""
         assert isinstance(transport, asyncio.Transport)  # uvicorn listens for streams alone
         self._transport, places = transport, self._places
-        raw = transport.get_extra_info("socket")
-        if raw is not None and raw.family in (socket.AF_INET, socket.AF_INET6):
-            # Else an answer's second piece waits 40 ms for word that its first has come; asyncio sets it on some sockets.
-            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._address = str((transport.get_extra_info("peername") or ("",))[0])
         self._has_place = places.taken.total() < places.most and places.taken[self._address] < places.of_address
         if not self._has_place:

@@ -27,7 +27,6 @@ log = logging.getLogger("dengine")
 MOST = 2 << 20  # bytes of a call: 40,000 samples, as robots write them
 SMALL = 1 << 16  # bytes of a call that is read at once; more is read in a thread
 TAGS = ("int", "i4", "double", "boolean", "string", "array", "value", "params", "methodName")
-ENCODINGS = ("utf-8", "us-ascii", "iso-8859-1")
 
 NOT_XML, NO_METHOD, WRONG_ARGUMENTS, OURS = -32700, -32601, -32602, -32603  # as XML-RPC servers agreed on
 REFUSED, NO_REPORT = 1, 2  # a trace, or anything else, that breaks the contract; a report that does
@@ -40,18 +39,11 @@ class Values(xmlrpc.client.Unmarshaller):
         super().__init__()
         self.dispatch = {name: xmlrpc.client.Unmarshaller.dispatch[name] for name in TAGS}
 
-    def xml(self, encoding: str | None, standalone: int) -> None:
-        """The document's encoding; a ValueError for a strange one."""
-        if (encoding or "utf-8").lower() not in ENCODINGS:
-            raise ValueError(f"expected one of {', '.join(ENCODINGS)}")
-        self._encoding = ""  # expat gives text
-
 
 def parsed(body: bytes) -> tuple[str, tuple[Any, ...]]:
     """A call's name and arguments; ValueError for what is none."""
     values = Values()
     parser = DefusedExpatParser(values, forbid_dtd=True)
-    parser._parser.XmlDeclHandler = lambda version, encoding, standalone: values.xml(encoding, standalone)
     try:
         parser.feed(body)
         parser.close()

@@ -51,7 +51,7 @@ def arguments(call: str) -> int:
 
 
 def test_every_remote_call_is_there_with_that_many_arguments() -> None:
-    table = RobotCalls.table(object.__new__(RobotCalls))
+    table = RobotCalls(None).table()
     calls = re.findall(r"dengine\.(\w+)\(([^)]*)\)", "\n".join(CODE))
     assert {name for name, _ in calls} == {"begin", "action_recorded", "report", CLOSE}
     for name, given in calls:

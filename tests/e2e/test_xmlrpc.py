@@ -4,7 +4,7 @@ import asyncio
 import http.client
 import xmlrpc.client
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, Policy, Recipe
-from dengine.errors import DataError
+from dengine.errors import BusyError, DataError
 from dengine.serve.robot_calls import SAMPLES, RobotCalls
 from dengine.serve.service import CellService
 from tests.support.serving import held, served
@@ -52,12 +52,10 @@ class Cell:
         return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
 
     def post(self, body: bytes, content: str = "text/xml", method: str = "POST", **headers: str) -> tuple[int, bytes]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
-        connection.request(method, "/RPC2", body, {"Content-Type": content, **headers})
-        answer = connection.getresponse()
-        said = answer.status, answer.read()
-        connection.close()
-        return said
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)) as connection:
+            connection.request(method, "/RPC2", body, {"Content-Type": content, **headers})
+            answer = connection.getresponse()
+            return answer.status, answer.read()
 
     def find(self, id_: str) -> Any:
         return asyncio.run(self.service.find(id_))
@@ -164,14 +162,16 @@ def test_what_was_not_recorded_is_verified_and_no_fault(cell: Cell, stream: Data
     assert robot.report(id_, True) is False  # nothing is known of it, and the robot goes on
 
 
-def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset, monkeypatch) -> None:
-    robot = cell.robot()
-    with monkeypatch.context() as patch, held(cell.service):
-        patch.setattr(cell.service._jobs, "maxsize", 1)
-        cell.service.submit(lambda engine: None)
+def test_a_busy_server_answers_verify_and_keeps_no_report(cell: Cell, stream: Dataset) -> None:
+    robot, waiting = cell.robot(), []
+    with held(cell.service):
+        with suppress(BusyError):
+            while True:
+                waiting.append(cell.service.submit(lambda engine: None))
         answer = robot.decide(stream.X[0].tolist(), "too much")
         assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "busy")
         assert robot.report("order-1", True) is False
+    waiting[-1].result(60)
     assert cell.find("too much") is None
 
 
@@ -208,7 +208,6 @@ NO_CALLS = [
     BOMB + INSIDE % (PARAM % b"&b;"),
     b'<?xml version="1.0"?><!DOCTYPE a SYSTEM "file:///etc/passwd">' + INSIDE % b"",
     b'<?xml version="1.0" encoding="no-such"?>' + INSIDE % b"",
-    "<?xml version='1.0' encoding='utf-16'?>".encode("utf-16") + INSIDE % b"",
     b'<?xml version="1.0" encoding="utf-8"?>' + INSIDE % (PARAM % b"<string>\xff</string>"),
     INSIDE % (PARAM % (b"<int>" + b"9" * 5000 + b"</int>")),
     INSIDE % (PARAM % b"<struct><member><name>a</name><value>1</value></member></struct>"),
