@@ -25,6 +25,7 @@ NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
 SPEED, DEADLINE, PORT = click.FloatRange(0.01, 1000.0), click.FloatRange(0.001, 60.0), click.IntRange(1, 65535)
 DEMO = "Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."
+SECONDS = click.FloatRange(0.0, 3600.0)
 NAMED = "A name by which the server is called, beside its own."
 WAITS = "Seconds that a decision may wait in line; then it is verify, and recorded so."
 RATE = "Requests a second of one client; 0: any."
@@ -41,6 +42,7 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
 @click.option("--allow-host", "allow_hosts", multiple=True, metavar="NAME", help=NAMED)
 @click.option("--deadline", type=DEADLINE, default=0.5, show_default=True, metavar="S", help=WAITS)
+@click.option("--check-seconds", type=SECONDS, default=5.0, show_default=True, help="That a verification takes.")
 @click.option("--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help=RATE)
 @click.option("--largest", type=click.IntRange(1024), default=2**20, show_default=True, help="Bytes of a request's body.")
 @click.option("--connections", type=COUNT, default=100, show_default=True, help="Connections at once.")

@@ -49,22 +49,6 @@ T = TypeVar("T")
 Json = dict[str, Any]
 JSON, RAW, MSGPACK = "application/json", "application/octet-stream", "application/msgpack"
 PROBLEM = "application/problem+json"
-PROBLEMS = {
-    400: "No JSON or MessagePack, or a header that makes no sense.",
-    401: "The token is missing or another.",
-    403: "A web page of another site asks.",
-    404: "There is no such path, decision or version.",
-    405: "The path has no such method.",
-    408: "The request's body did not come in time.",
-    409: "The id is another trace's, the label is against what was reported first, or a part has several decisions.",
-    413: "The request is larger than the server takes.",
-    415: "The body is of a type that is not read here.",
-    421: "The server was called by a name that is not its own.",
-    422: "The body or the query says something that cannot be: what was expected stands in detail.",
-    429: "Too many requests of one client; Retry-After says when.",
-    500: "The server failed; its log says why.",
-    503: "Too many wait, the store is away, or the server is closing; Retry-After says when.",
-}
 LATER = (429, 503)
 RETRY_AFTER = 1  # seconds
 DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
@@ -277,14 +261,11 @@ def _samples(given: bytes | list[Any], channels: int) -> NDArray[Any]:
 # What is answered
 
 
-def _answer(
-    name: str, about: str, *records: type, without: tuple[str, ...] = (), optional: Json | None = None, **more: Any
-) -> type[Struct]:
+def _answer(name: str, about: str, *records: type, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
     """The type of an answer: the fields of records as JSON has them but for some, and more of them."""
     kinds = {key: kind for each in records for key, kind in _members(each).items() if key not in without} | more
-    members: list[Any] = [*kinds.items(), *((key, kind, UNSET) for key, kind in (optional or {}).items())]
     doc = "\n".join([about, *(each.__doc__ or "" for each in records)])
-    return msgspec.defstruct(name, members, namespace={"__doc__": doc}, kw_only=True)
+    return msgspec.defstruct(name, kinds.items(), namespace={"__doc__": doc}, kw_only=True)
 
 
 def _members(record: type) -> Json:
@@ -321,13 +302,13 @@ class Health(Struct):
 class Problem(Struct):
     """Why a request is not served, as RFC 9457 has it. A part that got no decision is verified.
 
-    type : where to read of it.  detail : what was expected, what came, what to do.  action : always verify.
+    detail : what was expected, what came, what to do.  action : always verify.
     """
 
-    type: str
     title: str
     status: int
     detail: str
+    type: str = "about:blank"
     action: Action = Action.VERIFY
 
 
@@ -345,14 +326,13 @@ ARRAYS = (
 )
 Samples = list[list[float | None]]
 HASH, MUCH = ("content_hash",), ("settings", "retrains")  # 64 bits are no JavaScript's; `ever.retrains` counts those
-IN_LINE: Json = {"waiting": int, "late": int, "busy": int, "deadline": float}
+IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float, "check_seconds": float}
 ANSWERS: dict[str, type[Struct]] = {
     "Answer": _answer("Answer", f"A decision, as it is recorded.\n{LATE}", Decision, late=bool, seconds=float),
     "Told": _answer("Told", "The label is on the disk.", Told),
     "Changed": _answer("Changed", "", Changed),
-    "Decision": _answer(
-        "Decision", "A decision with its label.", StoredDecision, without=HASH, optional={"trace": Samples}
-    ),
+    "Decision": _answer("Decision", "A decision with its label.", StoredDecision, without=HASH),
+    "Traced": _answer("Traced", "A decision with its label and trace.", StoredDecision, without=HASH, trace=Samples | None),
     "Explanation": _answer(
         "Explanation",
         ARRAYS,
@@ -364,7 +344,7 @@ ANSWERS: dict[str, type[Struct]] = {
         bads=list[Samples],
         corrections=list[_shape(Correction)],  # type: ignore[misc]  # made above
     ),
-    "Status": _answer("Status", LINE, Status, without=MUCH, **IN_LINE, alarm=str, check_seconds=float),
+    "Status": _answer("Status", LINE, Status, without=MUCH, **IN_LINE, alarm=str),
     "Course": _answer("Course", "", Course),
     "PartMap": _answer("PartMap", "", PartMap),
     "Events": _answer("Events", "Newest first.", events=list[_shape(Event)]),  # type: ignore[misc]
@@ -396,7 +376,7 @@ def problem(status: int, detail: str, headers: Mapping[str, str] | None = None) 
     """The answer of a request that is not served. Whatever is wrong, a part without a decision is verified."""
     said = ({"Retry-After": str(RETRY_AFTER)} if status in LATER else {}) | dict(headers or {})
     line = " ".join(without_password(detail).split())
-    return answered(Problem(f"/docs#problem-{status}", HTTPStatus(status).phrase, status, line), status, said, PROBLEM)
+    return answered(Problem(HTTPStatus(status).phrase, status, line), status, said, PROBLEM)
 
 
 def _refused(request: Request, error: Any) -> Response:
@@ -434,6 +414,9 @@ HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
 # The OpenAPI document
 
 
+PROBLEMATIC = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+
+
 class Operation(NamedTuple):
     """One method on one path.
 
@@ -462,10 +445,9 @@ class Operation(NamedTuple):
         """It, as the document has it."""
         known = self.answer in ANSWERS
         schema = {"$ref": f"#/components/schemas/{self.answer}"} if known else {"type": "string"}
-        wrong = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
         responses = {
             "200": {"description": "Done.", "content": {JSON if known else self.answer: {"schema": schema}}},
-            "default": {"description": "A problem.", "content": wrong},
+            "default": {"description": "A problem.", "content": PROBLEMATIC},
         }
         said: Json = {"summary": " ".join((self.run.__doc__ or "").split()), "parameters": [], "responses": responses}
         if self.takes is None:

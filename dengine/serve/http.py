@@ -6,22 +6,20 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import replace
-from html import escape
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 from zipfile import ZipFile
 
-import msgspec
 import numpy as np
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response, StreamingResponse
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from .. import __version__
@@ -35,33 +33,8 @@ from ..records import Action, is_name
 from ..store.base import Store
 from ..store.records import Key, StoredDecision
 from ..store.views import HistoryFilter
-from . import http, page, xmlrpc
-from .api import (
-    HANDLERS,
-    JSON,
-    PROBLEMS,
-    Correct,
-    DecisionQuery,
-    EventQuery,
-    Forget,
-    Health,
-    Json,
-    ListQuery,
-    Nothing,
-    Operation,
-    PolicyChange,
-    Refusal,
-    Report,
-    Rollback,
-    Signed,
-    StatusQuery,
-    TraceRequest,
-    answer,
-    answered,
-    document,
-    given,
-    read_trace,
-)
+from . import api, page, xmlrpc
+from .api import Json, Operation, Refusal, answer
 from .auth import Access, Guard
 from .metrics import Metrics
 from .robot_calls import Recorder
@@ -77,7 +50,7 @@ CONFLICT = "Expected one decision of that part to report on, there are {}; say w
 
 def routes(service: CellService) -> Sequence[BaseRoute]:
     """What is asked over HTTP."""
-    return [Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations()]
+    return [*(Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations()), page.files()]
 
 
 class HttpApi:
@@ -93,32 +66,32 @@ class HttpApi:
         traces = one, {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
         reports = {"id": "order-7", "success": True}, {"part": "P-1007", "success": False, "author": "Kim"}
         return [
-            Operation("POST", "/decide", self.decide, "Answer", TraceRequest, raw=True, examples=traces),
-            Operation("POST", "/report", self.report, "Told", Report, examples=reports),
-            Operation("POST", "/correct", self.correct, "Changed", Correct),
-            Operation("POST", "/forget", self.forget, "Changed", Forget),
-            Operation("POST", "/rollback", self.rollback, "Changed", Rollback),
-            Operation("POST", "/policy", self.policy, "Changed", PolicyChange),
-            Operation("POST", "/retrain", self.retrain, "Changed", Signed),
-            Operation("POST", "/export", self.export, "application/zip", Signed),
-            Operation("GET", "/status", self.status, "Status", StatusQuery),
-            Operation("GET", "/decisions", self.decisions, "Decisions", ListQuery),
-            Operation("GET", "/decisions/{id:path}", self.decision, "Decision", DecisionQuery),
-            Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation", DecisionQuery),
-            Operation("GET", "/course", self.course, "Course", Nothing),
-            Operation("GET", "/embedding", self.embedding, "PartMap", Nothing),
-            Operation("GET", "/versions", self.versions, "Versions", Nothing),
-            Operation("GET", "/events", self.events, "Events", EventQuery),
+            Operation("POST", "/decide", self.decide, "Answer", api.TraceRequest, raw=True, examples=traces),
+            Operation("POST", "/report", self.report, "Told", api.Report, examples=reports),
+            Operation("POST", "/correct", self.correct, "Changed", api.Correct),
+            Operation("POST", "/forget", self.forget, "Changed", api.Forget),
+            Operation("POST", "/rollback", self.rollback, "Changed", api.Rollback),
+            Operation("POST", "/policy", self.policy, "Changed", api.PolicyChange),
+            Operation("POST", "/retrain", self.retrain, "Changed", api.Signed),
+            Operation("POST", "/export", self.export, "application/zip", api.Signed),
+            Operation("GET", "/status", self.status, "Status", api.StatusQuery),
+            Operation("GET", "/decisions", self.decisions, "Decisions", api.ListQuery),
+            Operation("GET", "/decisions/{id:path}", self.decision, "Traced", api.DecisionQuery),
+            Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation", api.DecisionQuery),
+            Operation("GET", "/course", self.course, "Course", api.Nothing),
+            Operation("GET", "/embedding", self.embedding, "PartMap", api.Nothing),
+            Operation("GET", "/versions", self.versions, "Versions", api.Nothing),
+            Operation("GET", "/events", self.events, "Events", api.EventQuery),
             Operation("GET", "/changes", self.changes, "text/event-stream"),
             Operation("GET", "/metrics", self.metrics, "text/plain"),
             Operation("GET", "/healthz", self.healthz, "Health"),
-            Operation("GET", "/openapi.json", self.openapi, JSON),
+            Operation("GET", "/openapi.json", self.openapi, api.JSON),
             Operation("GET", "/docs", self.docs, "text/html"),
         ]
 
     async def decide(self, request: Request) -> Json:
         """Decide on a trace; asked again under its request id, it answers the same. The query is of a raw body alone."""
-        told = await self.service.decide(*await read_trace(request))
+        told = await self.service.decide(*await api.read_trace(request))
         return answer("Answer", told.decision, late=told.late, seconds=told.seconds)
 
     async def report(self, asked: Any) -> Json:
@@ -146,7 +119,7 @@ class HttpApi:
         """Decide by other settings from the next decision on; with shadow, verify every part, or end that."""
 
         def change(engine: DataEngine, by: str) -> Changed:
-            return engine.set_policy(replace(engine.policy, **given(asked, type(engine.policy))), by)
+            return engine.set_policy(replace(engine.policy, **api.given(asked, type(engine.policy))), by)
 
         return await self._change(asked, change)
 
@@ -184,7 +157,7 @@ class HttpApi:
     async def status(self, asked: Any) -> Json:
         """How the cell is doing."""
         found, service = await self.service.status(asked.last, asked.watch), self.service
-        line = {name: getattr(service, name) for name in ("waiting", "late", "busy", "deadline", "check_seconds")}
+        line = {name: getattr(service, name) for name in api.IN_LINE}
         return answer("Status", found, alarm=found.alarm, **line)
 
     async def decision(self, asked: Any) -> Json:
@@ -192,11 +165,11 @@ class HttpApi:
         known = await self.service.find(asked.id)
         if known is None:
             raise _unknown()
-        return answer("Decision", known, **({"trace": known.trace} if asked.trace else {}))
+        return answer("Traced", known, trace=known.trace if asked.trace else None)
 
     async def decisions(self, asked: Any) -> Json:
         """Decisions, newest first; with open=true those that wait for a label."""
-        where = HistoryFilter(**given(asked, HistoryFilter))
+        where = HistoryFilter(**api.given(asked, HistoryFilter))
         before = _key(asked.before) if asked.before else None
         found = await self.service.look(lambda store: _newest(store, where, asked.limit, before, asked.open))
         older = f"{found[-1].time!r},{found[-1].decision.id}" if len(found) == asked.limit else None
@@ -243,17 +216,17 @@ class HttpApi:
         """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503). It asks for no token."""
         engine, alive = self.service.engine, self.service.silent < HUNG
         state = "down" if not alive else "degraded" if engine.store_fault else "ok"
-        return answered(Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
+        return api.answered(api.Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
 
     async def openapi(self, request: Request) -> Json:
         """The OpenAPI document."""
-        return document(self.operations(), __version__)
+        return api.document(self.operations(), __version__)
 
     async def docs(self, request: Request) -> Response:
         """The same, to read."""
-        return HTMLResponse("".join(_as_page(document(self.operations(), __version__))))
+        return await page.shown(request)
 
-    async def _change(self, asked: Signed, work: Callable[[DataEngine, str], Changed]) -> Json:
+    async def _change(self, asked: api.Signed, work: Callable[[DataEngine, str], Changed]) -> Json:
         """What a change by somebody did."""
         author = _name(asked.author)
         return answer("Changed", await self.service.ask(lambda engine: work(engine, author)))
@@ -305,53 +278,18 @@ def _explained(store: Store, id_: str) -> Json:
     if store.past_decision(id_) is None:
         raise _unknown()
     found, labelled = explain(store, id_), store.labelled(AMONG)
+    trace, band = found.trace, found.envelope
     bads = labelled.traces[labelled.labels == 0][-BADS:]
-    return answer(
-        "Explanation",
-        found,
-        trace=found.trace,
-        **{name: getattr(found.envelope, name, None) for name in ("low", "median", "high")},
-        bads=bads if bads.shape[1:] == found.trace.shape else np.zeros((0, 0, 0)),
-        corrections=[each for each in store.corrections() if each.decision_id == id_],
-    )
-
-
-def _as_page(document: Json) -> Iterable[str]:
-    """The document, as HTML to read."""
-
-    def listed(items: Mapping[str, Json]) -> str:
-        told = (f"<dt><code>{escape(name)}</code></dt><dd>{_told(each)}</dd>" for name, each in items.items())
-        return f"<dl>{''.join(told)}</dl>"
-
-    def _told(schema: Json) -> str:
-        return escape(schema.get("description", ""))
-
-    title = f"{document['info']['title']} {document['info']['version']}"
-    yield f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
-    yield '<meta name="viewport" content="width=device-width"><link rel="stylesheet" href="page/static/page.css">'
-    yield f'<main class="docs"><h1>{title}</h1><p>The same for machines: <a href="openapi.json">openapi.json</a>.</p>'
-    for path, methods in document["paths"].items():
-        for method, said in methods.items():
-            yield f"<h2><code>{method.upper()} {path}</code></h2><p>{escape(said['summary'])}</p>"
-            yield listed({each["name"]: each["schema"] for each in said["parameters"]})
-            for kind, content in said.get("requestBody", {}).get("content", {}).items():
-                of = content["schema"].get("$ref", "").rpartition("/")[2]
-                yield f"<p>Takes <code>{kind}</code>{f': <a href=#{of}>{of}</a>' if of else ''}.</p>"
-                for example in content.get("examples", {}).values():
-                    yield f"<pre>{escape(msgspec.json.encode(example['value']).decode())}</pre>"
-            for kind, content in said["responses"]["200"]["content"].items():
-                of = content["schema"].get("$ref", "").rpartition("/")[2]
-                yield f"<p>Answers {f'<a href=#{of}>{of}</a>' if of else f'<code>{kind}</code>'}.</p>"
-    yield "<h2>Objects</h2>"
-    for name, schema in document["components"]["schemas"].items():
-        yield f'<h3 id="{name}">{name}</h3><p>{_told(schema)}</p>{listed(schema.get("properties", {}))}'
-    yield "<h2>Problems</h2>"
-    for status, about in PROBLEMS.items():
-        yield f'<h3 id="problem-{status}">{status}</h3><p>{escape(about)}</p>'
+    bads = bads if bads.shape[1:] == trace.shape else np.zeros((0, *trace.shape))
+    digits = 4 - int(np.log10(np.ptp(np.nan_to_num(trace, posinf=0.0, neginf=0.0)) or 1.0))  # what lies around is a picture
+    around = {name: getattr(band, name, None) for name in ("low", "median", "high")} | {"bads": bads}
+    drawn = {name: None if each is None else np.round(each.astype(np.float64), digits) for name, each in around.items()}
+    corrections = [each for each in store.corrections() if each.decision_id == id_]
+    return answer("Explanation", found, trace=trace, corrections=corrections, **drawn)
 
 
 INTERFACES: Mapping[str, Callable[[CellService, Recorder | None], Sequence[BaseRoute]]] = {
-    "http": lambda service, recorder: http.routes(service),
+    "http": lambda service, recorder: routes(service),
     "xmlrpc": xmlrpc.routes,
     "page": lambda service, recorder: page.routes(),
 }
@@ -375,7 +313,7 @@ def create_app(
     """
     if unknown := [name for name in interfaces if name not in INTERFACES]:
         raise SettingError(f"Expected interfaces among {', '.join(INTERFACES)}, got {shortened(unknown[0])}.")
-    routes = [route for name in interfaces for route in INTERFACES[name](service, recorder)]
+    every = [route for name in interfaces for route in INTERFACES[name](service, recorder)]
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -389,6 +327,6 @@ def create_app(
             yield
 
     guard = Middleware(Guard, access=access or Access())
-    app = Starlette(routes=routes, middleware=[guard], exception_handlers=HANDLERS, lifespan=lifespan)
+    app = Starlette(routes=every, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan)
     app.router.redirect_slashes = False  # a robot does not follow; and where to, a request's Host would say
     return app

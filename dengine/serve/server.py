@@ -79,6 +79,7 @@ class Serving:
     allow_hosts : names by which the server is called, beside localhost.
     opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
     opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
+    check_seconds : that a verification takes, for the time that was saved.
     recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
     """
 
@@ -92,6 +93,7 @@ class Serving:
     largest: int = Access().largest
     rate: float = Access().rate
     connections: int = 100
+    check_seconds: float = 5.0
     interfaces: Sequence[str] = tuple(INTERFACES)
     beside: Sequence[Beside] = ()
     opcua: int | None = None
@@ -126,7 +128,7 @@ def serve(
         RetrainingProcess() as executor,
         serving.recorder() if serving.recorder else nullcontext() as recorder,
     ):
-        service = CellService(lambda: make(executor), store, serving.deadline)
+        service = CellService(lambda: make(executor), store, serving.deadline, check_seconds=serving.check_seconds)
         service.observers.append(tell)
         try:
             beside = list(serving.beside)

@@ -41,10 +41,7 @@ IDLE = 0.05  # seconds between two looks at what the engine has to do while nobo
 
 
 class Job(NamedTuple):
-    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more.
-
-    looks : it changes nothing, so that nobody is told of a change.
-    """
+    """Work for the engine's thread: called with the engine, and with whether nobody waits for the answer any more."""
 
     future: Future[Any]
     work: Callable[[DataEngine, bool], Any]
@@ -167,29 +164,29 @@ class CellService:
 
     async def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace and label; None for an unknown id."""
-        return await self._look(lambda engine: engine.find(decision_id))
+        return await self.ask(lambda engine: engine.find(decision_id), looks=True)
 
-    async def ask(self, work: Callable[[DataEngine], T]) -> T:
-        """Do something in the engine's thread, between two decisions; what it raises is raised here."""
-        return await asyncio.wrap_future(self.submit(work))
+    async def ask(self, work: Callable[[DataEngine], T], looks: bool = False) -> T:
+        """Do something in the engine's thread, between two decisions; what it raises is raised here.
 
-    def submit(self, work: Callable[[DataEngine], T]) -> Future[T]:
+        looks : it changes nothing, so that nobody who listens to `changes` is told.
+        """
+        return await asyncio.wrap_future(self.submit(work, looks))
+
+    def submit(self, work: Callable[[DataEngine], T], looks: bool = False) -> Future[T]:
         """As `ask`, from any thread and without waiting."""
-        return self._put(lambda engine, late: work(engine))
+        return self._put(lambda engine, late: work(engine), looks)
 
     async def read(self, work: Callable[[Store], T]) -> T:
         """Read the store as the disk has it, in a thread of its own; in the engine's where it remembers in memory."""
         if self.reading is self.engine.store:
-            return await self._look(lambda engine: work(engine.store))
+            return await self.ask(lambda engine: work(engine.store), looks=True)
         return await asyncio.to_thread(work, self.reading)
 
     async def look(self, work: Callable[[Store], T]) -> T:
         """Read a store that holds all that was decided so far."""
-        await self._look(lambda engine: engine.flush())
+        await self.ask(lambda engine: engine.flush(), looks=True)
         return await self.read(work)
-
-    async def _look(self, work: Callable[[DataEngine], T]) -> T:
-        return await asyncio.wrap_future(self._put(lambda engine, late: work(engine), looks=True))
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """How the cell is doing, as `history.status`: by its store, and by what the running engine alone knows."""

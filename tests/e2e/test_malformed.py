@@ -155,32 +155,6 @@ def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so
             assert "damaged" in [event.kind for event in engine.store.events()]
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"\0" * 50, b"FZ_0,FZ_1,label\n\0,\0,\0\n", b"FZ_0,FZ_1,label\n1,\xe9,OK\n", b'"' * 99, b"," * 99, b"\n\n"),
-        *(b"FZ_0,FZ_1,label\n" + field + b",2,OK\n" for field in (b"1" * 200_000, b'"' + b"x" * 200_000 + b'"')),
-    ],
-    ids=lambda content: repr(content[:20]),
-)
-@pytest.mark.parametrize("form", ["table", "folder", "labels"])
-def test_a_table_of_nonsense_is_a_data_error(tmp_path: Path, content: bytes, form: str) -> None:
-    (tmp_path / "data").mkdir()
-    if form == "labels":
-        (tmp_path / "data" / "1.csv").write_text("FZ_Base\n1.0\n2.0\n")
-        (tmp_path / "labels.csv").write_bytes(content)
-        how = {"labels": tmp_path / "labels.csv"}
-    else:
-        (tmp_path / "data" / "1_OK.csv").write_bytes(content)
-        how = {}
-    source = tmp_path / "data" / "1_OK.csv" if form == "table" else tmp_path / "data"
-    try:
-        data = load_dataset(source, **how)
-    except DataError:
-        return
-    assert not np.isfinite(data.X).all()  # an infinity, which the engine finds
-
-
 SETTINGS_OF_STORES = {
     "recipe": ["x = [", "radius = 'x'", "\ud7ff", "a" * 10**5],
     "seed": ["", "x", "-1", "9" * 5000, str(2**32)],

@@ -346,6 +346,9 @@ def test_the_history_is_searched_gone_through_and_taken_along(
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(16, 21, 26)"
         opened(page, demo, "part?id=nobody")
         expect(page.locator("h1")).to_have_text("That cannot be shown")
+        page.get_by_role("link", name="for programs").click()  # the document of the API, to read
+        for text in ("POST /decide", "GET /explanations/{id}", "PolicyChange"):
+            expect(page.locator("main").get_by_text(text, exact=True).first).to_be_visible()
 
 
 def stopped_until_safe(service: CellService, data: Dataset) -> str:

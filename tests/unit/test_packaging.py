@@ -62,7 +62,7 @@ def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, re
     assert {name.split("/")[0] for name in names} == {"dengine", f"dengine-{dengine.__version__}.dist-info"}
     modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
     assert modules <= names
-    assert {"dengine/py.typed", "dengine/data/insertion.npz"} <= names
+    assert {"dengine/py.typed", "dengine/data/insertion.npz", "dengine/serve/page/static/uplot.LICENSE"} <= names
     sources = {p.relative_to(repo).as_posix() for p in (repo / "dengine" / "export" / "cpp").rglob("*") if p.is_file()}
     assert len(sources) > 10
     assert sources <= names

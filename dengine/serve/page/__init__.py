@@ -18,10 +18,16 @@ HEADERS = {  # stricter than what `Guard` gives every answer; the rest is its
 
 
 async def shown(request: Request) -> Response:
-    """The page, whichever view of it."""
-    return FileResponse(STATIC / "index.html", headers=HEADERS)
+    """The page, whichever view of it; at /docs the document of the API, to read."""
+    name = "docs.html" if request.url.path.endswith("/docs") else "index.html"
+    return FileResponse(STATIC / name, headers=HEADERS)
+
+
+def files() -> BaseRoute:
+    """What the page and the document of the API are made of."""
+    return Mount("/page/static", StaticFiles(directory=STATIC))
 
 
 def routes() -> Sequence[BaseRoute]:
-    """The page's addresses and its files."""
-    return [*(Route(path, shown) for path in VIEWS), Mount("/page/static", StaticFiles(directory=STATIC))]
+    """The page's addresses."""
+    return [Route(path, shown) for path in VIEWS]

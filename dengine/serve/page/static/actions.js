@@ -38,7 +38,7 @@ function body() {
     const value = at(`confirm-${name}`).value.trim();
     if (value !== "") said[name] = type === "number" || name === "version" ? Number(value) : value;
   }
-  return asked.asked ? asked.asked(said) : said;
+  return said;
 }
 
 async function submit(event) {

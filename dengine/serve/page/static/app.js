@@ -15,7 +15,8 @@ const at = (id) => document.getElementById(id);
 const main = at("main");
 const view = location.pathname.split("/").pop();
 const written = new Map(); // each part of the view as it was put in: one that is still the same stays, and so does the focus in it
-let waiting = null;
+let timer = null;
+let due = Infinity; // when the next look is
 let looking = null;
 let notBefore = 0;
 let spoke = 0;
@@ -31,8 +32,11 @@ function lineIs(state, heard) {
 }
 
 function look(wait = 0) {
-  if (waiting !== null || document.hidden) return;
-  waiting = setTimeout(() => { waiting = null; refresh(); }, Math.max(wait, notBefore - Date.now(), 0));
+  const wanted = Math.max(Date.now() + wait, notBefore);
+  if (document.hidden || wanted >= due) return;
+  clearTimeout(timer);
+  due = wanted;
+  timer = setTimeout(() => { due = Infinity; refresh(); }, wanted - Date.now());
 }
 
 async function refresh() {

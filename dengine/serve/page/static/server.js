@@ -4,6 +4,7 @@ const REST = 10; // an answer that took a second is not asked for anew for so ma
 const LONGEST = 30000; // ms of such a rest at most
 const SILENCE = 12000; // ms without a word, after which the line counts as cut: the server says something every 5 s
 const kept = new Map(); // by address: an answer, and until when it rests
+let done = 0; // requests that changed something: what was asked before is old then
 
 export class Problem extends Error {
   constructor(status, detail) {
@@ -22,19 +23,21 @@ export async function get(path, rests = []) {
   // The answer to a question; an address whose answer is taken again says in `rests` when it may be asked anew.
   const was = kept.get(path);
   const begin = Date.now();
+  const before = done;
   if (was && begin < was.until) {
     rests.push(was.until);
     return was.said;
   }
   const said = await (await checked(await fetch(path, { headers: { accept: "application/json" } }))).json();
   if (kept.size > 64) kept.clear();
-  kept.set(path, { said, until: Date.now() + Math.min(LONGEST, REST * (Date.now() - begin)) });
+  if (before === done) kept.set(path, { said, until: Date.now() + Math.min(LONGEST, REST * (Date.now() - begin)) });
   return said;
 }
 
 export async function post(path, body) {
   const answer = await checked(await fetch(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(body) }));
   kept.clear();
+  done += 1;
   return answer;
 }
 
