@@ -28,7 +28,7 @@ import math
 from bisect import bisect_left
 from dataclasses import dataclass, replace
 
-from ..errors import SettingError, percent
+from ..errors import expect, percent
 
 ENDLESS = 10**8  # more audits than that are none
 
@@ -61,10 +61,8 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     Returns the largest theta that the evidence does not refute, sup{theta: log_evidence < log(1 / alpha)}, by bisection;
     never less than n_bad / (n propensity). 1 where nothing is known.
     """
-    if not 0.0 < alpha < 1.0:
-        raise SettingError(f"Expected 0 < alpha < 1, got {alpha!r}; 0.05 asks for 95 % confidence.")
-    if not 0.0 <= propensity <= 1.0:
-        raise SettingError(f"Expected 0 <= propensity <= 1, got {propensity!r}; 0.02 looks at one part in fifty.")
+    expect(0.0 < alpha < 1.0, "0 < alpha < 1", alpha, "0.05 asks for 95 % confidence")
+    expect(0.0 <= propensity <= 1.0, "0 <= propensity <= 1", propensity, "0.02 looks at one part in fifty")
     if not 0 <= n_bad <= n:
         raise ValueError(f"Expected 0 <= n_bad <= n, got n_bad = {n_bad} of n = {n}; count each part once.")
     enough = math.log(1.0 / alpha)
@@ -129,8 +127,7 @@ class Bounded:
 
         Where nobody looks it counts from now on, as if one part in fifty were audited.
         """
-        if not 0.0 < target < 1.0:
-            raise SettingError(f"Expected 0 < target < 1, got {target!r}; 0.05 asks for at most 5 % bad.")
+        expect(0.0 < target < 1.0, "0 < target < 1", target, "0.05 asks for at most 5 % bad")
         n, propensity = (self.n, self.propensity) if self.propensity > 0.0 else (0, 0.02)
 
         def reached(more: int) -> bool:
@@ -218,10 +215,8 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
     "all". Where both are possible they share alpha: whoever sees now the one and now the other is wrong with probability
     alpha at most. Rejected parts are known by audits alone. A label that was forgotten counts as a wrong decision.
     """
-    if stops not in ("all", "some"):
-        raise SettingError(f"Expected stops among all, some, got {stops!r}.")
-    if not 0.0 < tolerance < 1.0:
-        raise SettingError(f"Expected 0 < tolerance < 1, got {tolerance!r}; 0.05 tolerates 5 % of errors.")
+    expect(stops in ("all", "some"), "stops among all, some", stops)
+    expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")
     o = replace(
         outcomes,
         stops=outcomes.stops + outcomes.forgotten_accepts,

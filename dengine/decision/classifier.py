@@ -51,7 +51,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
         """Forget everything, then hold embeddings Z (n, d) with labels y (n,) of at most two classes."""
         Z, y = validate_data(self, Z, y)
-        self.classes_ = _classes(y)
+        self.classes_ = classes_of(y)
         self._start(np.asarray(Z).shape[1])
         return self._add(Z, y)
 
@@ -60,7 +60,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         first = "index_" not in vars(self)
         Z, y = validate_data(self, Z, y, reset=first)
         if first:
-            self.classes_ = _classes(y if classes is None else classes)
+            self.classes_ = classes_of(y if classes is None else classes)
             self._start(np.asarray(Z).shape[1])
         unknown = np.setdiff1d(np.asarray(y), self.classes_)
         if len(unknown):
@@ -127,7 +127,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return tags
 
 
-def _classes(y: ArrayLike) -> NDArray[Any]:
+def classes_of(y: ArrayLike) -> NDArray[Any]:
     """The classes among labels, two at most; ValueError in scikit-learn's words for more, and for continuous labels."""
     check_classification_targets(y)
     classes = np.unique(np.asarray(y))

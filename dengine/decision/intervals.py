@@ -65,13 +65,7 @@ def clopper_pearson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: 
 
     Arguments and result as `wilson_interval`. Source: Clopper and Pearson (1934), Biometrika 26(4).
     """
-    from scipy.special import betaincinv
-
-    normal_quantile(alpha)  # one place checks alpha
-    n_s, n_f, k = _counts(n_success, n_failure)
-    lower = np.where(n_s > 0, betaincinv(np.maximum(n_s, 1.0), n_f + 1.0, alpha / 2.0), 0.0)
-    upper = np.where(n_f > 0, betaincinv(n_s + 1.0, np.maximum(n_f, 1.0), 1.0 - alpha / 2.0), 1.0)
-    return _tidy(lower, upper, n_s, k)
+    return _beta_interval(n_success, n_failure, alpha, 0.0, 1.0)
 
 
 def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
@@ -79,13 +73,7 @@ def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float =
 
     Arguments and result as `wilson_interval`. Source: Brown, Cai and DasGupta (2001), Statistical Science 16(2), 4.1.1.
     """
-    from scipy.special import betaincinv
-
-    normal_quantile(alpha)
-    n_s, n_f, k = _counts(n_success, n_failure)
-    lower = np.where(n_s > 0, betaincinv(n_s + 0.5, n_f + 0.5, alpha / 2.0), 0.0)
-    upper = np.where(n_f > 0, betaincinv(n_s + 0.5, n_f + 0.5, 1.0 - alpha / 2.0), 1.0)
-    return _tidy(lower, upper, n_s, k)
+    return _beta_interval(n_success, n_failure, alpha, 0.5, 0.5)
 
 
 INTERVALS: dict[str, Interval] = {
@@ -94,6 +82,17 @@ INTERVALS: dict[str, Interval] = {
     "clopper_pearson": clopper_pearson_interval,
     "jeffreys": jeffreys_interval,
 }
+
+
+def _beta_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float, own: float, other: float) -> Bounds:
+    """Quantiles of a Beta distribution; own, other : what is added to the counts of its side and of the other one."""
+    from scipy.special import betaincinv
+
+    normal_quantile(alpha)  # one place checks alpha
+    n_s, n_f, k = _counts(n_success, n_failure)
+    lower = np.where(n_s > 0, betaincinv(np.maximum(n_s + own, 0.5), n_f + other, alpha / 2.0), 0.0)
+    upper = np.where(n_f > 0, betaincinv(n_s + other, np.maximum(n_f + own, 0.5), 1.0 - alpha / 2.0), 1.0)
+    return _tidy(lower, upper, n_s, k)
 
 
 def _counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:

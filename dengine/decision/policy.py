@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import SettingError, shortened
+from ..errors import SettingError, expect
 from ..records import ACTIONS, Action, find_class, is_number
 from .certificate import Certificate, Outcomes, certify
 from .intervals import INTERVALS, Bounds, normal_quantile
@@ -50,24 +50,17 @@ class Policy:
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
-            if not is_number(getattr(self, name)):
-                raise SettingError(f"Expected a number as {name}, got {shortened(getattr(self, name))}.")
-        if not isinstance(self.guarantee, str):
-            raise SettingError(f"Expected a guarantee's name, or module:Class as text, got {shortened(self.guarantee)}.")
+            expect(is_number(getattr(self, name)), f"a number as {name}", getattr(self, name))
+        expect(isinstance(self.guarantee, str), "a guarantee's name, or module:Class as text", self.guarantee)
         normal_quantile(self.alpha)
-        if not 0.5 < self.lower_bound < 1.0:
-            raise SettingError(f"Expected 0.5 < lower_bound < 1, got {self.lower_bound!r}; 0.95 tolerates 5 % of errors.")
-        if not isinstance(self.interval, str) or self.interval not in INTERVALS:
-            raise SettingError(f"Expected an interval among {', '.join(INTERVALS)}, got {shortened(self.interval)}.")
-        if not 0.0 <= self.audit_rate <= 1.0:
-            raise SettingError(f"Expected 0 <= audit_rate <= 1, got {self.audit_rate!r}; 0.02 checks one part in fifty.")
-        if ":" not in self.guarantee and self.guarantee not in RULES:
-            known = ", ".join(RULES)
-            raise SettingError(f"Expected a guarantee among {known}, or module:Class, got {shortened(self.guarantee)}.")
-        if self.stops not in get_args(Stops):
-            raise SettingError(f"Expected stops {' or '.join(get_args(Stops))}, got {shortened(self.stops)}.")
-        if not isinstance(self.shadow, bool):
-            raise SettingError(f"Expected shadow to be True or False, got {shortened(self.shadow)}.")
+        expect(0.5 < self.lower_bound < 1.0, "0.5 < lower_bound < 1", self.lower_bound, "0.95 tolerates 5 % of errors")
+        known = isinstance(self.interval, str) and self.interval in INTERVALS
+        expect(known, f"an interval among {', '.join(INTERVALS)}", self.interval)
+        expect(0.0 <= self.audit_rate <= 1.0, "0 <= audit_rate <= 1", self.audit_rate, "0.02 checks one part in fifty")
+        known = ":" in self.guarantee or self.guarantee in RULES
+        expect(known, f"a guarantee among {', '.join(RULES)}, or module:Class", self.guarantee)
+        expect(self.stops in get_args(Stops), f"stops {' or '.join(get_args(Stops))}", self.stops)
+        expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
 
     @property
     def audited_share(self) -> float:
@@ -124,11 +117,10 @@ class Neighbourhood:
     reject_fraction: float | None = None
 
     def __post_init__(self) -> None:
-        if not (is_number(self.radius) and 0.0 < self.radius < math.inf):
-            raise SettingError(f"Expected a finite radius > 0, got {shortened(self.radius)}.")
+        expect(is_number(self.radius) and 0.0 < self.radius < math.inf, "a finite radius > 0", self.radius)
         for name in ("fraction", "reject_fraction"):
             value = getattr(self, name)
-            if value is not None and not (is_number(value) and 0.0 < value <= 1.0):
-                raise SettingError(f"Expected {name} in (0, 1] or None for the fixed radius, got {shortened(value)}.")
+            held = value is None or (is_number(value) and 0.0 < value <= 1.0)
+            expect(held, f"{name} in (0, 1] or None for the fixed radius", value)
         if self.reject_fraction is not None and self.fraction is None:
             raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")

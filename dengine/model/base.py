@@ -181,7 +181,7 @@ class EngineModel(ABC):
 
     def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
         """`look_ahead`, or nothing where it fails."""
-        _guarded(lambda: self.look_ahead(X), None, "traces could not be looked at ahead of a retrain")
+        _guarded(lambda: self.look_ahead(X), "traces could not be looked at ahead of a retrain")
 
     def tell_safely(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
@@ -193,27 +193,27 @@ class EngineModel(ABC):
 
     def prepare_safely(self, previous: EngineModel) -> None:
         """`prepare`; one that fails at it will verify, and say so, on every part."""
-        _guarded(lambda: self.prepare(previous), None, "the model that was trained cannot be made to answer")
+        _guarded(lambda: self.prepare(previous), "the model that was trained cannot be made to answer")
 
     def place_safely(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats | None:
         """`reference_point`, or None where it fails."""
         failed = "the model cannot place a labelled trace; the next version learns it from the store"
-        return _guarded(lambda: self.reference_point(x, hash_, embedding), None, failed)
+        return _guarded(lambda: self.reference_point(x, hash_, embedding), failed)
 
     def add_safely(self, point: Floats | None, y: int, hash_: int, number: int) -> None:
         """`add_reference`, where there is a point; nothing where it fails."""
         if point is not None:
             failed = "the model cannot take a labelled trace; the next version learns it from the store"
-            _guarded(lambda: self.add_reference(point, y, hash_, number), None, failed)
+            _guarded(lambda: self.add_reference(point, y, hash_, number), failed)
 
 
-def _guarded(call: Callable[[], T], otherwise: T, failed: str) -> T:
-    """What the call returns; `otherwise`, logged, where it raises."""
+def _guarded(call: Callable[[], T], failed: str) -> T | None:
+    """What the call returns; None, logged, where it raises."""
     try:
         return call()
     except Exception:
         log.exception(failed)
-        return otherwise
+        return None
 
 
 def as_engine_model(model: Model) -> EngineModel:

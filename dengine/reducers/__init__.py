@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 import numpy as np
 
-from ..errors import SettingError, shortened
+from ..errors import SettingError, expect, shortened
 from ..recipe import Recipe
 from ..records import find_class, is_number, is_whole
 
@@ -74,8 +74,7 @@ def _must_be_like(default: Any, key: str, value: Any) -> None:
         int: is_whole(value, 2 if key == "folds" else -MOST, 1000 if key == "folds" else MOST),
         float: is_number(value) and value == value,  # no NaN
     }
-    if what is not None and not fits[type(default)]:
-        raise SettingError(f"Expected {what} as the reducer's {key}, as {default!r}, got {shortened(value)}.")
+    expect(what is None or fits[type(default)], f"{what} as the reducer's {key}, as {default!r}", value)
 
 
 def reducer_of(recipe: Recipe, seed: int) -> Any:

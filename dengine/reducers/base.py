@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassNamePrefixFeaturesOutMixin, TransformerMixin, clone
 from sklearn.utils import ClassifierTags, get_tags
-from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import assert_all_finite, check_array, check_is_fitted, column_or_1d, validate_data
 
-from ..errors import SettingError, TraceError
+from ..decision.classifier import classes_of
+from ..errors import SettingError, TraceError, expect
 from ..folds import content_fold
 
 if TYPE_CHECKING:
@@ -208,18 +208,12 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     try:
         labels = column_or_1d(y, warn=True)
         assert_all_finite(labels, input_name="y")
-        check_classification_targets(labels)
+        classes = classes_of(labels)
     except ValueError as error:  # scikit-learn's words for one that is continuous, not finite or not one column
         raise SettingError(str(error)) from error
     labels = np.asarray(labels)
     if len(labels) != n:
         raise SettingError(f"Expected a label for each of {n} traces, got inconsistent numbers of samples: {len(labels)}.")
-    classes = np.unique(labels)
-    if len(classes) > 2:
-        raise SettingError(
-            "Only binary classification is supported. The type of the target is multiclass: expected two classes, "
-            f"1 = success and 0 = failure, got {len(classes)}."
-        )
     if np.isin(classes, (0, 1)).all():
         return labels.astype(np.int64)
     return np.asarray(labels == classes[-1], dtype=np.int64)
@@ -329,8 +323,7 @@ class CrossFitted(_Wrapping):
 
         folds : (n,) of the traces; None: by their content.
         """
-        if self.folds < 2:
-            raise SettingError(f"Expected folds >= 2 for a reducer that uses labels, got {self.folds}.")
+        expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self.reducer).__name__)
         folds = content_fold(traces, self.folds) if folds is None else folds

@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..errors import SettingError
+from ..errors import expect
 from .base import Floats
 from .features import TAPS, FeatureReducer, Features, dilations_of, rocket_kernels
 
@@ -140,8 +140,7 @@ class ConvReducer(FeatureReducer):
         self.random_state = random_state
 
     def make_features(self, channels: int, samples: int) -> ConvEncoder:
-        if self.regions > 16:
-            raise SettingError(f"Expected regions <= 16, got {self.regions!r}.")
+        expect(self.regions <= 16, "regions <= 16", self.regions)
         return ConvEncoder(channels, samples, self.average_, self.kernels, self.dilations, self.regions)
 
     def _start(self, traces: Floats) -> None:
@@ -159,8 +158,6 @@ class ConvReducer(FeatureReducer):
 def averaging(traces: Tensor) -> int:
     """Samples of traces (n, C, T) to average: so many that 200 are left and a share 0.8 of the variance, or fewer."""
     samples = traces.size(2)
-    if samples < 400:
-        return 1
     centred = traces.double() - traces.double().mean((0, 2), keepdim=True)
     whole = centred.square().mean((0, 2))
     for average in range(samples // 200, 1, -1):

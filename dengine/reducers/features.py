@@ -21,8 +21,9 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..errors import SettingError
+from ..errors import SettingError, expect
 from ..folds import content_fold
+from ..records import is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, part, seed_of
 
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
@@ -32,6 +33,7 @@ FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, 
 TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
 GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
 VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
+MOST = 10**9  # of a parameter that is a whole number
 CHUNK = 64  # traces embedded at a time: what they need stays in the cache
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 
@@ -234,8 +236,7 @@ class FeatureReducer(Reducer):
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
-        if len(X) < MIN_TRACES:
-            raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
+        expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
         f = self._fit_heads(self._begun(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
         with torch.inference_mode():
             return own_places(self.net_.places(f).numpy(), folds)
@@ -272,8 +273,8 @@ class FeatureReducer(Reducer):
     def _fit_heads(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule | None) -> Tensor:
         """Train head k on rows outside fold k, from the present weights; returns the features (n, P)."""
         folds = np.asarray(folds, dtype=np.int64)
-        if folds.shape != labels.shape or folds.min() < 0 or folds.max() >= self.folds:
-            raise SettingError(f"Expected {len(labels)} folds from 0 to {self.folds - 1}, got {folds!r}.")
+        fit = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
+        expect(fit, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         with torch.no_grad():
             raw = self.raw_features(traces)
             least = 0
@@ -376,15 +377,10 @@ class FeatureReducer(Reducer):
         """Raise SettingError for a parameter out of its range."""
         for name in ("n_components", "folds", "max_iter", *self.sizes):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < 1:
-                raise SettingError(f"Expected {name} >= 1, an integer, got {value!r}.")
-        for fits, expected, value in (
-            (self.n_components <= 2, "n_components 1 or 2", self.n_components),
-            (self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2),
-            (self.folds >= 2, "folds >= 2 where labels are used", self.folds),
-        ):
-            if not fits:
-                raise SettingError(f"Expected {expected}, got {value!r}.")
+            expect(is_whole(value, 1, MOST), f"{name} >= 1, an integer", value)
+        expect(self.n_components <= 2, "n_components 1 or 2", self.n_components)
+        expect(self.l2 > 0, "l2 > 0, or separable labels have no solution", self.l2)
+        expect(self.folds >= 2, "folds >= 2 where labels are used", self.folds)
 
 
 def in_chunks(f: Any, x: Tensor) -> Tensor:
