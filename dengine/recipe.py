@@ -112,7 +112,7 @@ class Recipe:
         text = _text_of(Path(recipe))
         if text is not None:
             return cls.from_toml(text, where=str(recipe))
-        if OWN.fullmatch(str(recipe)):
+        if OWN.fullmatch(str(recipe)) or BARE.fullmatch(str(recipe)):  # of a name `REDUCERS` says whether there is one
             return cls(str(recipe))
         raise SettingError(
             f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; "

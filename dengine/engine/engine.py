@@ -335,7 +335,7 @@ class DataEngine:
             self._versions.collect()
             known = self._outbox.find(id_) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
-            return None if known.quarantined else self._versions.work(self.recipe.retrain_every)
+            return None if known.quarantined else self._versions.work(self.recipe)
 
     def _lost_stop(self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any) -> StoredDecision:
         if trace is None or success:
@@ -391,7 +391,7 @@ class DataEngine:
         """
         with self._alone():
             self._versions.collect(to_the_end=not brief)
-            self._versions.work(self.recipe.retrain_every)
+            self._versions.work(self.recipe)
             return self._versions.take_news()
 
     def close(self) -> None:

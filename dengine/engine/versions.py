@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from ..decision.policy import Policy
 from ..errors import StoreError
 from ..model.base import EngineModel
+from ..recipe import Recipe
 from ..records import Reason, RetrainReport
 from ..reducers.base import State
 from ..store.base import Store
@@ -294,18 +295,15 @@ class ModelVersions:
         assert self._news is not None  # nothing came in between; for the type checker
         return self._news
 
-    def work(self, retrain_every: int) -> RetrainReport | None:
-        """Do what is due between two cycles: a retrain, where the store is there."""
-        if self.count.due(retrain_every) and self._ready():
-            return self.start_retrain()
-        return None
-
-    def _ready(self) -> bool:
+    def work(self, recipe: Recipe) -> RetrainReport | None:
+        """Do what is due between two cycles by a recipe: a retrain, where the store is there."""
+        if not self.count.due(recipe.retrain_every):
+            return None
         try:
             self.store_waiting()
         except StoreError:  # told by the outbox; the labels wait in its journal
-            return False
-        return not self.outbox.fault
+            return None
+        return None if self.outbox.fault else self.start_retrain()
 
     @property
     def swapping(self) -> bool:

@@ -43,7 +43,7 @@ def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_s
     stream: Dataset, tmp_path: Path, stored: bool
 ) -> None:
     with DataEngine(recipe=RECIPE, store=tmp_path / "engine.db" if stored else None) as engine:
-        first = engine.decide(stream.X[0], part="P1", decision_id="order-7")
+        first = engine.decide(stream.X[0], part="P1", decision_id="order-7", wait=True)
         assert first.id == "order-7"
         assert first.action is Action.VERIFY
         drive(engine, stream, 1, 200)

@@ -10,6 +10,7 @@ from threading import Event
 
 import numpy as np
 import pytest
+from sklearn.decomposition import PCA
 
 from dengine import (
     Action,
@@ -85,6 +86,24 @@ def test_a_stop_is_a_failure_that_votes_on_what_is_alike(trained: DataEngine, da
     assert trained.store.get_decision(decision.id).source is Source.STOP
     alike = trained.decide(good(data) + np.float32(1e-3))
     assert (alike.n_success, alike.n_failure) == (decision.n_success, decision.n_failure + 1)
+
+
+class Looking(PCA):
+    """Counts how often it is asked."""
+
+    times = 0
+
+    def transform(self, X):
+        Looking.times += 1
+        return super().transform(X)
+
+
+def test_a_report_does_not_embed_again_what_its_version_decided_on(data: Dataset) -> None:
+    engine = DataEngine(Looking(2), RECIPE.policy, retrain_every=40)
+    play(engine, data, 0, 60, confirm=True)
+    decision, asked = engine.decide(data.X[60]), Looking.times
+    engine.report(decision.id, bool(data.y[60]))
+    assert (Looking.times, len(engine.model.index)) == (asked, 61)
 
 
 def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, data: Dataset) -> None:
