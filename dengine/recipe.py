@@ -25,6 +25,7 @@ from .errors import SettingError, expect, listed
 from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
+NAMED = ("conv", "umap", "pca", "rocket")  # reducers: the modules of `reducers` that hold one, PcaReducer for "pca"
 OWN = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE = re.compile(r"[A-Za-z0-9_-]+")  # a name that TOML takes without quotes
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
@@ -112,7 +113,7 @@ class Recipe:
         text = _text_of(Path(recipe))
         if text is not None:
             return cls.from_toml(text, where=str(recipe))
-        if OWN.fullmatch(str(recipe)) or BARE.fullmatch(str(recipe)):  # of a name `REDUCERS` says whether there is one
+        if OWN.fullmatch(str(recipe)) or str(recipe) in NAMED:
             return cls(str(recipe))
         raise SettingError(
             f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; "

@@ -262,8 +262,9 @@ def is_name(value: Any) -> bool:
 
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
-    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
-    expect(is_name(value), wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
+    if not is_name(value):
+        wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
+        expect(False, wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
     return str(value)
 
 

@@ -41,16 +41,16 @@ class Answering:
     """A version as it stood at a moment.
 
     version : its number.  index : its references.  known : the labels behind them, oldest first.
-    gate : of novelty, None where it was off.  levels : that a bound had to reach, None where that is not kept.
-    last_seq : the newest label that it could know.
+    levels : that a bound had to reach, None where that is not kept.  last_seq : the newest label that it could know.
+    novelty : of the trace that it found novel, None for any other.
     """
 
     version: int
     index: RadiusIndex
     known: list[PastLabel]
-    gate: NoveltyGate | None
     levels: Levels | None
     last_seq: int
+    novelty: Novelty | None
 
     def labels_of_references(self) -> list[PastLabel | None]:
         """The label behind each reference, in the order of `index.points`; None where it is not known any more."""
@@ -76,7 +76,7 @@ def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision
     known = [label for label in (*before, *later) if not label.quarantined]
     last = max((label.seq for label in known), default=stored.last_seq)
     index = _index(stored, [label for label in later if label.model_version == version], recipe)
-    return Answering(version, index, known, _gate(stored), _levels(stored, later, recipe.policy), last)
+    return Answering(version, index, known, _levels(stored, later, recipe.policy), last, _novelty(stored, then))
 
 
 def _known_at(label: PastLabel, then: StoredDecision, stops_all: bool) -> bool:
@@ -95,14 +95,14 @@ def _index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> Radi
     return index
 
 
-def _gate(stored: ModelVersion) -> NoveltyGate | None:
-    kept = _buffers(stored, "novelty.")
-    if not kept:
+def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | None:
+    if then is None or then.decision.reason is not Reason.NOVEL:
         return None
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
     gate.asleep = False
-    gate.load_state_dict(kept)
-    return gate
+    gate.load_state_dict(_buffers(stored, "novelty."))
+    with torch.inference_mode():
+        return Novelty(*gate.scores(torch.from_numpy(then.trace)).tolist())
 
 
 def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
@@ -234,11 +234,6 @@ class Novelty:
     level: float
     texture: float
 
-    @property
-    def is_novel(self) -> bool:
-        """Whether either is beyond its limit."""
-        return not max(self.level, self.texture) <= 1.0
-
     def __str__(self) -> str:
         return f"in level {self.level:.2f} times the limit, in texture {self.texture:.2f} times the limit"
 
@@ -369,8 +364,6 @@ def _verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) ->
     yield DID[made.action].capitalize() + (lost if _was_lost(made) else WHY[made.reason](made, past.trace, found))
     if bound is not None:
         yield from _bound_sentences(made, bound, found)
-    if found.novelty is not None and made.reason is not Reason.NOVEL:
-        yield f"It is not novel: {found.novelty}."
     source = "" if past.source is None else f" ({past.source.value})"
     known = past.success is not None
     yield f"The part turned out {past.label}{source}." if known else "Nothing was reported of the part."
@@ -503,7 +496,7 @@ class Explanation:
     decision : as it was recorded.  trace : (C, T), as `spec` says.  label : what became of it is in `decision`.
     said : why, in sentences.  notes : what was found again, and by which version.
     bound : how the bound came out, and what others it would have needed; None where no bound was asked for.
-    novelty : how unlike all references the trace is; None where novelty was off, or is not known any more.
+    novelty : how unlike all references a novel trace is; None for any other, and where that is not known any more.
     neighbours : the nearest references, nearest first; radius : of the ball, None where none was drawn.
     neighbours_version : the version that these are references of; None without neighbours.
     envelope : the band of the known successes; None while there are too few.
@@ -556,7 +549,7 @@ def explain(
     around = _around(store, past, answering, recipe, present)
     found = replace(settings, spec=spec, safe_mode=_safe_mode(store, past))
     if answering is not None:
-        found = replace(found, levels=answering.levels, novelty=_novelty(past, answering))
+        found = replace(found, levels=answering.levels, novelty=answering.novelty)
     bound = bound_of(made, found)
     return Explanation(
         decision=past,
@@ -578,13 +571,6 @@ def _safe_mode(store: Store, past: StoredDecision) -> str:
         return ""
     began = (each.text for each in reversed(store.events()) if each.kind == SAFE_MODE_BEGAN and each.time <= past.time)
     return next(began, "")
-
-
-def _novelty(past: StoredDecision, answering: Answering) -> Novelty | None:
-    if answering.gate is None or past.quarantined:
-        return None
-    with torch.inference_mode():
-        return Novelty(*answering.gate.scores(torch.from_numpy(past.trace)).tolist())
 
 
 def _around(

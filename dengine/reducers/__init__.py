@@ -11,7 +11,7 @@ import lazy_loader
 import numpy as np
 
 from ..errors import SettingError, expect, shortened
-from ..recipe import Recipe
+from ..recipe import NAMED, Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .umap import UmapReducer
 
 # The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
-_NAMED = {"conv": "ConvReducer", "umap": "UmapReducer", "pca": "PcaReducer", "rocket": "RocketReducer"}
+_NAMED = {name: f"{name.capitalize()}Reducer" for name in NAMED}
 _LAZY = {"base": ["Reducer", "CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer

@@ -205,7 +205,7 @@ class Store(Protocol):
         """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
 
         What is there already, and is the same, counts as taken. Another decision of the same id, a label on that, or a
-        second label becomes an event, "set aside": it is never guessed which one is right.
+        second label becomes an event, "dead letter": it is never guessed which one is right.
         """
 
     def doubt(self) -> str:

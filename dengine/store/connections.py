@@ -359,7 +359,7 @@ class Database:
         return []
 
     def _take(self, connection: sa.Connection, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Insert what is not there yet; what is there must be the same, or it is set aside."""
+        """Insert what is not there yet; what is there must be the same, or it becomes a dead letter."""
         events = [each for each in records if isinstance(each, Event)]
         if events:
             events = self._new_events(connection, events)
@@ -416,8 +416,8 @@ class Database:
             connection.execute(sa.insert(EVENT), rows)
 
     def _set_aside(self, text: str) -> Event:
-        log.error("set aside: %s", text)
-        return Event(0, self._clock(), "set aside", as_text(text))
+        log.error("dead letter: %s", text)
+        return Event(0, self._clock(), "dead letter", as_text(text))
 
 
 def _named(record: Record) -> str:

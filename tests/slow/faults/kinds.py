@@ -147,8 +147,8 @@ def unstorable(outcome: Outcome, place: Place) -> None:
         cell.play(DURING)
         cell.engine.flush()
         cell.until_back()  # a busy machine's store may have been late, too
-    texts = [event.text for event in cell.engine.store.events() if event.kind == "set aside"]
-    outcome.must(len(texts) == 1 and ODD in texts[0], "the row was not set aside")
+    texts = [event.text for event in cell.engine.store.events() if event.kind == "dead letter"]
+    outcome.must(len(texts) == 1 and ODD in texts[0], "the row did not become a dead letter")
     cell.finish()
 
 

@@ -270,7 +270,7 @@ def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its
         assert store.take([other, TakenLabel(label, 5.0, 1, other.time)]) == []
         assert (store.get_decision("part 7").success, store.status()["labels"]) == (None, 0)
         texts = [event.text for event in store.events()]
-        assert [event.kind for event in store.events()] == ["set aside", "set aside"]
+        assert [event.kind for event in store.events()] == ["dead letter", "dead letter"]
         assert "data" in texts[0]
         assert "another decision" in texts[1]
         for _ in range(2):
