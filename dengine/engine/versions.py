@@ -340,36 +340,40 @@ class ModelVersions:
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the version on its way in a step further. One that cannot be stored is dropped."""
-        candidate, window = self._candidate, self.retrainer.window
+        candidate = self._candidate
         assert candidate is not None  # the caller asked; for the type checker
         try:
-            if candidate.storing is None:
-                if not candidate.learn(window, np.inf if to_the_end else STEP):
-                    return
-                if self._can_wait(candidate, to_the_end):
-                    return
-                self.store_waiting()
-                candidate.learn(window)
-                candidate.storing, limit = self._store(candidate), self.outbox.limit
-                candidate.until = np.inf if limit is None else time.monotonic() + limit
-            storing = candidate.storing
-            if not to_the_end and not storing.done() and (storing.running() or time.monotonic() < candidate.until):
-                return
-            number = self.outbox.result(storing)
+            number = self._stored(candidate, to_the_end)
         except StoreError as error:  # a version that is not stored would be gone with the process
             self._candidate = None
             self._not_stored(candidate.report, error)
             return
-        if self._can_wait(candidate, to_the_end):
+        if number is None or self._can_wait(candidate, to_the_end):
             return
         try:
             self.store_waiting()  # what was confirmed since is to be among its references
         except StoreError as error:
             log.warning("version %d is stored, and answers once the labels since are: %s", candidate.report.version, error)
             return
-        candidate.learn(window)
+        candidate.learn(self.retrainer.window)
         self._candidate = None
         self._swap(candidate, number)
+
+    def _stored(self, candidate: Candidate, to_the_end: bool) -> int | None:
+        """The number that a version has in the store; None where another step is needed. StoreError where it has none."""
+        if candidate.storing is None:
+            if not candidate.learn(self.retrainer.window, np.inf if to_the_end else STEP):
+                return None
+            if self._can_wait(candidate, to_the_end):
+                return None
+            self.store_waiting()
+            candidate.learn(self.retrainer.window)
+            candidate.storing, limit = self._store(candidate), self.outbox.limit
+            candidate.until = np.inf if limit is None else time.monotonic() + limit
+        storing = candidate.storing
+        if not to_the_end and not storing.done() and (storing.running() or time.monotonic() < candidate.until):
+            return None
+        return self.outbox.result(storing)
 
     def _can_wait(self, candidate: Candidate, to_the_end: bool) -> bool:
         """Whether labels are on their way into the store, and the cell need not wait for that."""
