@@ -32,7 +32,7 @@ import torch
 from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
-from ..errors import ExportError, OutputError
+from ..errors import ExportError, OutputError, expect
 from ..files import UNREADABLE, check_output, write_output
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
@@ -75,10 +75,8 @@ def signature(content: bytes, key: KeyFile) -> str:
     except OSError as error:
         said = f"The key's file {key} cannot be read: {error.strerror}; dengine export --make-key writes one."
         raise ExportError(said) from error
-    if len(secret) < SHORTEST_KEY:
-        raise ExportError(
-            f"Expected a key of {SHORTEST_KEY} bytes or more in {key}, got {len(secret)}; use dengine export --make-key."
-        )
+    wanted = f"a key of {SHORTEST_KEY} bytes or more in {key}"
+    expect(len(secret) >= SHORTEST_KEY, wanted, len(secret), "use dengine export --make-key", ExportError)
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 

@@ -12,7 +12,6 @@ from ..records import FITS, REASONS, Reason, TraceSpec
 from ..traces import TraceGate, fitted
 
 One = tuple[int, int, float, float, int, int, Tensor]
-Many = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
 METHODS = ("decide", "learn", "stop", "settle", "safe_mode", "restore", "predicted", "drop", "n_references")
 AUDIT = REASONS.index(Reason.AUDIT)
@@ -81,26 +80,6 @@ class DecisionModule(nn.Module):
         self.waits, self.alone, self.lower, self.upper = action, alone, lower, upper
         self.own, self.content, self.novel = part if part != 0 else content, content, reason == self.novel_reason
         self.place.copy_(z)
-
-    def forward(self, traces: Tensor) -> Many:
-        """(T,), (B, T) or (B, C, T) -> action, reason, lower, upper, n_success, n_failure: (B,); embedding (B, K, d).
-
-        For trials: each trace by itself, of an unknown part, and nothing is waited for.
-        """
-        batch = traces.unsqueeze(0) if traces.dim() == 1 else traces
-        n = batch.size(0)
-        whole = torch.zeros(n, 4, dtype=torch.int64)
-        bounds = torch.zeros(n, 2, dtype=torch.float64)
-        embedding = torch.zeros(n, self.n_spaces, self.dim)
-        for i in range(n):
-            x = self.as_trace(batch[i])
-            fault, content = self.gate(x)
-            action, reason, lower, upper, n_success, n_failure, z = self.look(x, 0, fault, content)[0]
-            whole[i] = torch.tensor([action, reason, n_success, n_failure])
-            bounds[i, 0].fill_(lower)  # assigned, or made a tensor, a scripted float goes through float32
-            bounds[i, 1].fill_(upper)
-            embedding[i] = z
-        return whole[:, 0], whole[:, 1], bounds[:, 0], bounds[:, 1], whole[:, 2], whole[:, 3], embedding
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:

@@ -89,7 +89,7 @@ def export_torchscript(
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     x = golden_trace(source.trace)
     with torch.inference_mode():
-        embedding = frozen(torch.from_numpy(x)[None])[6][0]  # `decide` would wait for its label
+        embedding = copy.deepcopy(frozen).decide(torch.from_numpy(x))[6]  # a copy: it would wait for its label
     golden = {"trace": x.tolist(), "embedding": embedding.tolist()}
     return write_export(path, _content(frozen, describe(source) | {"golden": golden}), force, key, source)
 

@@ -168,22 +168,6 @@ def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], t
     assert exported.module.n_references() == 300
 
 
-def test_one_trace_a_batch_and_a_batch_with_channels_agree(file: Path, many: np.ndarray) -> None:
-    exported = load_exported(file)
-    with torch.inference_mode():
-        flat = exported.module(torch.from_numpy(many))
-        deep = exported.module(torch.from_numpy(many[:, None, :]))
-        single = exported.module(torch.from_numpy(many[0]))
-    for one, two, first in zip(flat, deep, single, strict=True):
-        torch.testing.assert_close(one, two, rtol=0, atol=0, equal_nan=True)
-        torch.testing.assert_close(one[:1], first, rtol=0, atol=0, equal_nan=True)
-    decided = exported.decide_many(many)
-    actions, reasons = exported.metadata["actions"], exported.metadata["reasons"]
-    assert [actions[i] for i in flat[0]] == [d.action for d in decided]
-    assert [reasons[i] for i in flat[1]] == [d.reason for d in decided]
-    assert flat[2].tolist() == [d.lower for d in decided]
-
-
 def test_several_channels_are_exported_too(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
     data = make_data(150, 40, 3)
     model = fitted(data)
