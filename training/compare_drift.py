@@ -26,7 +26,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dengine import Policy, Recipe
-from dengine.cells.simulation.conditions import CellParameters, first_change
+from dengine.cells.simulation.conditions import CellParameters, find_scenario
 from dengine.experiments.figures import LIMIT, RECIPES, SMALL, draw_verified, finish, save
 from dengine.experiments.replay import Replay, replay
 from dengine.experiments.tables import write_csv
@@ -86,6 +86,12 @@ def row_of(run: Run) -> dict[str, Any]:
         "back": back,
         "saved_s": seconds_saved(log),
     }
+
+
+def first_change(name: str, cycles: int) -> int | None:
+    """The number, from 1, of the first cycle that is not as at the beginning; None where nothing changes."""
+    as_usual, change = CellParameters(), find_scenario(name)
+    return next((i + 1 for i in range(cycles) if change(as_usual, i, cycles) != as_usual), None)
 
 
 def escapes(log: Replay, part: slice) -> float:

@@ -534,11 +534,9 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
                 axes.plot(time_s, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
         finish(axes, legend=3 if shown.any() and not i else 0, xlabel="time [s]", ylabel=f"{names[i]}{unit}")
     share, level = below.subplots(2, 1, sharex=True)
-    window = max(1, len(y) // 10)
-    full = numbers(len(y)) >= window  # a share of the first few jumps
-    share.plot(
-        numbers(len(y))[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}"
-    )
+    window, x = max(1, len(y) // 10), numbers(len(y))
+    full = x >= window  # a share of the first few jumps
+    share.plot(x[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}")
     share.axhline(100 * y.mean(), label="good, of all", **LIMIT)
     finish(share, ylim=(0, 104), ylabel="share [%]")
     x, means = np.flatnonzero(shown) + 1, levels(X[shown, :1])[:, 0]

@@ -45,6 +45,12 @@ def test_an_alarm_is_counted_from_the_change_and_lasts_until_it_is_off(drift, on
     assert drift.alarm_and_back(np.array(on, dtype=bool), change) == expected
 
 
+@pytest.mark.parametrize(("scenario", "cycle"), [("nominal", None), ("wear", 2), ("variant", 401), ("bias_jump", 401)])
+def test_a_change_is_marked_at_the_first_cycle_that_it_touches(drift, scenario: str, cycle: int | None) -> None:
+    # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
+    assert drift.first_change(scenario, 800) == cycle
+
+
 def test_escapes_are_shares_of_the_parts_that_were_passed_on(drift: ModuleType) -> None:
     log = log_of(["verify", "verify", "accept", "accept", "reject"], [1, 0, 1, 0, 1])
     assert drift.escapes(log, slice(None)) == pytest.approx(1000 / 3)

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
-from dengine.cells.simulation.conditions import first_change
 from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
 from dengine.experiments.replay import Replay, RunRecorder
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line
@@ -200,9 +199,3 @@ def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_i
         box = legend.get_window_extent()
         assert [box.overlaps(axes.get_window_extent()) for axes in figure.axes] == [False] * len(figure.axes)
         assert box.x1 <= max(axes.get_window_extent().x1 for axes in figure.axes)  # or the axes would have to shrink
-
-
-@pytest.mark.parametrize(("scenario", "cycle"), [("nominal", None), ("wear", 2), ("variant", 401), ("bias_jump", 401)])
-def test_a_change_is_marked_at_the_first_cycle_that_it_touches(scenario: str, cycle: int | None) -> None:
-    # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
-    assert first_change(scenario, 800) == cycle

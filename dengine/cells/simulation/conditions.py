@@ -223,9 +223,3 @@ def find_scenario(name: str) -> Scenario:
     """The scenario of this name."""
     expect(name in SCENARIOS, f"a scenario of {', '.join(SCENARIOS)}", name, "choose one of these")
     return SCENARIOS[name]
-
-
-def first_change(name: str, cycles: int) -> int | None:
-    """The number, from 1, of the first cycle that is not as at the beginning; None where nothing changes."""
-    as_usual, change = CellParameters(), find_scenario(name)
-    return next((i + 1 for i in range(cycles) if change(as_usual, i, cycles) != as_usual), None)
