@@ -148,7 +148,7 @@ def check(plan: Plan, worked: Worked) -> dict[str, Any]:
             lost += known is None or known.success is None
             wrong += known is not None and known.success is not None and known.success != good
             mixed += known is not None and read_mark(known.trace) != (worked.cell, cycle)
-        mixed += sum(read_mark(x)[0] != worked.cell for x in store.own_labelled().traces)
+        mixed += sum(read_mark(x)[0] != worked.cell for x in store.labelled(own=True).traces)
     about = {"cell": worked.cell, "version": worked.version, "certain": worked.certain, "sent": len(worked.sent)}
     return about | {"stored": stored, "lost": lost, "wrong": wrong, "mixed": mixed + worked.others}
 

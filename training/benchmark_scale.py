@@ -20,8 +20,10 @@ import numpy as np
 from common import POLICY, noisy, options, tell, wall_time
 from rich.progress import track
 
-from dengine import Action, DataEngine, Dataset, Decision, ModelPrediction, Reason, Recipe, Source, load_dataset
+from dengine import Action, DataEngine, Dataset, Decision, ModelPrediction, Reason, Recipe, load_dataset
 from dengine.folds import content_hash
+from dengine.store.journal import labelled
+from dengine.store.records import checked_decision
 
 CHUNK = 5000
 
@@ -32,8 +34,10 @@ def fill(engine: DataEngine, data: Dataset, n: int) -> None:
     engine.decide(noisy(data, 1, rng)[0][0])  # the first trace sets the contract
     for start in track(range(0, n, CHUNK), description=f"{n:,} traces"):
         X, y = noisy(data, min(CHUNK, n - start), rng)
-        decisions = [_verified(f"import-{start + i}") for i in range(len(X))]
-        engine.store.put_labelled(decisions, X, content_hash(X), y, Source.VERIFICATION)
+        records: list[Any] = []
+        for i, (x, good, hash_) in enumerate(zip(X, y, content_hash(X), strict=True), start):
+            records += labelled(checked_decision(_verified(f"import-{i}"), x, hash_, False, 0.0), good)
+        engine.store.take(records)
 
 
 def _verified(name: str) -> Decision:

@@ -331,11 +331,11 @@ def compare_with_store(file: Path, store: Path, differently: set[str], lost: set
     opened = open_store(store)
     for each in read(file):
         if answer := each.get("answer"):
-            found = opened.past_decision(answer["id"])
+            found = opened.get_decision(answer["id"], trace=False)
             if found is None or (found.decision.action, found.decision.lower) != (answer["action"], answer["lower"]):
                 differently.add(answer["id"])
         if "told" in each:
-            found = opened.past_decision(each["told"])
+            found = opened.get_decision(each["told"], trace=False)
             if found is None or found.success is not each["success"]:
                 lost.add(each["told"])
     opened.close()

@@ -133,7 +133,7 @@ def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> t
 
     dataset = source.load()
     # By content: of a part that comes twice the store's own hash would name both.
-    played = store.own_labelled()
+    played = store.labelled(own=True)
     hashes = content_hash(played.traces)
     for id_ in store.unreported_accepts()[-1:]:
         newest = store.get_decision(id_)

@@ -24,9 +24,11 @@ from ..engine.engine import DataEngine
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, RetrainReport, Source, TraceSpec, trace_in
+from ..records import REASONS, Action, Decision, Reason, RetrainReport, TraceSpec, trace_in
 from ..store.base import Store
+from ..store.journal import Record, labelled
 from ..store.opening import UNHURRIED, opening
+from ..store.records import checked_decision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
 from .loading import TABLES
@@ -159,11 +161,10 @@ def _import_chunk(
 ) -> tuple[int, int, int]:
     """Numbers of traces imported, quarantined and known."""
     faults = {i: gate(torch.from_numpy(traces[i]))[0] for i, d in enumerate(decisions) if store.get_decision(d.id) is None}
-    good = [i for i, fault in faults.items() if not fault]
-    if good:
-        store.put_labelled([decisions[i] for i in good], traces[good], own[good], labels[good], Source.VERIFICATION)
-    for i in sorted(faults.keys() - good):  # kept, but never given to training
-        decision = replace(decisions[i], reason=REASONS[faults[i]])
-        store.put_decision(decision, traces[i], int(own[i]), quarantined=True)
-        store.put_label(decision.id, bool(labels[i]), Source.VERIFICATION, 0, None)
-    return len(good), len(faults) - len(good), len(decisions) - len(faults)
+    records: list[Record] = []
+    for i, fault in faults.items():  # a bad one is kept, but never given to training
+        decision = replace(decisions[i], reason=REASONS[fault]) if fault else decisions[i]
+        records += labelled(checked_decision(decision, traces[i], own[i], bool(fault), store.clock()), labels[i])
+    store.take(records)
+    bad = sum(map(bool, faults.values()))
+    return len(faults) - bad, bad, len(decisions) - len(faults)

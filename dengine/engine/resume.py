@@ -117,7 +117,7 @@ def change(model: EngineModel, store: Store, correction: Correction) -> bool:
         return True
     # As reported, of whichever cell; nothing where the part was quarantined, or the trace is damaged.
     data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=0)
-    known = None if len(data.seq) else store.past_decision(correction.decision_id)
+    known = None if len(data.seq) else store.get_decision(correction.decision_id, trace=False)
     if not len(data.seq) and (known is None or known.quarantined):
         return True
     hash_ = int(data.hashes[0]) if known is None else known.content_hash

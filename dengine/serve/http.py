@@ -247,7 +247,7 @@ def _unknown() -> UnknownDecisionError:
 def _only_one(store: Store, part: str) -> str:
     """The id of the one decision of a part that a label can be of; of a part that is unknown, it may be the id itself."""
     found = [each for each in store.decisions(HistoryFilter(part=part), 20) if each.decision.action is not Action.REJECT]
-    found = found or [each for each in [store.past_decision(part)] if each is not None]
+    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
     if not found:
         got = f"{shortened(part)}, which is unknown"
         raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
@@ -275,7 +275,7 @@ def _newest(store: Store, where: HistoryFilter, limit: int, before: Key | None, 
 
 
 def _explained(store: Store, id_: str) -> Json:
-    if store.past_decision(id_) is None:
+    if store.get_decision(id_, trace=False) is None:
         raise _unknown()
     found, labelled = explain(store, id_), store.labelled(AMONG)
     trace, band = found.trace, found.envelope

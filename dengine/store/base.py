@@ -65,10 +65,10 @@ class Store(Protocol):
     def flush(self) -> None:
         """Return when all that is on its way into it is there, as far as it comes in time."""
 
-    def get_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision with its trace; None where it is unknown or forgotten.
+    def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
+        """Return the decision; None where it is unknown or forgotten.
 
-        StoreError where the trace is not as it was stored.
+        trace : with it; StoreError where it is not as it was stored.
         """
 
     def decision_ids(self) -> list[str]:
@@ -87,28 +87,22 @@ class Store(Protocol):
         Raises ReportError for an unknown decision, or for a second label of one.
         """
 
-    def put_labelled(
-        self,
-        decisions: Sequence[Decision],
-        traces: NDArray[np.float32],
-        hashes: NDArray[np.int64],
-        labels: NDArray[np.int8],
-        source: Source,
-    ) -> NDArray[np.int64]:
-        """Import labelled traces, all or none; returns their sequence numbers."""
-
     def labelled(
-        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+        self,
+        limit: int | None = None,
+        *,
+        first: int = 1,
+        last: int | None = None,
+        corrected_to: int | None = None,
+        own: bool = False,
     ) -> Labelled:
         """Return the newest `limit` labelled traces, all where it is None, with their labels as they count.
 
         first, last : sequence numbers between which they lie.
         corrected_to : number of the last correction that counts, for labels as they stood then; None: all do.
+        own : of this cell alone, where others share its product.
         A trace that is not as it was stored is left out; an event names its decision.
         """
-
-    def own_labelled(self) -> Labelled:
-        """Return this cell's own labelled traces, all of them, oldest first."""
 
     def news_since(self, seq: int, limit: int) -> News:
         """Return the labels after `seq`, at most `limit`, and the numbers of the newest version and correction."""
@@ -182,9 +176,6 @@ class Store(Protocol):
 
         beyond : only those before (or after) this one: the next page.
         """
-
-    def past_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return one decision without its trace; None where it is unknown or forgotten."""
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
         """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""

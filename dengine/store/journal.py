@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StoreError
-from ..records import Decision
+from ..records import Decision, Source, as_success
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
 LENGTH = struct.Struct("<I")  # of a record's JSON text, before it; the samples of a trace or a point follow it
@@ -83,6 +83,12 @@ def from_bytes(blob: bytes) -> Record:
             f"Expected a record of a journal, got what cannot be read ({error}); "
             "open the store with the dengine that wrote it."
         ) from error
+
+
+def labelled(item: StoredDecision, success: Any, source: Source = Source.VERIFICATION) -> list[Record]:
+    """A decision that was labelled when it was made, as a recording is that is imported."""
+    label = NewLabel(item.decision.id, as_success(success), source, item.decision.model_version, None)
+    return [item, TakenLabel(label, item.time, item.content_hash, item.time)]
 
 
 class Journal:

@@ -48,7 +48,7 @@ def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
         elif kind is bytes:
             pieces += (b"%bb%d:" % (begin, len(value)), value)
         else:
-            raise TypeError(f"Expected a plain value of column {name!r}, got {kind.__name__}; see `plain_row`.")
+            raise TypeError(f"Expected a plain value of column {name!r}, got {kind.__name__}; see `to_row`.")
     return hashlib.sha256(b"".join(pieces)).digest()
 
 
@@ -58,19 +58,6 @@ def _columns(names: tuple[str, ...]) -> list[tuple[str, bytes]]:
 
 
 _DOUBLE = struct.Struct(">d").pack
-PLAIN = (int, float, str, bytes)
-
-
-def plain_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row whose values are Python's own: a NumPy number, an enum's text, a view of bytes are made so."""
-    return {name: _plain(value) for name, value in row.items()}
-
-
-def _plain(value: Any) -> Any:
-    if value is None or type(value) in PLAIN:
-        return value
-    kind = next((kind for kind in (str, float, bytes) if isinstance(value, kind)), None)
-    return kind(value) if kind else bytes(value) if isinstance(value, bytearray | memoryview) else int(value)
 
 
 def state_sum(state: bytes | None) -> bytes | None:
@@ -124,12 +111,7 @@ class LedgerEntry:
                 full[name] = None if full[name] is None else float(full[name])
         if "state" in row:
             full["state_sum"] = state_sum(row["state"])
-        try:
-            full["sum"] = row_sum(table, full)
-        except TypeError:
-            full = plain_row(full)
-            full["sum"] = row_sum(table, full)
-        return full
+        return full | {"sum": row_sum(table, full)}
 
     def take_settings(self, connection: sa.Connection) -> None:
         """Note that the settings change."""

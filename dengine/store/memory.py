@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..records import Action, Decision, Reason, RetrainReport, Source
+from ..records import Action, Decision, Reason, RetrainReport
 from .base import Store
 from .journal import Record, TakenLabel
 from .records import (
@@ -37,13 +37,10 @@ from .records import (
     as_data,
     as_label,
     as_text,
-    check_decision,
-    check_import,
     check_state,
     checked_decision,
     checked_label,
     duplicate_id,
-    imported_labels,
     keeps_state,
     mixed_shapes,
     not_kept,
@@ -127,12 +124,9 @@ class MemoryStore(Store):
     def flush(self) -> None:
         """Nothing waits here."""
 
-    def get_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision with its trace; None where it is unknown or forgotten."""
+    def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
         kept = self._open.get(decision_id) or self._done.get(decision_id)
-        if kept is None:
-            return None
-        return replace(self._known(kept), trace=kept.trace.copy())
+        return None if kept is None else replace(self._known(kept), trace=kept.trace.copy() if trace else NO_TRACE)
 
     def decision_ids(self) -> list[str]:
         return [*self._open, *self._done]
@@ -170,27 +164,14 @@ class MemoryStore(Store):
             self._train.append(label)
             self._silent[given.model_version] += given.silent
 
-    def put_labelled(
-        self,
-        decisions: Sequence[Decision],
-        traces: NDArray[np.float32],
-        hashes: NDArray[np.int64],
-        labels: NDArray[np.int8],
-        source: Source,
-    ) -> NDArray[np.int64]:
-        traces = check_import(decisions, traces, hashes, labels)
-        for decision in decisions:
-            check_decision(decision)
-            if self._holds(decision.id):
-                raise duplicate_id(decision.id)
-        first, given = len(self._labels) + 1, imported_labels(decisions, labels, source)
-        for decision, trace, hash_, label in zip(decisions, traces, hashes, given, strict=True):
-            self.put_decision(decision, trace, int(hash_), False)
-            self._take(label)  # at once, or the import would be forgotten
-        return np.arange(first, first + len(given), dtype=np.int64)
-
     def labelled(
-        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+        self,
+        limit: int | None = None,
+        *,
+        first: int = 1,
+        last: int | None = None,
+        corrected_to: int | None = None,
+        own: bool = False,
     ) -> Labelled:
         said = self._said
         if corrected_to is not None:
@@ -210,9 +191,6 @@ class MemoryStore(Store):
             labels=np.array([self._counted(row, said) for row in rows], dtype=np.int8),
             hashes=np.array([row.item.content_hash for row in rows], dtype=np.int64),
         )
-
-    def own_labelled(self) -> Labelled:
-        return self.labelled()
 
     def news_since(self, seq: int, limit: int) -> News:
         after = (row for row in self._train if row.seq > seq and self._counted(row) != FORGOTTEN)
@@ -357,11 +335,6 @@ class MemoryStore(Store):
             found = [past for past in found if beyond is None or past.key < beyond]
             return found[max(0, len(found) - limit) :]
         return [past for past in found if beyond is None or past.key > beyond][:limit]
-
-    def past_decision(self, decision_id: str) -> StoredDecision | None:
-        """Return one decision; None where it is unknown or forgotten."""
-        item = self._open.get(decision_id) or self._done.get(decision_id)
-        return None if item is None else replace(self._known(item), trace=NO_TRACE)
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
         found = []

@@ -105,6 +105,9 @@ class Outbox:
         journal = self._journal
         assert journal is not None
         try:
+            if journal.newest is not None and not self.store.holds_entry(*journal.newest):  # before it takes anything
+                text = f"the ledger lacks entry {journal.newest[0]}, which this cell's journal knows: the store was cut off"
+                self._note("lost", f"{text}, or put back from a copy; labels may be missing")
             for at, _, blob in journal.records():
                 self._appended, self._synced = self._appended + 1, self._synced + 1
                 self._times.append(time.monotonic())
@@ -112,9 +115,6 @@ class Outbox:
                     self._where[record.decision.id] = at  # a later one of an id is in the place of an earlier one
             while not self.drained:
                 self._take()
-            if journal.newest is not None and not self.store.holds_entry(*journal.newest):
-                text = f"the ledger lacks entry {journal.newest[0]}, which this cell's journal knows: the store was cut off"
-                self._note("lost", f"{text}, or put back from a copy; labels may be missing")
             if journal.dropped:
                 text = f"{journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
                 self._note("journal", text)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -104,24 +103,6 @@ def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None)
         if values.dtype.hasobject:
             raise StoreError(f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers or strings.")
     return copies
-
-
-def check_import(
-    decisions: Sequence[Decision], traces: NDArray[Any], hashes: NDArray[Any], labels: NDArray[Any]
-) -> NDArray[np.float32]:
-    """Return the traces of an import as (n, C, T) float32, once every part of it has n rows."""
-    traces = np.asarray(traces, dtype=np.float32)
-    traces = traces[:, None, :] if traces.ndim == 2 else traces
-    lengths = (len(decisions), len(traces), len(hashes), len(labels))
-    if traces.ndim != 3 or len(set(lengths)) != 1:
-        raise StoreError(
-            f"Expected n decisions, traces (n, C, T), hashes and labels, got {lengths} of them and traces of shape "
-            f"{traces.shape}; give one of each a part."
-        )
-    twice = [name for name, times in Counter(decision.id for decision in decisions).items() if times > 1]
-    if twice:
-        raise duplicate_id(twice[0])
-    return traces
 
 
 def duplicate_id(decision_id: str) -> StoreError:
@@ -422,12 +403,6 @@ def checked_label(label: NewLabel) -> NewLabel:
     if silent < -1:  # -1: the label is of one of them
         raise StoreError(f"Expected a count of parts that went on in silence, -1 or more, got {silent}; count from 0.")
     return NewLabel(name, success, label.source, int(label.model_version), point, silent)
-
-
-def imported_labels(decisions: Sequence[Decision], labels: NDArray[np.int8], source: Source) -> list[NewLabel]:
-    """Return the labels that decisions of an import come with."""
-    pairs = zip(decisions, map(as_success, labels), strict=True)
-    return [NewLabel(decision.id, success, source, int(decision.model_version), None) for decision, success in pairs]
 
 
 def refuse_repeats(

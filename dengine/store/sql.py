@@ -26,7 +26,7 @@ from ..records import Action, Decision, Reason, RetrainReport, Source
 from .base import Store
 from .connections import Database
 from .journal import Journal, Record, TakenLabel, journal_path
-from .ledger import plain_row, row_sum, state_sum
+from .ledger import row_sum, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
@@ -63,13 +63,11 @@ from .records import (
     as_data,
     as_label,
     as_text,
-    check_import,
     check_state,
     checked_decision,
     checked_label,
     duplicate_id,
     from_row,
-    imported_labels,
     keeps_state,
     mixed_shapes,
     not_kept,
@@ -207,7 +205,10 @@ class SqlStore(Store):
         self._database.check_open()
         self.before_use()
 
-    def get_decision(self, decision_id: str) -> StoredDecision | None:
+    def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
+        if not trace:
+            rows = self._read(past_query(self.cell_id).where(DECISION.c.id == decision_id))
+            return read_decision(rows[0]) if rows else None
         same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
         stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
         query = past_query(self.cell_id).add_columns(*TRACE.c["channels", "samples", "data"], *stored)
@@ -240,37 +241,24 @@ class SqlStore(Store):
 
         return np.array(self._database.write(add), dtype=np.int64)
 
-    def put_labelled(
-        self,
-        decisions: Sequence[Decision],
-        traces: NDArray[np.float32],
-        hashes: NDArray[np.int64],
-        labels: NDArray[np.int8],
-        source: Source,
-    ) -> NDArray[np.int64]:
-        traces, now, ids = check_import(decisions, traces, hashes, labels), self.clock(), [each.id for each in decisions]
-        items = [checked_decision(*each, False, now) for each in zip(decisions, traces, hashes, strict=True)]
-        taken = [TakenLabel(each, now, 0, 0.0) for each in imported_labels(decisions, labels, source)]
-
-        def load(connection: sa.Connection) -> list[int]:
-            for name in self._database.held(connection, ids):
-                raise duplicate_id(name)
-            self._database.insert(connection, items)
-            return self._database.insert_labels(connection, taken, self._database.held(connection, ids))
-
-        return np.array(self._database.write(load), dtype=np.int64)
-
     # Training
 
     def labelled(
-        self, limit: int | None = None, *, first: int = 1, last: int | None = None, corrected_to: int | None = None
+        self,
+        limit: int | None = None,
+        *,
+        first: int = 1,
+        last: int | None = None,
+        corrected_to: int | None = None,
+        own: bool = False,
     ) -> Labelled:
-        query = training_query(self._scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
+        scope = Scope(self.cell_id) if own else self._scope
+        query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
         query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
         query = query if last is None else query.where(LABEL.c.seq <= last)
         with self._database.transaction(write=False) as connection:
             rows = self._newest(connection, query, limit, last)[::-1]
-            found, damaged = self._with_traces(connection, rows, self._scope)
+            found, damaged = self._with_traces(connection, rows, scope)
         return self._told_of(damaged, found)
 
     def _newest(
@@ -284,13 +272,6 @@ class SqlStore(Store):
             if len(rows) == limit or newest <= 2 * limit:
                 return rows
         return connection.execute(query).all()  # more than every second is quarantined or forgotten
-
-    def own_labelled(self) -> Labelled:
-        own = Scope(self.cell_id)
-        with self._database.transaction(write=False) as connection:
-            rows = connection.execute(training_query(own).order_by(LABEL.c.seq)).all()
-            found, damaged = self._with_traces(connection, rows, own)
-        return self._told_of(damaged, found)
 
     def news_since(self, seq: int, limit: int) -> News:
         query = training_query(self._scope).where(LABEL.c.seq > int(seq)).order_by(LABEL.c.seq).limit(limit)
@@ -543,10 +524,6 @@ class SqlStore(Store):
         rows = self._read(decisions_query(self.cell_id, where, beyond, newest).limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
-    def past_decision(self, decision_id: str) -> StoredDecision | None:
-        rows = self._read(past_query(self.cell_id).where(DECISION.c.id == decision_id))
-        return read_decision(rows[0]) if rows else None
-
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
         of_label = [column for column in LABEL.c if column.name != "point"]
         point = LABEL.c.point if points else sa.null().label("point")
@@ -634,7 +611,7 @@ def _checked_wait(wait: float | None) -> float:
 
 def _is_sound(table: str, row: dict[str, Any]) -> bool:
     """Whether a row is as it was stored."""
-    return bool(row_sum(table, plain_row(row)) == row["sum"])
+    return bool(row_sum(table, row) == row["sum"])
 
 
 def _since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:

@@ -20,6 +20,8 @@ from hypothesis.extra import numpy as hnp
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, StoredDecision, open_store
+from dengine.store.journal import labelled
+from dengine.store.records import checked_decision
 from tests.support.plans import plans
 
 C, T = 2, 30
@@ -113,19 +115,6 @@ def test_any_trace_returns_bit_for_bit(store: Store, values: np.ndarray, content
 
 
 # Labels
-
-
-def test_labels_are_numbered_from_one_in_the_order_of_their_reports(store: Store) -> None:
-    for name in "abc":
-        put(store, name)
-    assert [store.put_label(name, True, Source.VERIFICATION, 0, None) for name in "cab"] == [1, 2, 3]
-
-
-def test_a_label_is_found_on_its_decision(store: Store) -> None:
-    put(store, "a")
-    store.put_label("a", False, Source.STOP, 0, None)
-    found = store.get_decision("a")
-    assert (found.success, found.source) == (False, Source.STOP)
 
 
 def test_a_report_on_an_unknown_decision_names_the_id(store: Store) -> None:
@@ -240,35 +229,17 @@ def test_points_since_a_swap_are_those_of_that_version(store: Store) -> None:
 # Import
 
 
-def test_an_import_is_labelled_and_numbered_after_what_was_there(store: Store) -> None:
+def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: Store) -> None:
     put(store, "a")
     store.put_label("a", True, Source.VERIFICATION, 0, None)
-    traces, hashes, labels = trace(1, (3, C, T)), np.array([5, -5, 6]), np.array([1, 0, 1], dtype=np.int8)
+    traces, hashes, labels = trace(1, (3, C, T)), [5, -5, 6], [1, 0, 1]
     decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
-    seqs = store.put_labelled(decisions, traces, hashes, labels, Source.VERIFICATION)
+    for made, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
+        assert len(store.take(labelled(checked_decision(made, x, hash_, False, 1.0), good))) == 1
     assert [store.get_decision(name).decision for name in "bcd"] == decisions
-    assert seqs.tolist() == [2, 3, 4]
     found = store.labelled(3)
     np.testing.assert_array_equal(found.traces, traces)
-    assert (found.hashes.tolist(), found.labels.tolist()) == ([5, -5, 6], [1, 0, 1])
-    assert store.get_decision("c").success is False
-
-
-def test_an_import_with_a_known_id_adds_nothing(store: Store) -> None:
-    put(store, "b")
-    store.flush()
-    with pytest.raises(StoreError, match="'b'"):
-        store.put_labelled(
-            [decision("a"), decision("b")], trace(0, (2, C, T)), np.arange(2), np.ones(2, np.int8), Source.VERIFICATION
-        )
-    assert store.get_decision("a") is None
-    assert store.status()["labels"] == 0
-    assert store.status()["write_failures"] == 0
-
-
-def test_an_import_whose_parts_differ_in_length_is_refused(store: Store) -> None:
-    with pytest.raises(StoreError, match=r"\(1, 2, 2, 2\)"):
-        store.put_labelled([decision("a")], trace(0, (2, C, T)), np.arange(2), np.ones(2, np.int8), Source.VERIFICATION)
+    assert (found.seq.tolist(), found.hashes.tolist(), found.labels.tolist()) == ([2, 3, 4], hashes, labels)
 
 
 def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quarantined(store: Store) -> None:
@@ -281,13 +252,6 @@ def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quaran
     np.testing.assert_array_equal(found.lower, [0.2, 0.1 * 3])
     np.testing.assert_array_equal(found.upper, [0.4, 0.2 * 3])
     assert len(store.evidence_since(4).seq) == 0
-
-
-def test_an_import_with_a_bad_part_adds_nothing(store: Store) -> None:
-    decisions = [replace(decision("a"), part="x"), replace(decision("b"), part="y\0")]
-    with pytest.raises(StoreError, match="plain text"):
-        store.put_labelled(decisions, trace(0, (2, C, T)), np.arange(2), np.ones(2), Source.VERIFICATION)
-    assert (store.get_decision("a"), store.status()["decisions"]) == (None, 0)
 
 
 def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Store) -> None:
@@ -317,14 +281,6 @@ def test_unreported_accepts_are_those_without_a_label_oldest_first(store: Store)
     store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
     assert store.unreported_accepts() == ["amy", "kim", "ann"]
     assert sorted(store.decision_ids()) == sorted([*names, "verified", "rejected"])
-
-
-def test_the_silent_total_leaves_out_quarantined_labels(store: Store) -> None:
-    for i, silent in enumerate([3, 0, 4, 5]):
-        put(store, str(i), quarantined=i == 2)
-        store.put_label(str(i), True, Source.VERIFICATION, 0, None, silent=silent)
-    assert store.silent_total() == 8
-    assert store.evidence_since(0).silent.sum() == 8
 
 
 def test_outcomes_count_what_became_of_what_was_certain(store: Store) -> None:
@@ -483,8 +439,8 @@ def test_memory_forgets_old_unreported_decisions_says_so_and_counts_them() -> No
         KEEP_UNLABELLED = 3
 
     store = Small()
-    names = [str(i) for i in range(5)]
-    store.put_labelled([decision(n) for n in names], trace(0, (5, C, T)), np.arange(5), np.ones(5), Source.VERIFICATION)
+    for i in range(5):
+        store.take(labelled(StoredDecision(decision(str(i)), trace(), i, False, 1.0), True))
     for name in "abcde":
         store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
     assert [store.get_decision(name) is None for name in ("0", "a", "b", "c")] == [False, True, True, False]
@@ -675,11 +631,6 @@ def test_a_url_that_is_not_served_is_refused_without_its_password(url: str) -> N
     with pytest.raises(StoreError) as caught:
         SqlStore(url)
     assert "secret" not in str(caught.value)
-
-
-def test_an_empty_cell_id_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="cell_id"):
-        SqlStore(str(tmp_path / "a.db"), "")
 
 
 def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:

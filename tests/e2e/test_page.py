@@ -211,7 +211,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(watched: Watc
     expect(page.locator("#part .story")).to_contain_text(f"corrected from good to bad by {AUTHOR}", timeout=PATIENT)
     assert page.title().startswith("Part")  # what was typed stayed text
     with demo.store() as store:
-        assert store.past_decision(labelled.decision.id).success is False
+        assert store.get_decision(labelled.decision.id, trace=False).success is False
         assert store.corrections()[-1].author == AUTHOR
 
 

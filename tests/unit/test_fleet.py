@@ -478,7 +478,7 @@ def test_every_verb_that_names_a_store_names_a_cell(fleet: Fleet, parts: Dataset
     assert [row["product"] for row in listed if row["cell_id"] in (cell, peer)] == [product, product]
     assert cell[:10] in run("status", fleet.url)
     with SqlStore(fleet.url, peer) as store:
-        assert len(store.labelled().seq) > len(store.own_labelled().seq) > 0
+        assert len(store.labelled().seq) > len(store.labelled(own=True).seq) > 0
 
 
 @pytest.mark.parametrize("verb", ["status", "export"])

@@ -117,10 +117,10 @@ def test_a_past_decision_has_its_part_its_evidence_and_its_label(store: Store) -
     stored = store.get_decision(labelled.decision.id)
     assert stored == labelled
     assert (stored.trace.size, labelled.trace.size) == (5, 0)
-    assert store.past_decision(labelled.decision.id) == labelled
+    assert store.get_decision(labelled.decision.id, trace=False) == labelled
     assert labelled.label_time is not None
     assert labelled.label_time >= labelled.time
-    assert store.past_decision("unknown") is None
+    assert store.get_decision("unknown", trace=False) is None
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,8 @@ from click.testing import CliRunner
 from dengine.cli import main
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import Change, NewLabel, SqlStore, verify_history
+from dengine.store import Change, NewLabel, SqlStore, StoredDecision, verify_history
+from dengine.store.journal import labelled
 from dengine.store.ledger import START, entry_digest, row_sum
 from dengine.store.schema import CHAINED
 
@@ -46,8 +47,8 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     points = rng.normal(size=(n, 2)).astype(np.float32)
     store.put_label("d0", True, Source.VERIFICATION, 1, points[0], silent=2)
     store.put_labels([NewLabel(f"d{i}", i % 2 == 0, Source.AUDIT, 1, points[i]) for i in range(1, n - 2)])
-    imported = [decision(f"i{i}") for i in range(4)]
-    store.put_labelled(imported, traces[:4], np.arange(4), np.ones(4, np.int8), Source.VERIFICATION)
+    imported = (labelled(StoredDecision(decision(f"i{i}"), traces[i], i, False, 1.0), True) for i in range(4))
+    store.take([record for pair in imported for record in pair])
     for version in (1, 2):
         store.put_version(report(version), 5, {"w": rng.normal(size=40)})
     store.put_version(report(2, accepted=False), 6, None)

@@ -95,11 +95,6 @@ def test_json_and_progress_mask_it(capsys: pytest.CaptureFixture) -> None:
     assert SECRET not in "".join(capsys.readouterr())
 
 
-def test_a_url_without_a_password_leaves_it_to_the_environment() -> None:
-    url = make_engine("postgresql://robot@host/cell").url
-    assert (url.username, url.password, url.host) == ("robot", None, "host")
-
-
 @pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
 def test_the_environment_gives_the_password_and_a_used_store_is_shown_without_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, make_data

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import Change, MemoryStore, NewLabel, SqlStore, Store
+from dengine.store import Change, NewLabel, SqlStore, Store
 from tests.support.plans import plans
 
 C, T = 1, 30
@@ -135,17 +135,6 @@ def test_an_events_data_that_json_has_not_is_refused(store: Store) -> None:
     assert store.events() == []
 
 
-def test_a_version_is_loaded_by_its_number_and_another_names_those_that_are_kept(store: Store) -> None:
-    with pytest.raises(StoreError, match="load one of these: none"):
-        store.load_version(1)
-    for number in (1, 2, 3):
-        report = RetrainReport(number, 0.1, 10, 1, number != 3, "")
-        store.put_version(report, number, {"w": np.full(2, number)} if number != 3 else None)
-    assert (store.load_version(1).last_seq, store.load_version(1).state["w"].tolist()) == (1, [1, 1])
-    with pytest.raises(StoreError, match="got 3, which is not kept; load one of these: 1, 2"):
-        store.load_version(3)
-
-
 def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(store: Store) -> None:
     kinds = [
         (Action.ACCEPT, Action.ACCEPT, False),
@@ -221,11 +210,3 @@ def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(t
     assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan
     assert "SCAN" not in plan
     assert "TEMP B-TREE" not in plan
-
-
-def test_a_store_in_memory_keeps_the_first_version_and_the_newest_ones() -> None:
-    store = MemoryStore()
-    for number in range(1, 9):
-        store.put_version(RetrainReport(number, 0.1, 10, 1, True, ""), number, {"w": np.ones(T)})
-    with pytest.raises(StoreError, match="load one of these: 1, 4, 5, 6, 7, 8"):
-        store.load_version(2)
