@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -55,6 +55,7 @@ class Store(Protocol):
 
     def peers_settings(self) -> dict[str, dict[str, str]]:
         """Return the settings of the product's other cells, by cell."""
+        return {}
 
     def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
         """Commit a decision and its trace, (C, T) or (T,).
@@ -64,6 +65,7 @@ class Store(Protocol):
 
     def flush(self) -> None:
         """Return when all that is on its way into it is there, as far as it comes in time."""
+        self.before_use()
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
         """Return the decision; None where it is unknown or forgotten.
@@ -188,9 +190,11 @@ class Store(Protocol):
 
     def own(self) -> Journal | None:
         """Claim the cell for one engine; its journal, None where there is none. StoreError where another engine has it."""
+        return None
 
     def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
         """Roll back this thread's transactions that are not wanted any more before their commit."""
+        return nullcontext()
 
     def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
@@ -201,15 +205,19 @@ class Store(Protocol):
 
     def doubt(self) -> str:
         """Say what of settings, labels and corrections is not as the ledger has it; "" where nothing is."""
+        return ""
 
     def newest_entry(self) -> tuple[int, str] | None:
         """Return number and digest of the newest entry of its ledger; None where there is none."""
+        return None
 
     def holds_entry(self, number: int, digest: str) -> bool:
         """Whether its ledger has that entry."""
+        return False
 
     def let_go(self) -> None:
         """Disconnect without waiting: the journal holds what is missing."""
+        self.close()
 
     def close(self) -> None:
         """Disconnect."""

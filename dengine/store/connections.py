@@ -6,6 +6,7 @@ A deleted file, a fork, and a row that the database refuses are each met here.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 import sqlite3
@@ -19,10 +20,22 @@ import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, shortened
 from .journal import Record, TakenLabel, owned_by, owner
-from .ledger import LedgerEntry, chain_writes
+from .ledger import LedgerEntry, chain_writes, held_settings, is_sound
 from .queries import Scope, held_query, join_product
 from .records import Event, StoredDecision, as_text, pack, to_row
-from .schema import DECISION, EVENT, LABEL, LEDGER, TRACE, chunks, decision_row, label_row, prepare_tables, trace_row
+from .schema import (
+    CORRECTION,
+    DECISION,
+    EVENT,
+    LABEL,
+    LEDGER,
+    TRACE,
+    chunks,
+    decision_row,
+    label_row,
+    prepare_tables,
+    trace_row,
+)
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
@@ -35,6 +48,7 @@ PATIENCE = {
     "keepalives_count": 3,
     "tcp_user_timeout": 10000,
 }
+IN_FORCE = 10_000  # newest labels that are held to their sums when an engine opens the store
 BUSY = 10.0  # seconds to wait for another process that writes to the same SQLite file
 
 
@@ -254,6 +268,22 @@ class Database:
         """Whether the ledger has that entry."""
         mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
         return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
+
+    def doubt(self) -> str:
+        """What of settings, labels and corrections is not as the ledger has it, in words; "" where nothing is."""
+        newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == self.cell_id, LEDGER.c.settings.is_not(None))
+        chained = self.read(newest.order_by(LEDGER.c.number.desc()).limit(1))
+        with self.transaction(write=False) as connection:
+            held = held_settings(connection, self.cell_id)
+        if chained and json.loads(chained[0].settings) != held:
+            return "the settings are not those of the ledger"
+        labels = sa.select(LABEL).where(LABEL.c.cell_id == self.cell_id).order_by(LABEL.c.seq.desc()).limit(IN_FORCE)
+        corrections = sa.select(CORRECTION).where(CORRECTION.c.cell_id == self.cell_id)
+        for table, query in ((LABEL, labels), (CORRECTION, corrections)):
+            for row in self.read(query):
+                if not is_sound(table.name, dict(zip(table.c.keys(), row, strict=True))):
+                    return f"the {table.name} of decision {row.decision_id!r} is not as it was written"
+        return ""
 
     def lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""

@@ -60,6 +60,11 @@ def _columns(names: tuple[str, ...]) -> list[tuple[str, bytes]]:
 _DOUBLE = struct.Struct(">d").pack
 
 
+def is_sound(table: str, row: Mapping[str, Any]) -> bool:
+    """Whether a row, its sum among its columns, is as it was stored."""
+    return bool(row_sum(table, row) == row["sum"])
+
+
 def state_sum(state: bytes | None) -> bytes | None:
     """Return the SHA-256 of a version's state as it is stored; None without one."""
     return None if state is None else hashlib.sha256(state).digest()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -117,12 +116,6 @@ class MemoryStore(Store):
 
     def _holds(self, decision_id: str) -> bool:
         return decision_id in self._open or decision_id in self._done
-
-    def peers_settings(self) -> dict[str, dict[str, str]]:
-        return {}
-
-    def flush(self) -> None:
-        """Nothing waits here."""
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
         kept = self._open.get(decision_id) or self._done.get(decision_id)
@@ -353,26 +346,6 @@ class MemoryStore(Store):
         every = self._every()
         length = max(1, -(-len(every) // n))
         return [stretch_of(every[start : start + length]) for start in range(0, len(every), length)]
-
-    # An owner: there is nothing to claim or to play back
-
-    def own(self) -> None:
-        return None
-
-    def doubt(self) -> str:
-        return ""
-
-    def newest_entry(self) -> None:
-        return None
-
-    def holds_entry(self, number: int, digest: str) -> bool:
-        return False
-
-    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
-        return nullcontext()
-
-    def let_go(self) -> None:
-        self.close()
 
 
 def _copied(version: ModelVersion) -> ModelVersion:

@@ -9,7 +9,6 @@ what it decides: that goes into a journal first, and from there, by `take`, into
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import time
@@ -26,7 +25,7 @@ from ..records import Action, Decision, Reason, RetrainReport, Source
 from .base import Store
 from .connections import Database
 from .journal import Journal, Record, TakenLabel, journal_path
-from .ledger import row_sum, state_sum
+from .ledger import is_sound, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
@@ -84,7 +83,6 @@ from .schema import (
     DECISION,
     EVENT,
     LABEL,
-    LEDGER,
     RESERVED,
     SETTING,
     TRACE,
@@ -102,8 +100,6 @@ if TYPE_CHECKING:
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 NAMED = 20  # decisions that an event names
-IN_FORCE = 10_000  # newest labels that are held to their sums when an engine opens the store
-INSERTED = {"sqlite": "decision.rowid", "postgresql": "decision.ctid"}  # in the order of insertion: rows never change
 REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
 
@@ -217,7 +213,7 @@ class SqlStore(Store):
             return None
         row = rows[0]
         values = {"cell_id": row.cell_id, "decision_id": row.id, "channels": row.channels, "samples": row.samples}
-        if not _is_sound(TRACE.name, values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
+        if not is_sound(TRACE.name, values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
             raise StoreError(
                 f"Expected the trace of decision {row.id!r} as it was stored in {self._database.name}, its bytes have "
                 "changed; see `dengine verify`, and restore the store from a copy."
@@ -293,7 +289,7 @@ class SqlStore(Store):
         query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
         query = query.where(LABEL.c.seq.between(*((rows[0].seq, rows[-1].seq) if rows else (1, 0))))
         for row in connection.execute(query.execution_options(yield_per=CHUNK)):
-            if row.seq not in at or not _is_sound(TRACE.name, dict(zip(TRACE.c.keys(), row, strict=False))):
+            if row.seq not in at or not is_sound(TRACE.name, dict(zip(TRACE.c.keys(), row, strict=False))):
                 continue
             if not kept.any():
                 traces = np.empty((len(rows), row.channels, row.samples), dtype=np.float32)
@@ -341,7 +337,8 @@ class SqlStore(Store):
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
         query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        inserted: sa.ColumnElement[Any] = sa.literal_column(INSERTED["postgresql" if self._remote else "sqlite"])
+        # In the order of insertion: rows never change.
+        inserted: sa.ColumnElement[Any] = sa.literal_column("decision.ctid" if self._remote else "decision.rowid")
         return [
             row.id for row in self._read(query.where(_since(DECISION, since_version)).order_by(DECISION.c.time, inserted))
         ]
@@ -569,17 +566,7 @@ class SqlStore(Store):
         return self._database.holds_entry(number, digest)
 
     def doubt(self) -> str:
-        newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == self.cell_id, LEDGER.c.settings.is_not(None))
-        chained = self._read(newest.order_by(LEDGER.c.number.desc()).limit(1))
-        if chained and json.loads(chained[0].settings) != self.settings():
-            return "the settings are not those of the ledger"
-        labels = sa.select(LABEL).where(LABEL.c.cell_id == self.cell_id).order_by(LABEL.c.seq.desc()).limit(IN_FORCE)
-        corrections = sa.select(CORRECTION).where(CORRECTION.c.cell_id == self.cell_id)
-        for table, query in ((LABEL, labels), (CORRECTION, corrections)):
-            for row in self._read(query):
-                if not _is_sound(table.name, dict(zip(table.c.keys(), row, strict=True))):
-                    return f"the {table.name} of decision {row.decision_id!r} is not as it was written"
-        return ""
+        return self._database.doubt()
 
     def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         return self._database.take(records)
@@ -591,7 +578,6 @@ class SqlStore(Store):
         self._database.close(waiting=False)
 
     def close(self) -> None:
-        """Disconnect, and give the cell free."""
         self._database.close()
         if self._journal is not None:
             self._journal.close()
@@ -607,11 +593,6 @@ def _checked_wait(wait: float | None) -> float:
     if not 0.0 < seconds < math.inf:
         raise StoreError(f"Expected {name} above 0 seconds, got {shortened(said or wait)}; {WAIT} is the default.")
     return seconds
-
-
-def _is_sound(table: str, row: dict[str, Any]) -> bool:
-    """Whether a row is as it was stored."""
-    return bool(row_sum(table, row) == row["sum"])
 
 
 def _since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
