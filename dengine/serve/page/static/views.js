@@ -15,7 +15,11 @@ const DOES = {
 const CAME = { good: "It was good.", bad: "It was bad.", none: "Nothing is known of it yet." };
 const VERDICT = { kept: "Tolerance kept", open: "Not decided yet", broken: "Tolerance broken" };
 const MODES = { decides: "Decides", learns: "Learning", shadow: "Verifying all", safe: "Safe mode" };
-const BY = { "every outcome": "Every outcome is known.", audits: "Estimated by audits.", "": "Only stops are known so far; audits would bound it." };
+const BY = {
+  "every outcome": (bad) => `Every outcome is known: ${number(bad.wrong)} of ${number(bad.known)} were bad.`,
+  audits: (bad, stops) => `By audits alone: ${number(bad.wrong)} of ${number(bad.known)} were bad; the ${number(stops)} system stops are not among these.`,
+  "": (bad, stops) => `Only the ${number(stops)} system stops are known so far; audits would bound it.`,
+};
 
 export function modeOf(doing) {
   if (doing.safe_mode) return "safe";
@@ -68,7 +72,7 @@ function badAccepts(doing) {
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
     verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
     el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
-    small(`${number(bad.wrong)} of ${number(bad.known)} that are known about; ${number(doing.ever.stops)} system stops. ${BY[bad.by] ?? ""}`));
+    small(BY[bad.by](bad, doing.ever.stops)));
 }
 
 function wouldHave(doing) {
@@ -208,7 +212,7 @@ async function overview(get, _, doing) {
   const happened = card("events", "What happened", events.length
     ? el("ol", { class: "story" }, events.map((each) => el("li", {}, el("time", {}, moment(each.time)), " ", el("b", {}, each.kind), each.author && ` · ${each.author}`,
       el("br"), each.text.replace(/\b([0-9a-f]{12})[0-9a-f]{28,}\b/g, "$1…"))))
-    : small("Nothing yet."));
+    : small("Nothing beside decisions, labels and retrains."));
   return { title: "Overview", shown: [el("h1", {}, "Overview"), escapes, el("div", { class: "tiles" }, tiles), el("div", { class: "split" }, lines, happened)] };
 }
 
