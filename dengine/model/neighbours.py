@@ -260,7 +260,8 @@ class ModelPrediction(EngineModel):
             self._predictor = self._compile()
 
     def _compile(self) -> Any:
-        around, encoder = self.classifier.around(self.index, self.rule), self.spaces.module()
+        own, encoder = self.classifier, self.spaces.module()
+        around = RadiusNeighbours(self.index.ring, self.rule, own.radius, own.fraction or 0.0, own.reject_fraction or 0.0)
         scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable
         if encoder is not None and compiles:
             return compiled(Predictor(encoder, scale, self.gate, around).eval(), self.trace_shape)
