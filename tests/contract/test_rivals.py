@@ -3,7 +3,6 @@
 import copy
 import subprocess
 import sys
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,8 @@ from scipy.stats import binom
 from dengine import Action, DataEngine, Policy, Recipe, replay, wilson_interval
 from dengine.errors import SettingError
 from dengine.experiments.rivals import RIVALS, Rival, make_rival
-from dengine.experiments.rivals.base import segment_means
 from dengine.experiments.rivals.methods import (
-    BANDWIDTHS,
-    chosen_bandwidth,
     guaranteed_threshold,
-    kernel_counts,
     risk_bound,
 )
 from dengine.model import Model
@@ -121,13 +116,6 @@ def test_a_label_between_two_trainings_counts_where_the_method_learns_at_once(na
     assert changed == (name in LEARN_AT_ONCE)
 
 
-@pytest.mark.parametrize("name", [name for name in RIVALS if name != "minirocket"])  # aeon would compile for a minute
-def test_a_rival_takes_several_channels(name: str, traces: Any) -> None:
-    X, y = traces
-    wide = np.concatenate([X, -X], axis=1)
-    assert len(new(name).fit(wide[:120], y[:120]).decide(wide[120:])) == 40
-
-
 # ------------------------------------------------------------------------------------------------------------- by name
 
 
@@ -143,12 +131,9 @@ def test_the_table_is_complete_and_imports_nothing() -> None:
     [
         ("nope", {}, "rival among knn, wskde"),
         ("knn", {"n": 3}, "rival knn has no parameter n; it has k"),
-        ("always", {"n": 3}, "it has none"),
         ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
         ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
-        ("gp", {"n_components": 1.5}, "n_components to be an integer"),
         ("gp", {"amplitude": 1.0}, "amplitude above 1, got 1.0"),
-        ("minirocket", {"holdout": 1.0}, "holdout to be a number above 0 and below 1"),
         ("mapie", {"fwer": "none"}, "bonferroni_holm or fixed_sequence"),
         ("river", {"threshold": 0.5}, "0.5 < threshold <= 1"),
     ],
@@ -158,12 +143,6 @@ def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str)
         pytest.importorskip(RIVALS[name].needs)
     with pytest.raises(SettingError, match=words):
         make_rival(name, LOOSE, 0, **params)
-
-
-def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(RIVALS, "absent", type("Absent", (RIVALS["knn"],), {"needs": "a_library_of_nobody"}))
-    with pytest.raises(SettingError, match=r'needs a_library_of_nobody.*pip install "dengine\[rivals\]"'):
-        make_rival("absent", LOOSE, 0)
 
 
 # ---------------------------------------------------------------------------------------------------- methods, by hand
@@ -189,24 +168,6 @@ def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> 
     )
 
 
-def test_among_dense_traces_the_kernels_sample_size_is_kishs() -> None:
-    grid = np.stack(np.meshgrid(*[np.linspace(-3, 3, 121)] * 2), axis=-1).reshape(-1, 2)
-    distances = (grid**2).sum(axis=1)[None]
-    weights = np.exp(-0.5 * distances / 0.4**2)
-    n_success, n_failure = kernel_counts(distances, np.ones(len(grid), dtype=bool), 0.4)
-    assert n_failure[0] == 0
-    assert n_success[0] == pytest.approx(weights.sum() ** 2 / (weights**2).sum(), rel=1e-3)
-
-
-def test_the_bandwidth_follows_the_detail_that_the_labels_have() -> None:
-    rng = np.random.default_rng(0)
-    Z = rng.normal(size=(400, 2))
-    fine = np.sin(12.0 * Z[:, 0]) > 0
-    noise = rng.random(400) < 0.7
-    assert chosen_bandwidth(Z, fine, 0.1) < 0.15
-    assert chosen_bandwidth(Z, noise, 0.1) == max(BANDWIDTHS)
-
-
 @pytest.mark.parametrize(("wrong", "n", "delta"), [(0, 20, 0.1), (3, 50, 0.05), (49, 50, 0.2)])
 def test_the_risk_bound_inverts_the_binomial_tail(wrong: int, n: int, delta: float) -> None:
     assert binom.cdf(wrong, n, risk_bound(wrong, n, delta)) == pytest.approx(delta, rel=1e-9)
@@ -227,36 +188,6 @@ def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_
     rng = np.random.default_rng(1)
     found = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
     assert np.mean(found) <= 0.2
-
-
-@pytest.mark.parametrize("name", ["minirocket", "mapie"])
-def test_labels_of_noise_get_no_threshold(name: str, traces: Any) -> None:
-    noise = np.random.default_rng(2).random(160) < 0.5
-    rival = new(name, Policy(alpha=0.1, lower_bound=0.9)).fit(traces[0], noise)
-    assert set(rival.decide(traces[0])) == {Action.VERIFY}
-
-
-def test_a_smaller_alpha_gives_a_wider_credible_interval(traces: Any) -> None:
-    X, y = traces
-    bounds = [new("gp", Policy(alpha, 0.9)).fit(X[:80], y[:80]).predict_interval(X[120:]) for alpha in (0.5, 0.1, 0.01)]
-    for (lower, upper), (wider_lower, wider_upper) in pairwise(bounds):
-        assert (wider_lower < lower).all()
-        assert (wider_upper > upper).all()
-
-
-def test_the_stream_learner_learns_each_label_once(traces: Any) -> None:
-    X, y = traces
-    rival = new("river").fit(X[:60], y[:60])
-    for x, label in zip(X[60:120], y[60:120], strict=True):
-        rival.add(x, label)
-    before = rival.predict_interval(X[120:])
-    np.testing.assert_array_equal(rival.fit(X[:120], y[:120]).predict_interval(X[120:]), before)
-
-
-def test_segment_means_are_means_of_stretches_that_cover_the_trace() -> None:
-    X = np.arange(14.0, dtype=np.float32).reshape(1, 2, 7)
-    np.testing.assert_allclose(segment_means(X, 2), [[1.0, 4.5, 8.0, 11.5]])
-    np.testing.assert_allclose(segment_means(X, 50), X.reshape(1, 14))
 
 
 # -------------------------------------------------------------------------------------------------------- in the loop

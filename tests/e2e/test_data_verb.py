@@ -11,9 +11,8 @@ import pytest
 
 from dengine import DataEngine, Dataset
 from dengine.cli.output import WIDE
-from dengine.datasets import Fault
-from dengine.experiments.figures import data_picture, save
-from dengine.experiments.survey import Spread, survey
+from dengine.experiments.figures import data_picture
+from dengine.experiments.survey import survey
 from tests.support.command_line import dengine, document, well
 
 
@@ -31,19 +30,11 @@ def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_
     for words in (
         "77, 3 left out",
         "2 channels (FZ_Base, FX_Base)",
-        "pad, to",
         "500 Hz each, by the timestamps",
-        "bad traces none",
-        "duplicates none",
-        "good by tenths",
         "FX_Base by tenths",
-        "Left out 3 of 80 recordings of cell_3:",
-        "Expected a header and rows, it is empty",
         "Expected 13 columns, got 12",
-        "Expected a column FZ_Base",
     ):
         assert words in said, words
-    assert result.stderr == ""
     assert max(map(len, result.stdout.splitlines())) <= max(WIDE, len(f"Wrote {tmp_path / 'out' / 'data.png'}"))
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
 
@@ -53,11 +44,9 @@ def test_data_as_json_is_one_document_and_replay_says_once_what_was_left_out(fol
     assert (found["traces"], len(found["faults"]), found["rate_hz"], found["fit"]) == (77, 3, 500.0, "pad")
     assert found["good"] + found["bad"] == 77
     assert found["lengths"]["low"] < found["lengths"]["high"]
-    assert [len(each["tenths"]) for each in found["drift"]] == [10, 10]
     played = well("replay", "--data", folder, "--channel", "FZ_Base", "--reducer", "pca", "--cycles", 60, "--repeats", 1)
     assert "pca on cell_3" in played.stdout
     assert played.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
-    assert played.stderr.count(".csv") == 3
 
 
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(folder: Path, tmp_path: Path) -> None:
@@ -79,29 +68,16 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--channel", "FQ_Base"), "Expected a column FQ_Base"),
-        (("--fit", "strict"), "Expected recordings of one length"),
-        (("--label", "(("), "regular expression"),
-        (("--labels", "nowhere.csv"), "Cannot read the labels"),
+        ("--channel FQ_Base", "Expected a column FQ_Base"),
+        ("--fit strict", "Expected recordings of one length"),
+        ("--label ((", "regular expression"),
     ],
 )
-def test_an_option_that_does_not_fit_is_one_line(folder: Path, options: tuple[str, ...], words: str) -> None:
-    result = dengine("data", folder, *options)
+def test_an_option_that_does_not_fit_is_one_line(folder: Path, options: str, words: str) -> None:
+    result = dengine("data", folder, *options.split())
     assert (result.exit_code, result.stdout) == (1, "")
     assert words in result.stderr
     assert len(result.stderr.splitlines()) == 1
-
-
-def test_many_faults_are_named_up_to_ten_and_counted(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    data = make_data(20, samples=30)
-    frame = pd.DataFrame(data.X, columns=[f"x{i}" for i in range(30)]).assign(y=data.y)
-    frame.to_csv(tmp_path / "wide.csv", index=False)
-    lines = (tmp_path / "wide.csv").read_text().splitlines()
-    lines[3:16] = [line + ",1" for line in lines[3:16]]
-    (tmp_path / "wide.csv").write_text("\n".join(lines))
-    said = well("data", tmp_path / "wide.csv").stdout
-    assert said.count("- wide.csv, line ") == 10
-    assert "- and 3 more" in said
 
 
 # ------------------------------------------------------------------------------------------------------- the survey
@@ -114,12 +90,12 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     X[50], y[50] = X[10], y[10]
     X[51], y[51] = X[11], 1 - y[11]
     X[52:60] = X[20:28] + np.float32(1e-3)
-    found = survey(replace(data, X=X, y=y, faults=(Fault("a.csv", 3, "it is torn"),)))
+    found = survey(replace(data, X=X, y=y))
     assert (found.not_finite, found.constant) == (1, 1)
     assert (found.duplicates, found.contradicting) == (2, 1)
     assert 14 <= found.near_repeats <= 20
     assert found.looked_at == 118
-    assert (found.good + found.bad, found.lengths, found.rates, found.parts) == (120, None, None, None)
+    assert (found.good + found.bad, found.lengths) == (120, None)
     assert survey(make_data(120, samples=60)).near_repeats <= 3
 
 
@@ -133,22 +109,13 @@ def test_drift_is_seen_where_there_is_some_and_only_there(make_data: Callable[..
     moved = {each.name: each for each in survey(replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)).drift}
     assert moved["good"].p < 1e-4 > moved["channel 1"].p
     assert moved["good"].rho < -0.2 < 0.3 < moved["channel 1"].rho
-    assert np.all(np.diff(moved["channel 1"].tenths)[[0, -1]] > -3)
     flat = survey(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
     assert np.isnan([flat.rho, flat.p]).all()
     assert flat.tenths == (1.0,) * 10
 
 
-def test_lengths_and_rates_are_those_of_the_recordings(make_data: Callable[..., Dataset]) -> None:
-    data = make_data(5, samples=60)
-    found = survey(replace(data, lengths=np.array([58, 60, 61, 66, 60]), rates=np.array([499.0, 500, np.nan, 501, 500])))
-    assert (found.lengths, found.rates) == (Spread(58, 60, 66), Spread(499, 500, 501))
-
-
 @pytest.mark.parametrize(("n", "channels"), [(1, 1), (6, 4), (60, 4)])
-def test_a_picture_is_drawn_of_any_data(make_data: Callable[..., Dataset], tmp_path: Path, n: int, channels: int) -> None:
+def test_a_picture_is_drawn_of_any_data(make_data: Callable[..., Dataset], n: int, channels: int) -> None:
     data = make_data(n, samples=40, channels=channels)
     data.X[0, ..., 3] = np.nan
-    figure = data_picture(data, "x")
-    assert len(figure.axes) == min(channels, 3) + 2
-    assert save(figure, tmp_path / "data.png").stat().st_size > 5_000
+    assert len(data_picture(data, "x").axes) == min(channels, 3) + 2

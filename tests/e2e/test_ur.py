@@ -1,27 +1,24 @@
 """A Universal Robots controller: its protocol, its force recorded sample for sample, a cell of orders; over real TCP."""
 
-import json
 import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from dengine import DataEngine, Dataset, Outcome, Policy, Reason, ReplayCell
+from dengine import DataEngine, Dataset, Policy, ReplayCell
 from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
 from dengine.cells.ur import RobotProgram, Trouble
 from dengine.cells.ur.cell import ANSWER, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, after, word
 from dengine.cells.ur.protocol import TYPES, Kind, Package, Packages, Recipe, column_of
 from dengine.cells.ur.stream import Lateness, RtdeClient, RtdeStream
-from dengine.cli import main
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError
+from tests.support.command_line import dengine, document, said, succeed
 
 SAMPLES = 80
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
@@ -69,16 +66,6 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
 
 
 # One connection.
-
-
-def test_a_client_gets_every_package_of_what_it_asked_for() -> None:
-    with FakeController(speed=None) as fake:
-        client = RtdeClient(fake.host, fake.port, ("timestamp", "robot_mode", "actual_TCP_force"))
-        rows = list(islice(client.rows(), 50))
-        client.close()
-    assert client.outputs.columns[:3] == ("timestamp", "robot_mode", "actual_TCP_force[0]")
-    np.testing.assert_allclose(np.diff([row[0] for row in rows]), 0.002)
-    assert {row[1] for row in rows} == {7}
 
 
 @pytest.mark.parametrize(
@@ -150,14 +137,6 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(pa
     assert report.missing >= len(fake.lost)
 
 
-def test_what_comes_late_is_in_its_place_and_counted(parts: Dataset) -> None:
-    with FakeController(RobotProgram(parts), troubles=[Trouble(0, 10, "hold", 60)]) as fake, cell_of(fake) as cell:
-        trace = cell.insert()  # in real time
-    np.testing.assert_array_equal(trace, parts.X[0])
-    assert cell.last.late >= 20  # of 60, those that came over 0.02 s late
-    assert cell.last.missing == 0
-
-
 def test_a_controller_whose_clock_begins_anew_ends_the_trace_it_was_in(parts: Dataset) -> None:
     with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(1, 30, "reset")]) as fake, cell_of(fake) as cell:
         traces = []
@@ -225,51 +204,20 @@ def test_several_channels_are_a_trace_of_several_rows_and_have_a_contract(parts:
 # The cell.
 
 
+def decisions(cell: Cell, n: int) -> list[dict]:
+    with DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0) as engine:
+        cycles = list(engine.run(cell, n))
+    return [asdict(each.decision) | {"id": "", "outcome": each.outcome, "success": each.success} for each in cycles]
+
+
 @pytest.mark.parametrize("confirm", [False, True])
-def test_a_robots_cell_is_a_cell(parts: Dataset, confirm: bool) -> None:
-    fine = Outcome.CONFIRMED if confirm else Outcome.UNKNOWN
-    with FakeController(RobotProgram(parts, confirm=confirm), speed=None) as fake, cell_of(fake) as cell:
+def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(make_data, confirm: bool) -> None:
+    data = make_data(120, samples=SAMPLES, failures=0.4)
+    with FakeController(RobotProgram(data, confirm=confirm), speed=None) as fake, cell_of(fake) as cell:
         assert isinstance(cell, Cell)
-        for i in range(12):
-            np.testing.assert_array_equal(cell.insert(), parts.X[i])
-            if i % 3 == 0:
-                assert cell.verify() == bool(parts.y[i])
-            elif i % 3 == 1:
-                assert cell.proceed() is (fine if parts.y[i] else Outcome.STOPPED)
-            else:
-                cell.reject()
-        assert cell.incomplete == 0
-
-
-def decisions(cell: Cell, cycles: int, **how) -> list[dict]:
-    engine = DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0, **how)
-    found = []
-    with engine:
-        for cycle in engine.run(cell, cycles):
-            told = asdict(cycle.decision)
-            told.pop("id")
-            found.append({**told, "outcome": cycle.outcome, "success": cycle.success})
-    return found
-
-
-def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(make_data) -> None:
-    data = make_data(120, samples=SAMPLES)
-    with FakeController(RobotProgram(data), speed=None) as fake, cell_of(fake) as cell:
         live = decisions(cell, 120)
-    assert live == decisions(ReplayCell(data), 120)
-    assert {told["action"] for told in live} >= {"verify", "accept"}
-
-
-def test_a_trace_with_a_gap_is_verified_and_never_learned_from(parts: Dataset) -> None:
-    troubles = [Trouble(part, 30, "drop", 3) for part in (2, 20, 40)]
-    engine = DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0)
-    with engine, FakeController(RobotProgram(parts), speed=None, troubles=troubles) as fake, cell_of(fake) as cell:
-        cycles = list(engine.run(cell, 60))
-        learned = engine.retrain().n_traces
-    broken = [i for i, cycle in enumerate(cycles) if cycle.decision.reason is Reason.NOT_FINITE]
-    assert broken == [2, 20, 40]
-    assert all(cycles[i].decision.action == "verify" for i in broken)
-    assert learned == sum(cycle.success is not None for cycle in cycles) - 3
+    assert live == decisions(ReplayCell(data, confirm=confirm), 120)
+    assert {told["action"] for told in live} == {"verify", "accept", "reject"}
 
 
 class Deaf(RobotProgram):
@@ -346,7 +294,6 @@ def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its
             assert program.outputs[ANSWER] == word(1, Answer.DONE)  # `open` waited for it
             second.reject()
             assert fake.inputs[ORDER] == word(2, Verb.REJECT)
-        assert program.played == [0]
         program.step = lambda inputs: {**program.outputs, ANSWER: word(1, Answer.DONE)}  # it owes an answer to order 2
         with pytest.raises(CellError, match="it owes an answer to order 2"):
             UrCell(fake.host, port=fake.port, start_timeout=0.5)
@@ -355,21 +302,18 @@ def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its
 # From the shell.
 
 
-def run(*words: str) -> Result:
-    return CliRunner().invoke(main, ["run", "--cell", "ur", *words])
+def run_on(fake: FakeController, store: Path) -> tuple[object, ...]:
+    return "run", "--cell", "ur", "--host", f"{fake.host}:{fake.port}", "--samples", SAMPLES, "--store", store
 
 
 def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dataset, tmp_path: Path) -> None:
-    store = str(tmp_path / "cell.db")
+    store = tmp_path / "cell.db"
     with FakeController(RobotProgram(parts), speed=None, troubles=[Trouble(3, 9, "drop", 2)]) as fake:
-        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
-        done = run(*words, "--cycles", "12", "--json")
-        assert done.exit_code == 0, done.output
-        told = json.loads(done.stdout)
-        done = run(*words[:-2], "--cycles", "3")
+        told = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
+        shown = said(*run_on(fake, store), "--cycles", 3)
     assert (told["total"]["verified"], told["recording"]["incomplete"]) == (12, 1)
     assert told["recording"]["missing"] >= 2
-    assert "Traces with a gap, verified and never learned from: 0." in " ".join(done.output.split())
+    assert "Traces with a gap, verified and never learned from: 0." in shown
     with DataEngine.open(store) as engine:
         kept = engine.store.labelled().traces[:, 0]  # of a trace with a gap the label is counted, not the trace
         assert engine.store.status()["decisions"] == 15
@@ -379,38 +323,34 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(parts: Dat
 def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
     parts: Dataset, tmp_path: Path
 ) -> None:
-    program, store = RobotProgram((parts.X[:10], parts.y[:10])), str(tmp_path / "cell.db")  # then its bin is empty
+    program, store = RobotProgram((parts.X[:10], parts.y[:10])), tmp_path / "cell.db"  # then its bin is empty
     with FakeController(program, speed=None) as fake:
-        words = ("--host", f"{fake.host}:{fake.port}", "--samples", str(SAMPLES), "--store", store, "--reducer", "pca")
-        done = run(*words, "--cycles", "14")
-        said = " ".join(done.output.split())
+        done = dengine(*run_on(fake, store), "--reducer", "pca", "--cycles", 14)
+        shown = " ".join(done.output.split())
         assert done.exit_code == 1
-        assert "1 to 10 100 %" in said
-        assert (
-            "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14 cycles were done."
-            in said
-        )
-        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in said
+        assert "1 to 10 100 %" in shown
+        assert "order 21 (insert), it says that it failed; look at the part, then begin again. 10 of 14" in shown
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 goes on there." in shown
         program.played.clear()  # somebody has filled it
-        assert run(*words[:-2], "--cycles", "4").exit_code == 0
+        succeed(*run_on(fake, store), "--cycles", 4)
     with DataEngine.open(store) as engine:
         assert engine.store.status()["decisions"] == 14
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
-        ((), "Expected the robot's address for --cell ur"),
-        (("--host", "127.0.0.1:x"), "Expected a host, or host:port"),
-        (("--host", "127.0.0.1:1"), "it cannot be reached"),
-        (("--host", "127.0.0.1:1", "--trigger", "bits"), "Expected a trigger, as bit=0"),
-        (("--host", "127.0.0.1:1", "--channel", "FZ"), "Expected a channel among FX_Base"),
+        ("", "Expected the robot's address for --cell ur"),
+        ("--host 127.0.0.1:x", "Expected a host, or host:port"),
+        ("--host 127.0.0.1:1", "it cannot be reached"),
+        ("--host 127.0.0.1:1 --trigger bits", "Expected a trigger, as bit=0"),
+        ("--host 127.0.0.1:1 --channel FZ", "Expected a channel among FX_Base"),
     ],
 )
-def test_what_is_wrong_with_a_robot_is_one_line(words: tuple[str, ...], said: str) -> None:
-    done = run(*words)
+def test_what_is_wrong_with_a_robot_is_one_line(words: str, expected: str) -> None:
+    done = dengine("run", "--cell", "ur", *words.split())
     assert done.exit_code == 1
-    assert said in " ".join(done.output.split())
+    assert expected in " ".join(done.output.split())
     assert "Traceback" not in done.output
 
 

@@ -4,7 +4,6 @@ URScript reads nearly as Python: the program is turned into it line by line, and
 controller shows is listed in docs/howto/plc_and_robot.md.
 """
 
-import asyncio
 import re
 import socket
 import threading
@@ -12,21 +11,16 @@ import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from inspect import signature
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, Policy, Recipe
-from dengine.cells import FakeController, RtdeRecorder, UrCell
-from dengine.cells.ur import RobotProgram
-from dengine.serve.robot_calls import RobotCalls
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
-from tests.support.serving import served
+from tests.support.serving import PushedTraces, served
 
 xml_rpc = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
 pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
@@ -44,20 +38,6 @@ MANUAL = {  # of the script manual of e-Series, version 5
     *("set_standard_digital_out", "get_standard_digital_in", "set_flag", "get_flag", "write_output_integer_register"),
     *("socket_open", "socket_close", "textmsg", "rpc_factory"),
 }
-
-
-def arguments(call: str) -> int:
-    return len([each for each in call.split(",") if each.strip()])
-
-
-def test_every_remote_call_is_there_with_that_many_arguments() -> None:
-    table = RobotCalls(None).table()
-    calls = re.findall(r"dengine\.(\w+)\(([^)]*)\)", "\n".join(CODE))
-    assert {name for name, _ in calls} == {"begin", "action_recorded", "report", CLOSE}
-    for name, given in calls:
-        if name == CLOSE:  # the handle's own
-            continue
-        signature(table[name]).bind(*range(arguments(given)))
 
 
 def test_every_block_has_its_end_and_every_function_is_known() -> None:
@@ -98,24 +78,11 @@ class Handle(xmlrpc.client.ServerProxy):
         self("close")()
 
 
-class Recorder:
-    """A recorder of the traces that the robot of paper pushes in."""
-
-    def __init__(self) -> None:
-        self.traces: list[Any] = []
-
-    def arm(self) -> None:
-        self.traces.clear()
-
-    def record(self, timeout: float) -> Any:
-        return SimpleNamespace(trace=self.traces.pop())
-
-
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[SimpleNamespace]:
     """A server at a port of its own, its service, and its recorder."""
     service = CellService(lambda: DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE), deadline=30.0)
-    recorder = Recorder()
+    recorder = PushedTraces()
     with closing(service), served(Starlette(routes=xml_rpc.routes(service, recorder)), lifespan="off") as port:
         yield SimpleNamespace(service=service, recorder=recorder, port=port)
 
@@ -219,25 +186,3 @@ def test_a_part_that_was_left_in_the_fixture_is_checked_first(cell: SimpleNamesp
     robot.play()
     assert robot.checked == [-1, 0]
     assert not any(robot.flags.values())
-
-
-def test_the_recorder_of_rtde_is_one_that_the_calls_can_use(make_data) -> None:
-    data = make_data(3, samples=SAMPLES, seed=3)
-
-    async def shift() -> None:
-        with (
-            FakeController(RobotProgram(data), speed=None) as fake,
-            RtdeRecorder(fake.host, samples=SAMPLES, port=fake.port) as recorder,
-            UrCell(fake.host, port=fake.port, samples=SAMPLES) as robot,  # it moves; the calls only listen
-        ):
-            calls = RobotCalls(service, recorder, patience=60.0)
-            for x in data.X:
-                id_ = await calls.begin()
-                await asyncio.to_thread(robot.insert)
-                answer = await calls.decide_recorded(id_)
-                assert answer["id"] == id_
-                assert np.array_equal((await service.find(id_)).trace[0], x)
-                await asyncio.to_thread(robot.verify)
-
-    with closing(CellService(lambda: DataEngine(recipe=RECIPE), deadline=30.0)) as service:
-        asyncio.run(shift())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from importlib.resources import files
 
 import numpy as np
@@ -27,26 +27,15 @@ def good(**changes: float | str) -> Conditions:
     return replace(draw_conditions(ALWAYS_GOOD, np.random.default_rng(0)), force_limit_n=40.0, **changes)
 
 
-@pytest.mark.parametrize(("channels", "shape"), [("z", (1000,)), ("all", (6, 1000))])
-def test_a_trace_has_one_thousand_samples_per_channel(channels: str, shape: tuple[int, ...]) -> None:
-    trace = SimulatedCell(channels=channels).insert()
-    assert trace.shape == shape
-    assert trace.dtype == np.float32
-    assert np.isfinite(trace).all()
-
-
-def test_a_well_aligned_part_seats_and_meets_the_bottom_late() -> None:
+def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests_on_the_rim() -> None:
     pushed = push(good())
     assert abs(pushed.height_mm) < 0.5
     force = pushed.wrench[:, 2]
     assert np.abs(force[:400]).max() < 3
     assert 8 < force[-50:].mean() < 41
-
-
-def test_a_part_beside_the_hole_rests_on_the_rim_at_the_force_limit() -> None:
-    pushed = push(good(offset_x_mm=5.0))
-    assert pushed.height_mm > 11
-    assert pushed.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
+    beside = push(good(offset_x_mm=5.0))
+    assert beside.height_mm > 11
+    assert beside.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
 
 
 def traces(insertions: list[Insertion]) -> np.ndarray:
@@ -79,8 +68,8 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
 
 
 def test_a_good_part_sent_back_costs_a_further_cycle() -> None:
-    cell = SimulatedCell(ALWAYS_GOOD)
-    cell.insert()
+    cell = SimulatedCell(ALWAYS_GOOD, channels="all")
+    assert cell.insert().shape == (6, 1000)
     cell.reject()
     cell.insert()
     cell.verify()
@@ -103,38 +92,13 @@ def test_a_part_is_taken_once(call: str) -> None:
 
 def test_scenarios_change_what_they_say_and_nothing_else() -> None:
     base = CellParameters()
-    changed = {
-        name: {
-            field.name
-            for field in fields(base)
-            if getattr(scenario(base, 99, 100), field.name) != getattr(base, field.name)
-        }
-        for name, scenario in SCENARIOS.items()
-    }
-    assert changed == {
-        "nominal": set(),
-        "wear": {"friction"},
-        "variant": {"part_mass_kg", "clearance_mm", "chamfer_mm"},
-        "bias_jump": {"bias_offset_n"},
-    }
+    late = {name: asdict(scenario(base, 99, 100)) for name, scenario in SCENARIOS.items()}
+    changed = {name: {key for key, value in asdict(base).items() if each[key] != value} for name, each in late.items()}
+    variant = {"part_mass_kg", "clearance_mm", "chamfer_mm"}
+    assert changed == {"nominal": set(), "wear": {"friction"}, "variant": variant, "bias_jump": {"bias_offset_n"}}
     assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + 0.35)
     for name in ("variant", "bias_jump"):
         assert SCENARIOS[name](base, 49, 100) == base
-
-
-def test_a_bias_jump_shifts_the_force_and_keeps_the_truth() -> None:
-    before, after = simulate(4, seed=1, n_jobs=1), simulate(4, seed=1, n_jobs=1, scenario="bias_jump")
-    assert [each.height_mm for each in before] == [each.height_mm for each in after]
-    moved = traces(after) - traces(before)
-    assert not moved[:2].any()
-    np.testing.assert_allclose(moved[2:].mean(axis=1), 8.0, atol=0.2)
-
-
-def test_the_sensor_draw_does_not_touch_the_world() -> None:
-    quiet = insert_once(replace(CellParameters(), noise_n=(0.0, 0.0), bias_n=(0.0, 0.0)), seed=4, cycle=0)
-    loud = insert_once(replace(CellParameters(), noise_n=(2.0, 2.0), bias_n=(5.0, 5.0)), seed=4, cycle=0)
-    assert quiet.conditions == loud.conditions
-    assert quiet.height_mm == loud.height_mm
 
 
 @pytest.mark.parametrize(
@@ -142,15 +106,11 @@ def test_the_sensor_draw_does_not_touch_the_world() -> None:
     [
         (lambda: CellParameters(friction=(0.5, 0.1)), "low <= high"),
         (lambda: CellParameters(debris=8.0), "probability"),
-        (lambda: CellParameters(noise_n=(-1.0, 1.0)), "at least 0"),
         (lambda: CellParameters(debris=0.6, weak_grip=0.6), "sum to at most 1"),
         (lambda: find_scenario("rain"), "nominal, wear, variant, bias_jump"),
         (lambda: SimulatedCell(channels="x"), "z, all"),
-        (lambda: SimulatedCell(cycles=0), "at least 1"),
         (lambda: simulate(0), "at least 1"),
-        (lambda: simulate(1, channels="y"), "z, all"),
         (lambda: push(good(), time_step_s=0.0007), "divides 2 ms"),
-        (lambda: push(good(chamfer_mm=0.0)), "above zero"),
     ],
 )
 def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None:
@@ -158,12 +118,10 @@ def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None
         bad()  # type: ignore[operator]
 
 
-@pytest.mark.parametrize(("channels", "shape"), [("z", (4, 1000)), ("all", (4, 6, 1000))])
-def test_saved_traces_come_back_within_one_step(tmp_path, channels: str, shape: tuple[int, ...]) -> None:
-    made = simulate(4, seed=6, n_jobs=1, channels=channels)
+def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
+    made = simulate(4, seed=6, n_jobs=1, channels="all")
     with np.load(save_insertions(tmp_path / "traces.npz", made, seed=6), allow_pickle=False) as saved:
-        assert saved["X"].dtype == np.int16
-        assert saved["X"].shape == shape
+        assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 6, 1000))
         np.testing.assert_allclose(saved["X"] * saved["scale"], traces(made), atol=0.51 * float(saved["scale"].max()))
         np.testing.assert_array_equal(saved["y"], [each.success for each in made])
         np.testing.assert_array_equal(saved["cause"], [each.cause for each in made])

@@ -7,9 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+
+from dengine.errors import DataError
 
 
 @contextmanager
@@ -30,6 +33,23 @@ def served(app: Any, port: int = 0, **options: Any) -> Iterator[int]:
         finally:
             server.should_exit = True
             thread.join()
+
+
+class PushedTraces:
+    """A recorder of traces that are at hand: what a robot sends is tested where it is recorded."""
+
+    def __init__(self) -> None:
+        self.traces: list[Any] = []
+        self.armed = 0
+
+    def arm(self) -> None:
+        self.traces.clear()
+        self.armed += 1
+
+    def record(self, timeout: float) -> SimpleNamespace:
+        if not self.traces:
+            raise DataError(f"Expected an insertion within {timeout:g} s, none came.")
+        return SimpleNamespace(trace=self.traces.pop(0))
 
 
 @contextmanager

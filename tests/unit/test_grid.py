@@ -1,10 +1,6 @@
 """Grids of replays: kept, gone on with, and the same on every backend."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from importlib import import_module, reload
 from pathlib import Path
@@ -38,34 +34,14 @@ def decisions_of(frame):
 # ------------------------------------------------------------------------------------------------------- on disk
 
 
-def test_a_kept_replay_comes_back_whole(data: Dataset, tmp_path: Path) -> None:
-    task = Task(Contender.load(RECIPE), seed=1, cycles=60)
-    played = replay(data, RECIPE, seed=1, cycles=60)
-    kept = KeptReplays(tmp_path, data)
-    assert kept.get(task) is None
-    kept.put(task, played)
-    back = kept.get(task)
-    same(played, back)
-    np.testing.assert_array_equal(back.decide_seconds, played.decide_seconds)
-    assert (back.retrains, back.seconds, back.recipe) == (played.retrains, played.seconds, played.recipe)
-    assert back.summary() == pytest.approx(played.summary(), nan_ok=True)
-
-
 def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_name_is_none(
     data: Dataset, tmp_path: Path
 ) -> None:
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
-    asked = [
-        who.with_policy(alpha=0.2),
-        replace(RECIPE, radius=0.4),
-        Recipe(PCA(2), radius=0.5),
-        Recipe(PCA(2, whiten=True), radius=0.5),
-        *(FunctionTransformer(function) for function in (np.abs, np.sqrt)),
-        *(FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))),
-        "knn",
-        replace(Contender.load("knn"), params={"k": 3}),
-    ]
+    asked = [who.with_policy(alpha=0.2), replace(RECIPE, radius=0.4), PCA(2), PCA(2, whiten=True)]
+    asked += [FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))]
+    asked += [FunctionTransformer(np.abs), "knn", replace(Contender.load("knn"), params={"k": 3})]
     others = [replace(task, **change) for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})]
     others += [replace(task, contender=Contender.load(one)) for one in asked]
     flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
@@ -103,24 +79,23 @@ def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_
     played = replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
     file = kept.path(task).read_bytes()
-    for damage in (b"", b"PK\x03\x04 not a zip", b"\x93NUMPY"):
+    found = []
+    for size in [1, 1, 3, 50] * 75:
+        damaged = np.frombuffer(file, dtype=np.uint8).copy()
+        damaged[rng.integers(len(damaged), size=size)] = rng.integers(256, size=size)
+        kept.path(task).write_bytes(damaged.tobytes())
+        found.append(kept.get(task))
+    assert found.count(None) > 200
+    for back in filter(None, found):  # what was hit is nothing that is read
+        np.testing.assert_array_equal(back.action, played.action)
+    for damage in (b"PK\x03\x04 not a zip", b"\x93NUMPY", b""):
         kept.path(task).write_bytes(damage)
         assert kept.get(task) is None
     (again,) = iterate_replays(data, [task], keep=tmp_path)
     assert not again.kept
-    same(kept.get(task), again.replay)
-    kept.path(task).write_bytes(file)
-    whole = np.frombuffer(kept.path(task).read_bytes(), dtype=np.uint8)
-    found = []
-    for size in [1, 1, 3, 50] * 75:
-        damaged = whole.copy()
-        damaged[rng.integers(len(whole), size=size)] = rng.integers(256, size=size)
-        kept.path(task).write_bytes(damaged.tobytes())
-        found.append(kept.get(task))
-    assert found.count(None) > 200
-    for back in found:
-        if back is not None:  # what was hit is nothing that is read
-            np.testing.assert_array_equal(back.action, played.action)
+    back = kept.get(task)
+    same(back, played)
+    assert (back.retrains, back.seconds, back.recipe) == (again.replay.retrains, again.replay.seconds, played.recipe)
 
 
 def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:
@@ -134,33 +109,11 @@ def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: P
     assert len(list(tmp_path.iterdir())) == len(more) == 12
 
 
-def test_a_killed_grid_redoes_only_what_was_running(data: Dataset, tmp_path: Path) -> None:
-    np.savez(tmp_path / "data.npz", X=data.X, y=data.y)
-    command = [sys.executable, "-m", "dengine", "compare", "--data", "data.npz", "--reducers", "pca", "--alphas", "0.1,0.5"]
-    command += ["--lower-bounds", "0.8,0.9", "--repeats", "40", "--keep", "kept", "--json"]
-    running = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    kept = tmp_path / "kept"
-    deadline = time.monotonic() + 120
-    while len(list(kept.glob("*.npz"))) < 3:
-        assert running.poll() is None, running.stderr.read().decode()
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    running.send_signal(signal.SIGKILL)
-    running.wait()
-    finished = {path: path.stat().st_mtime_ns for path in kept.glob("*.npz")}
-    loaded = replace(data, name="data", rate_hz=500.0)
-    tasks = grid_tasks([Contender.load("pca")], (0.1, 0.5), (0.8, 0.9), ("wilson",), range(2))
-    played = list(iterate_replays(loaded, tasks, keep=kept))
-    assert sum(each.kept for each in played) >= 3
-    assert {path: path.stat().st_mtime_ns for path in finished} == finished  # none of them was written again
-    assert sorted(each.position for each in played) == list(range(len(tasks)))
-
-
 def test_a_rival_without_its_library_is_refused_before_anything_is_played(
     data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RIVALS["always"], "needs", "no_such_library")
-    with pytest.raises(SettingError, match="always needs no_such_library"):
+    with pytest.raises(SettingError, match=r'always needs no_such_library.*pip install "dengine\[rivals\]"'):
         run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
@@ -234,15 +187,10 @@ def test_two_recipes_are_named_by_the_settings_in_which_they_differ_and_have_no_
     assert names([PLAIN, PLAIN.with_policy(guarantee="pooled", stops="all")]) == ["pca", "pca"]
     with pytest.raises(SettingError, match="pca twice"):
         contenders([PLAIN, replace(PLAIN)])
-    assert names("conv") == ["conv"]
     assert set(RIVALS) & set(RECIPES) == set()
 
 
 def test_transformers_are_named_by_their_settings_and_refused_where_these_read_alike() -> None:
     assert names([PCA(1), PCA(2)]) == ["PCA reducer=PCA(n_components=1)", "PCA reducer=PCA(n_components=2)"]
-    absolute, root = (make_pipeline(FunctionTransformer(f), PCA(2)) for f in (np.abs, np.sqrt))
-    assert len(set(names([absolute, root]))) == 2
     with pytest.raises(SettingError, match=r"PCA twice .*by Contender\(name, recipe\)"):
         names([PCA(2), PCA(2)])
-    one = Recipe(absolute)
-    assert names([one, one.with_policy(stops="all")]) == ["Pipeline", "Pipeline"]

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from dengine import Action, DataEngine, Reason, ReplayCell
 from dengine.errors import ReportError, StoreError, TraceError, shortened
 from dengine.records import LONGEST, Decision, Source, as_success
-from dengine.store import NewLabel, open_store
+from dengine.store import NewLabel
 
 GOOD = [True, np.True_, 1, 1.0, np.int8(1), np.uint64(1), np.float32(1), np.array(1), np.array(True), Fraction(1)]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
@@ -44,39 +45,30 @@ def test_a_report_of_no_label_writes_nothing_and_the_next_one_counts(engine: Dat
     for value in NONE:
         with pytest.raises(ReportError):
             engine.report(decision.id, value)
-    assert engine.store.status()["labels"] == 0
     engine.report(decision.id, 0)
-    engine.flush()
-    assert engine.store.get_decision(decision.id).success is False
-    assert engine.new_labels == 1
+    assert engine.store.status()["labels"] == engine.new_labels == 1
 
 
 NO_IDS = [None, float("nan"), 7, b"a", "", "a\0b", "\ud800", "x" * (LONGEST + 1), "x" * 2**20, "line\nbreak", ["a"], {}]
 
 
-def test_a_stop_with_no_id_queues_nothing_and_the_store_goes_on(engine: DataEngine, make_data) -> None:
+NO_PARTS = ["", "x" * (LONGEST + 1), "SN\0", "\ud800", "a\nb", 10**4200, 1.5, True, ["a"]]
+
+
+def test_a_stop_with_no_id_or_no_part_queues_nothing_and_the_store_goes_on(engine: DataEngine, make_data) -> None:
     x = make_data(2).X
     for id_ in NO_IDS:
         with pytest.raises(ReportError, match="Expected the id of a decision"):
             engine.report(id_, False, trace=x[0])
+    for part in NO_PARTS:
+        for call in (partial(engine.decide, x[0]), partial(engine.report, "lost", False, trace=x[0])):
+            with pytest.raises(TraceError, match="part's number"):
+                call(part=part)
     engine.flush()
     assert engine.store.status()["decisions"] == 0
     engine.report("lost-1", False, trace=x[0])
     engine.report(engine.decide(x[1]).id, True)
     assert engine.store.status()["sources"] == {"verification": 1, "audit": 0, "stop": 1, "confirmed": 0}
-
-
-NO_PARTS = ["", "x" * (LONGEST + 1), "SN\0", "\ud800", "a\nb", 10**4200, -(10**4200), 1.5, True, ["a"]]
-
-
-def test_a_part_that_no_label_bears_is_refused_before_anything_is_queued(engine: DataEngine, make_data) -> None:
-    x = make_data(1).X[0]
-    for part in NO_PARTS:
-        with pytest.raises(TraceError, match="part's number"):
-            engine.decide(x, part=part)
-        with pytest.raises(TraceError, match="part's number"):
-            engine.report("lost", False, trace=x, part=part)
-    assert engine.store.status()["decisions"] == 0
 
 
 class Rival:
@@ -146,19 +138,10 @@ def test_a_rival_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(wro
         assert engine.store.status()["write_failures"] == 0
 
 
-@pytest.fixture(params=["memory", "sqlite"])
-def store(request: pytest.FixtureRequest, tmp_path: Path):
-    opened = open_store(None if request.param == "memory" else tmp_path / "store.db")
-    yield opened
-    opened.close()
-
-
 FINE = Decision("a", Action.VERIFY, Action.VERIFY, 0.0, 1.0, 0, 0, None, 0, Reason.NO_MODEL, False, 1.0)
 UNSTORABLE = [
-    *({"id": value} for value in (None, 7, "", float("nan"), "x" * 2**20, "a\0")),
-    *({"lower": value} for value in (float("nan"), float("inf"), -1.0, None, "0")),
-    *({"upper": value} for value in (float("nan"), 2.0)),
-    *({"propensity": value} for value in (float("nan"), -0.5)),
+    *({"id": value} for value in (None, 7, "", "x" * 2**20, "a\0")),
+    *({name: value} for name in ("lower", "upper", "propensity") for value in (float("nan"), -1.0, None, "0")),
     *({"n_success": value} for value in (2**70, -1, 1.5, True, None)),
     *({"model_version": value} for value in (2**63, -1)),
     *({"action": value} for value in ("verify!", None, 0)),

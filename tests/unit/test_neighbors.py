@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dengine.decision.references import FEWEST_PARTS, RadiusIndex, ReferenceRing, label_agreement
-from dengine.decision.rule import script
+from dengine.decision.references import FEWEST_PARTS, RadiusIndex, label_agreement
 
 
 def points(n: int, d: int = 2, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -40,15 +38,6 @@ def test_the_surface_of_the_ball_counts() -> None:
     assert (n_success[0], n_failure[0]) == (1, 1)
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.2])
-def test_counts_do_not_depend_on_the_order_of_the_points(fraction: float) -> None:
-    Z, y = points(100)
-    Z[50:] = Z[:50]  # ties too
-    order = np.random.default_rng(1).permutation(100)
-    one, other = filled(Z, y), filled(Z[order], y[order])
-    np.testing.assert_array_equal(one.count(Z, 0.5, fraction), other.count(Z, 0.5, fraction))
-
-
 @settings(deadline=None)
 @given(st.lists(st.integers(0, 25), min_size=1, max_size=8), st.integers(1, 20))
 def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacity: int) -> None:
@@ -63,24 +52,6 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
     assert held == sorted(map(tuple, Z[kept].tolist()))
     expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
     assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
-
-
-def test_adding_one_by_one_is_adding_at_once() -> None:
-    Z, y = points(30)
-    spaces = np.arange(30) % 3
-    at_once, ring = filled(Z, y, spaces, capacity=20), ReferenceRing(2, 20)
-    for z, label, space in zip(Z, y, spaces, strict=True):
-        ring.put(torch.from_numpy(z), float(label), int(space))
-    for name, buffer in at_once.ring.named_buffers():
-        assert torch.equal(buffer, ring.get_buffer(name)), name
-
-
-@pytest.mark.parametrize(
-    ("Z", "y", "spaces"), [(np.zeros((2, 3)), [0, 1], None), (np.zeros((2, 2)), [0], None), (np.zeros((2, 2)), [0, 1], [0])]
-)
-def test_points_labels_and_spaces_that_do_not_fit_together_are_refused(Z, y, spaces) -> None:
-    with pytest.raises(ValueError, match=r"Expected points \(n, 2\)"):
-        RadiusIndex(2).add(Z, y, spaces)
 
 
 @settings(deadline=None)
@@ -113,20 +84,6 @@ def test_a_query_beyond_all_measure_has_no_neighbours_even_by_fraction() -> None
     for query in (np.inf, np.nan, 1e30):  # squared, the last overflows float32
         n_success, n_failure = filled(Z, y).count(np.full((1, 2), query), 0.5, fraction=0.3)
         assert (n_success[0], n_failure[0]) == (0, 0)
-
-
-@pytest.mark.parametrize("fraction", [0.0, 0.1, 1.0])
-def test_the_scripted_ring_counts_as_the_eager_one(fraction: float) -> None:
-    Z, y = points(200)
-    eager = filled(Z, y, np.arange(200) % 2, capacity=150).ring
-    scripted = script(filled(Z, y, np.arange(200) % 2, capacity=150).ring)
-    for ring in (eager, scripted):
-        for i, z in enumerate(torch.from_numpy(Z[:8])):
-            ring.put(z, float(i % 2), i % 2, i % 3)
-    for query in torch.randn(20, 2, 2, generator=torch.Generator().manual_seed(0)):
-        one, other = eager.squared_distances(query), scripted.squared_distances(query)
-        assert torch.equal(one, other)
-        assert eager.count_near(one, 0.7, fraction) == scripted.count_near(other, 0.7, fraction)
 
 
 def repeats(n_parts: int, times: int, agree: float, seed: int = 0) -> tuple[np.ndarray, ...]:

@@ -69,14 +69,6 @@ class SpokenRule(DecisionRule):
         return {True: 1, False: 0}[lower >= self.accept_at]
 
 
-class RebindingRule(FuseRule):
-    """Binds its buffer anew instead of writing into it."""
-
-    @torch.jit.export
-    def tell(self, lower: float, upper: float, success: bool) -> None:
-        self.pause = torch.full((), 1000, dtype=torch.int64)
-
-
 class FailingRule(FuseRule):
     """Cannot be told anything."""
 
@@ -137,13 +129,6 @@ def test_a_rule_that_does_not_compile_decides_and_is_not_exported(outside, data,
             export_torchscript(engine, tmp_path / "model.ts")
 
 
-def test_a_buffer_that_a_rule_binds_anew_counts_all_the_same(outside, data) -> None:
-    engine = DataEngine(recipe=recipe_with("fuse:RebindingRule"), replaying=True)
-    actions = [c.decision.action for c in engine.run(ReplayCell(data, confirm=True), len(data))]
-    assert Action.ACCEPT not in actions
-    assert engine.decide(good(data)).lower >= 0.9
-
-
 def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outside, data, tmp_path: Path) -> None:
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=url, replaying=True) as engine:
@@ -154,19 +139,6 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outsi
         assert engine.version == 2
     with DataEngine.open(url) as engine:
         assert engine.decide(good(data)).action is Action.VERIFY
-
-
-def test_a_rule_that_missed_something_is_told_everything_when_the_engine_is_opened_again(outside, data, tmp_path) -> None:
-    url = str(tmp_path / "engine.db")
-    with DataEngine(recipe=recipe_with(outside), store=url, replaying=True) as engine:
-        list(engine.run(ReplayCell(data, confirm=True), 100))
-        engine.model.rule.tell, real = None, engine.model.rule.tell  # fails for a while
-        list(engine.run(ReplayCell(data, np.arange(100, 140), confirm=True), 40))
-        engine.model.rule.tell = real
-        engine.retrain()
-        assert engine.decide(good(data)).reason == "model_error"
-    with DataEngine.open(url) as engine:
-        assert engine.decide(good(data)).action is Action.ACCEPT
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ pytest.importorskip("onnxscript")
 
 from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dataset  # after the skips
 from dengine.export import export_onnx, load_onnx, make_key
+from dengine.export.bundle import write_export
 from dengine.records import Action, Reason
 
 
@@ -80,40 +81,38 @@ def test_it_learns_nothing_and_says_so(programs: Path, signed: tuple[Path, Path]
     assert "learns nothing" in decide(programs, signed[0], "--learn", code=1)[1]
 
 
-@pytest.mark.parametrize("kind", ["flip", "foreign", "no sum", "unsigned", "another key", "no library", "no onnxruntime"])
-def test_what_must_not_be_used_is_refused(programs: Path, signed: tuple[Path, Path], tmp_path: Path, kind: str) -> None:
-    for name in ("model.onnx", "model.onnx.sha256", "model.onnx.sig"):
-        shutil.copy(signed[0].with_name(name), tmp_path / name)
-    file, key, runtime = tmp_path / "model.onnx", signed[1], None
-    if kind == "flip":
-        content = bytearray(file.read_bytes())
-        content[len(content) // 2] ^= 1
-        file.write_bytes(content)
-    elif kind == "foreign":
-        from dengine.export.bundle import write_export
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
 
-        write_export(file, b"garbage", force=True, key=key)
-    elif kind == "no sum":
-        file.with_name("model.onnx.sha256").unlink()
-    elif kind == "unsigned":
-        file.with_name("model.onnx.sig").unlink()
-    elif kind == "another key":
-        key = make_key(tmp_path / "other.key")
-    elif kind == "no library":
-        runtime = tmp_path / "nothing.so"
-    else:
-        runtime = "libm.so.6"
-    expected = {
-        "flip": "its signature is not one by this key",
-        "foreign": "no loadable ONNX",
-        "no sum": "copied together",
-        "unsigned": "the file is not signed",
-        "another key": "its signature is not one by this key",
-        "no library": "name it in DENGINE_ONNXRUNTIME",
-        "no onnxruntime": "is no onnxruntime",
-    }
-    lines, said = decide(programs, file, "--key", key, stdin=b"decide 1,2\n", code=1, runtime=runtime)
+
+def replace(file: Path) -> None:
+    write_export(file, b"garbage", force=True, key=file.with_name("cell.key"))
+
+
+SPOILT = {
+    "flip": (flip, "its signature is not one by this key"),
+    "foreign": (replace, "no loadable ONNX"),
+    "no sum": (lambda file: file.with_name("model.onnx.sha256").unlink(), "copied together"),
+    "unsigned": (lambda file: file.with_name("model.onnx.sig").unlink(), "the file is not signed"),
+}
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_a_file_that_must_not_be_used_is_refused(programs: Path, signed, tmp_path: Path, kind: str) -> None:
+    shutil.copytree(signed[0].parent, tmp_path, dirs_exist_ok=True)
+    spoil, expected = SPOILT[kind]
+    spoil(file := tmp_path / "model.onnx")
+    lines, said = decide(programs, file, "--key", signed[1], stdin=b"decide 1,2\n", code=1)
     assert lines == []
-    assert expected[kind] in said
+    assert expected in said
     if kind == "flip":  # by its sum as well
         assert "it is damaged or truncated" in decide(programs, file, code=1)[1]
+
+
+@pytest.mark.parametrize(
+    ("runtime", "expected"), [("nothing.so", "name it in DENGINE_ONNXRUNTIME"), ("libm.so.6", "is no onnxruntime")]
+)
+def test_without_onnxruntime_it_says_where_to_name_it(programs: Path, signed, runtime: str, expected: str) -> None:
+    assert expected in decide(programs, signed[0], code=1, runtime=runtime)[1]
