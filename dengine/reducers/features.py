@@ -230,13 +230,17 @@ class FeatureReducer(Reducer):
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
+        folds = content_fold(traces, self.folds) if folds is None else np.asarray(folds, dtype=np.int64)
+        within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
+        expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         self._start(traces)
-        self._fit_heads(traces, labels, content_fold(traces, self.folds) if folds is None else folds, stop)
+        self._fit_heads(traces, labels, folds, stop)
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
-        expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), "verify more parts first")
+        if len(X) < MIN_TRACES:
+            raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
         f = self._fit_heads(self._begun(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
         with torch.inference_mode():
             return own_places(self.net_.places(f).numpy(), folds)
@@ -272,9 +276,6 @@ class FeatureReducer(Reducer):
 
     def _fit_heads(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule | None) -> Tensor:
         """Train head k on rows outside fold k, from the present weights; returns the features (n, P)."""
-        folds = np.asarray(folds, dtype=np.int64)
-        fit = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
-        expect(fit, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         with torch.no_grad():
             raw = self.raw_features(traces)
             least = 0
