@@ -49,9 +49,6 @@ def trained(name: str, traces: tuple[np.ndarray, np.ndarray]) -> Rival:
     return new(name).fit(X[:120], y[:120])
 
 
-# ------------------------------------------------------------------------------------------------------- the contract
-
-
 @every_rival
 def test_a_rival_gives_the_engine_what_it_asks_for_by_its_seed_and_of_one_trace_as_among_others(
     name: str, traces: Any
@@ -116,9 +113,6 @@ def test_a_label_between_two_trainings_counts_where_the_method_learns_at_once(na
     assert changed == (name in LEARN_AT_ONCE)
 
 
-# ------------------------------------------------------------------------------------------------------------- by name
-
-
 def test_the_table_is_complete_and_imports_nothing() -> None:
     code = "import sys; from dengine.experiments.rivals import RIVALS; print(*{'aeon', 'mapie', 'river'} & {*sys.modules})"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
@@ -143,9 +137,6 @@ def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str)
         pytest.importorskip(RIVALS[name].needs)
     with pytest.raises(SettingError, match=words):
         make_rival(name, LOOSE, 0, **params)
-
-
-# ---------------------------------------------------------------------------------------------------- methods, by hand
 
 
 def test_neighbours_decide_only_where_all_k_agree() -> None:
@@ -188,9 +179,6 @@ def test_a_risk_above_the_tolerance_is_vouched_for_in_no_more_than_delta_of_all_
     rng = np.random.default_rng(1)
     found = [guaranteed_threshold(rng.random(200), rng.random(200) < 0.12, 0.1, 0.2) < np.inf for _ in range(500)]
     assert np.mean(found) <= 0.2
-
-
-# -------------------------------------------------------------------------------------------------------- in the loop
 
 
 @every_rival

@@ -190,20 +190,6 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained
         assert engine.decide(file["X"][0]).predicted != "verify"
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--samples", "30"], "Expected 40 samples, got 30"),
-        (["--reducer", "pca", *POLICY, "--guarantee", "pooled"], "guarantee local"),
-        (["--seed", "9"], "seed 0"),
-    ],
-)
-def test_a_used_store_refuses_another_contract(trained: Path, data: Path, words: list[str], expected: str) -> None:
-    result = dengine("train", "--data", data, "--store", trained, *words)
-    assert result.exit_code == 1
-    assert expected in result.stderr
-
-
 def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_their_own() -> None:
     X, y = easy(160, 0)
     X[0, 3], X[1], X[2:8] = np.nan, 7.0, X[2]

@@ -10,15 +10,6 @@ from dengine import Dataset
 from dengine.experiments.rivals import RIVALS
 from tests.support.command_line import dengine, document, said, succeed
 
-LATE = """
-from sklearn.decomposition import PCA
-class Late(PCA):
-    def fit(self, X, y=None):
-        if len(X) < 59:
-            raise ValueError("too few")
-        return super().fit(X)
-"""
-
 
 @pytest.fixture(autouse=True)
 def folder(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -60,12 +51,6 @@ def test_every_row_of_a_grid_can_be_told_from_the_others() -> None:
             for known in ("stops alone", "good ones confirmed"):
                 assert f"never ({guarantee}, {interval}, {known}): " in lines
     assert shown[: shown.index("Means a replay")].count("binomial") == 4
-
-
-def test_the_retrains_that_were_dropped_are_counted_row_by_row(folder: Path) -> None:
-    (folder / "late_of_test_compare.py").write_text(LATE, encoding="utf-8")
-    rows = document(*words("--reducers late_of_test_compare:Late --repeats 2 --alphas 0.1,0.5"))["rows"]
-    assert [row["retrains_dropped"] for row in rows] == [2, 2]
 
 
 @pytest.mark.parametrize("address", ["nonsense", "foo://host:1"])

@@ -80,9 +80,6 @@ def test_an_option_that_does_not_fit_is_one_line(folder: Path, options: str, wor
     assert len(result.stderr.splitlines()) == 1
 
 
-# ------------------------------------------------------------------------------------------------------- the survey
-
-
 def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
     data = make_data(120, samples=60)
     X, y = data.X.copy(), data.y.copy()

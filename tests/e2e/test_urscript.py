@@ -31,7 +31,6 @@ TEXT = SCRIPT.read_text(encoding="utf-8")
 CODE = [line.partition("#")[0].rstrip() for line in TEXT.splitlines()]
 SAMPLES = 60
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
-CLOSE = "closeXMLRPCClientConnection"
 BLOCK = re.compile(r"^\s*(def|thread|if|while)\b.*:$")
 MANUAL = {  # of the script manual of e-Series, version 5
     *("movel", "stopl", "pose_trans", "sleep", "force_mode", "end_force_mode", "get_actual_tcp_pose", "zero_ftsensor"),

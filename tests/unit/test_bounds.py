@@ -63,16 +63,12 @@ def test_interval_equals_statsmodels(interval, method: str, alpha: float) -> Non
 
 @intervals
 @given(n_s=counts, n_f=counts, alpha=alphas)
-def test_bounds_enclose_the_observed_rate_within_0_and_1(interval, n_s: int, n_f: int, alpha: float) -> None:
+def test_bounds_enclose_the_observed_rate_and_exchanging_the_labels_mirrors_them(
+    interval, n_s: int, n_f: int, alpha: float
+) -> None:
     lower, upper = interval(n_s, n_f, alpha)
     rate = n_s / (n_s + n_f) if n_s + n_f else 0.5
     assert 0.0 <= lower <= rate <= upper <= 1.0
-
-
-@intervals
-@given(n_s=counts, n_f=counts, alpha=alphas)
-def test_exchanging_success_and_failure_mirrors_the_interval(interval, n_s: int, n_f: int, alpha: float) -> None:
-    lower, upper = interval(n_s, n_f, alpha)
     mirrored_lower, mirrored_upper = interval(n_f, n_s, alpha)
     assert (lower, upper) == pytest.approx((1.0 - mirrored_upper, 1.0 - mirrored_lower), abs=1e-9)
 

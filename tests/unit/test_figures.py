@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
-from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, sliding_sum, window_curves
+from dengine.experiments.figures import curves, embedding_map, is_probability, run_picture, save, window_curves
 from dengine.experiments.replay import Replay, RunRecorder
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_kept, promise_line
 from tests.support.replays import replay_of as by_hand
@@ -21,7 +21,7 @@ from tests.support.replays import replay_of as by_hand
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
-RETRAINS = tuple(RetrainReport(i, seconds, 50, 0, True, "") for i, seconds in enumerate((0.1, 0.3)))
+RETRAINS = tuple(RetrainReport(i, seconds, 50, 0, seconds > 0.2, "") for i, seconds in enumerate((0.1, 0.3)))
 
 
 def replay_of(action: list[str], truth: list[int], recipe: Recipe = RECIPE, **known: Any) -> Replay:
@@ -55,20 +55,14 @@ def test_the_promise_is_kept_up_to_the_tolerance(bad: int, kept: bool) -> None:
     assert promise_kept(row) is kept
 
 
-def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own() -> None:
+def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own_with_the_retrains_that_were_dropped() -> None:
     pooled = replay_of(["accept"] * 300, [1] * 300, recipe=RECIPE.with_policy(guarantee="pooled", stops="all"))
-    rows = pool(frame_of([MANY_RIGHT, pooled]))
-    assert [(row["guarantee"], row["stops"]) for row in rows] == [("local", "some"), ("pooled", "all")]
+    rows = pool(frame_of(replays := [MANY_RIGHT, MANY_RIGHT, pooled]), replays)
+    shown = [(row["guarantee"], row["stops"], row["retrains_dropped"]) for row in rows]
+    assert shown == [("local", "some", 2), ("pooled", "all", 1)]
     table = pooled_table(rows)
     assert list(table.columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
     assert promise_line(rows[1]).startswith("pca (pooled): 100.0 % of 300")
-
-
-@pytest.mark.parametrize("window", [1, 3, 10, 50])
-def test_a_sliding_sum_equals_the_sum_of_each_window(window: int) -> None:
-    values = np.random.default_rng(0).random((2, 20))
-    expected = [[row[max(0, i - window + 1) : i + 1].sum() for i in range(20)] for row in values]
-    np.testing.assert_allclose(sliding_sum(values, window), expected)
 
 
 def test_window_curves_are_shares_of_the_cycles_and_of_what_was_decided_in_the_window() -> None:
@@ -94,9 +88,6 @@ def test_the_curves_draw_the_lower_bound_and_the_tolerance_and_count_the_errors(
     assert {"a: 10 bad of 300 accepted", "b: 1 good of 1 rejected"} <= {line.get_label() for line in bottom.lines}
 
 
-# ---------------------------------------------------------------------------------------------------------- maps
-
-
 def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> None:
     figure = embedding_map(MANY_RIGHT)
     (ball,) = figure.axes[0].patches
@@ -115,9 +106,6 @@ def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() ->
     assert [ball.get_radius() for ball in left.patches] == [0.05]
     asked = ("rocket", ConvReducer(), "dengine.reducers.conv:ConvReducer", PCA(2), "sklearn.decomposition:PCA")
     assert [is_probability(Recipe(reducer)) for reducer in asked] == [True, True, True, False, False]
-
-
-# ---------------------------------------------------------------------------------------------------------- runs
 
 
 def log_of(clock_s: np.ndarray | None) -> Replay:

@@ -61,18 +61,6 @@ def test_the_summary_counts_what_happened(played: Replay) -> None:
     assert (row["cycles"], row["seed"], row["retrains"]) == (200, 1, len(played.retrains))
 
 
-def test_parts_that_are_confirmed_or_not_stopped_where_all_bad_ones_are_are_learned_from(
-    data: Dataset, played: Replay
-) -> None:
-    first = int(np.flatnonzero(played.accepted)[0])
-    for told in (replay(data, RECIPE, seed=1, confirm=True), replay(data, RECIPE.with_policy(stops="all"), seed=1)):
-        np.testing.assert_array_equal(told.action[: first + 1], played.action[: first + 1])
-        assert told.n_success[-1] + told.n_failure[-1] > played.n_success[-1] + played.n_failure[-1]
-
-
-# ------------------------------------------------------------------------------------------------------- records
-
-
 class Silent:
     """A cell as real ones are: it tells nothing but what it is asked for."""
 
@@ -118,9 +106,6 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
 
 
-# --------------------------------------------------------------------------------------------------------- grids
-
-
 def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(RECIPE.to_toml(), encoding="utf-8")
@@ -128,9 +113,6 @@ def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Datase
     names = ["paper", "mine", "mine", "pca", "PCA", "sklearn.decomposition:PCA", "PCA"]
     assert [Contender.load(recipe).name for recipe in asked] == names
     assert replay(data, PCA(2), cycles=30).summary()["recipe"] == "PCA"
-
-
-# ------------------------------------------------------------------------------------------------------ the cell
 
 
 def test_a_replay_cell_plays_its_order_and_says_when_all_is_played(data: Dataset) -> None:

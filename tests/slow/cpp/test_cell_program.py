@@ -4,8 +4,7 @@ import random
 import resource
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +18,6 @@ from dengine.export.cell_journal import read_journal
 from dengine.records import Action
 from tests.support.exports import SAMPLES, trained
 
-N = 160
-
 
 class Learned(NamedTuple):
     """A store after its engine's first retrain, and the exported file."""
@@ -31,9 +28,7 @@ class Learned(NamedTuple):
 
 
 @pytest.fixture(scope="module", params=["some", "all"])
-def learned(
-    request: pytest.FixtureRequest, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
-) -> Learned:
+def learned(request, make_data: Callable[..., Dataset], tmp_path_factory) -> Learned:
     folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=1.5)
     guarantee = {"some": "local", "all": "pooled"}[request.param]
     settings = {"some": {"fraction": 0.3, "reject_fraction": 0.08}, "all": {"fraction": 0.1}}[request.param]
@@ -54,10 +49,15 @@ class Program:
         pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self.process = subprocess.Popen(command, text=True, bufsize=1, **pipes, **options)
 
+    def __enter__(self) -> "Program":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
     def ask(self, line: str) -> str:
         """The answer to a line; "" where the program is gone."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         try:
             self.process.stdin.write(line + "\n")
         except BrokenPipeError:
@@ -70,23 +70,22 @@ class Program:
         return self.process.returncode, said
 
 
-@contextmanager
-def program(programs: Path, *arguments: Any, **options: Any) -> Iterator[Program]:
-    running = Program(programs, *arguments, **options)
-    try:
-        yield running
-    finally:
-        running.process.kill()
-        running.process.communicate()
+@pytest.fixture
+def start(programs: Path, learned: Learned, tmp_path: Path) -> Callable[..., Program]:
+    """Starts the program, which writes cell.csv."""
+    return partial(Program, programs, learned.file, "--journal", tmp_path / "cell.csv")
+
+
+@pytest.fixture(scope="module")
+def X(make_data: Callable[..., Dataset]) -> np.ndarray:  # noqa: N802  # as everywhere
+    return make_data(60, SAMPLES, seed=9, noise=1.5).X
 
 
 def asked(x: np.ndarray, part: str | None = None) -> str:
     return f"decide {part + ' ' if part else ''}{','.join(f'{v:.9g}' for v in x)}"
 
 
-def stream(
-    make_data: Callable[..., Dataset], n: int = N
-) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
+def stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
     """Traces, labels, parts, and after each trace the indices of the parts whose label comes then: late, or never."""
     rng, data = np.random.default_rng(8), make_data(n, SAMPLES, seed=2, noise=1.5)
     X = data.X.copy()
@@ -101,11 +100,6 @@ def stream(
     return X, data.y, parts, due
 
 
-def told(decision: Any, label: int, late: bool, stops_all: bool) -> bool:
-    """Whether a label can come: not of a rejected part; of a confirmed one the engine wants none later."""
-    return decision.action is not Action.REJECT and not (stops_all and late and decision.action is Action.ACCEPT)
-
-
 def same(answer: str, decision: Any) -> bool:
     words = answer.split(",")
     found = [words[1], words[2], float(words[3]), float(words[4]), int(words[5]), int(words[6])]
@@ -114,24 +108,21 @@ def same(answer: str, decision: Any) -> bool:
 
 
 def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as_its_own(
-    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+    start: Callable[..., Program], learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
-    X, y, parts, due = stream(make_data)
+    X, y, parts, due = stream(make_data, 160)
     journal, ids, decisions, told_of = tmp_path / "cell.csv", [], [], 0
     for name in ("own", "imported"):
         shutil.copy(learned.store, tmp_path / f"{name}.db")
-    with (
-        DataEngine.open(tmp_path / "own.db", replaying=True) as engine,
-        program(programs, learned.file, "--key", learned.key, "--journal", journal) as cell,
-    ):
-        stops_all = engine.policy.stops == "all"
+    with DataEngine.open(tmp_path / "own.db", replaying=True) as engine, start("--key", learned.key) as cell:
+        stops_all = engine.policy.stops == "all"  # there the engine wants no late label of a confirmed part
         for i, (x, part) in enumerate(zip(X, parts, strict=True)):
             answer = cell.ask(asked(x, part))
             decisions.append(engine.decide(x, part))
             assert same(answer, decisions[-1]), (i, answer, decisions[-1])
             ids.append(answer.split(",")[0])
             for k in due[i]:
-                if not told(decisions[k], y[k], k != i, stops_all):
+                if decisions[k].action is Action.REJECT or (stops_all and k != i and decisions[k].action is Action.ACCEPT):
                     continue
                 engine.report(decisions[k].id, bool(y[k]))
                 stop = decisions[k].action is Action.ACCEPT and not y[k]
@@ -159,63 +150,48 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
 
 
 def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_decides_on_as_if_it_had_not_been(
-    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
+    programs: Path, start: Callable[..., Program], learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
     X, y, parts, due = stream(make_data, 100)
-    rng, kills, acknowledged = random.Random(4), 0, {}
-    whole = play(partial(program, programs, learned.file), X, y, parts, due)
-    journal = tmp_path / "cell.csv"
-    lines: list[tuple[str, int]] = []  # what is still to be said: a part, or a label of one
+    rng = random.Random(4)
+    lines: list[tuple[str, int]] = []  # what is said: a part, or a label of one
     for i in range(len(X)):
         lines += [("decide", i), *(("label", k) for k in due[i])]
     ids: dict[int, str] = {}
+    acknowledged: dict[str, bool] = {}
+
+    def play(cell: Program, first: int, last: int, decided: dict[int, str]) -> None:
+        for kind, k in lines[first:last]:
+            if kind == "decide":
+                ids[k], decided[k] = cell.ask(asked(X[k], parts[k])).rsplit(",", 1)[0].split(",", 1)
+            elif not decided[k].startswith("reject"):
+                assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
+                acknowledged[ids[k]] = bool(y[k])
+
+    whole: dict[int, str] = {}
+    with Program(programs, learned.file) as cell:
+        play(cell, 0, len(lines), whole)
+    acknowledged.clear()
     decided: dict[int, str] = {}
-    done = 0
+    kills = done = 0
     while done < len(lines):
-        with program(programs, learned.file, "--journal", journal) as cell:
-            until = min(len(lines), done + rng.randrange(10, 60))
-            for kind, k in lines[done:until]:
-                if kind == "decide":
-                    answer = cell.ask(asked(X[k], parts[k]))
-                    ids[k], decided[k] = answer.split(",")[0], ",".join(answer.split(",")[1:7])
-                elif not decided[k].startswith("reject"):
-                    assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
-                    acknowledged[ids[k]] = bool(y[k])
-            if until < len(lines):  # in the middle of a label, or of a trace
-                waiting = lines[until]
-                line = asked(X[waiting[1]]) if waiting[0] == "decide" else f"label {ids[waiting[1]]} {y[waiting[1]]}"
-                if waiting[0] == "label":
-                    assert cell.process.stdin is not None
-                    cell.process.stdin.write(line + "\n")  # not acknowledged: said again after the restart
-                cell.process.kill()
-                kills += 1
-            done = until
-    assert kills >= 3
+        until = min(len(lines), done + rng.randrange(10, 60))
+        with start() as cell:
+            play(cell, done, until, decided)
+            if until < len(lines) and lines[until][0] == "label":  # not acknowledged: said again after the restart
+                k = lines[until][1]
+                cell.process.stdin.write(f"label {ids[k]} {y[k]}\n")
+        kills, done = kills + 1, until
+    assert kills > 3
     assert decided == whole
-    held = read_journal(journal, TraceSpec(SAMPLES)).lines
+    held = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES)).lines
     assert acknowledged.items() <= {line.decision.id: line.label for line in held if line.label is not None}.items()
 
 
-def play(start: Any, X: np.ndarray, y: np.ndarray, parts: list[str | None], due: list[list[int]]) -> dict[int, str]:
-    """The decisions of a program that nobody kills."""
-    ids, decided = {}, {}
-    with start() as cell:
-        for i in range(len(X)):
-            answer = cell.ask(asked(X[i], parts[i]))
-            ids[i], decided[i] = answer.split(",")[0], ",".join(answer.split(",")[1:7])
-            for k in due[i]:
-                if not decided[k].startswith("reject"):
-                    assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
-    return decided
-
-
 @ONE
-def test_a_label_is_taken_once_and_never_changed(
-    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    X = make_data(60, SAMPLES, seed=9, noise=1.5).X
+def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], X: np.ndarray, tmp_path: Path) -> None:
     journal, ids = tmp_path / "cell.csv", {}
-    with program(programs, learned.file, "--journal", journal) as cell:
+    with start() as cell:
         for x in X:
             id_, action = cell.ask(asked(x)).split(",")[:2]
             ids.setdefault(action, id_)
@@ -231,7 +207,6 @@ def test_a_label_is_taken_once_and_never_changed(
             f"stop {ids['verify']}": "was to be verified and cannot stop the system",
             "label nobody 1": 'expected the id of one of the last 10000 decisions, got "nobody"',
             f"label {ids['verify']} 100": "expected label ID 0|1",
-            f"label {ids['verify']}": "expected label ID 0|1",
             "stop": "expected stop ID",
         }
         for line, message in wrong.items():
@@ -240,44 +215,34 @@ def test_a_label_is_taken_once_and_never_changed(
             assert message in answer
         assert journal.read_text().count("\n") == n
         assert cell.end()[0] == 1
-    with program(programs, learned.file, "--journal", journal) as cell:  # after a restart, too
+    with start() as cell:  # after a restart, too
         assert "has the other label already" in cell.ask(f"label {ids['verify']} 0")
-        assert cell.ask(f"label {ids['verify']} 1").startswith("ok ")
+        with start() as second:  # two do not write one journal
+            code, said = second.end()
+        assert code == 1
+        assert "is being written by another program" in said
 
 
 @ONE
-def test_traces_come_from_files_too(
-    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    x = make_data(1, SAMPLES, seed=9).X[0]
-    x.tofile(tmp_path / "trace.f32")
-    for name, text in (("line.csv", ",".join(map(str, x))), ("column.txt", "\n".join(map(str, x))), ("short.csv", "1,2")):
-        (tmp_path / name).write_text(text + "\n")
-    (tmp_path / "short.f32").write_bytes(x.tobytes()[:-3])
-    with program(programs, learned.file) as cell:
-        answers = [cell.ask(f"decide P1 {tmp_path / name}") for name in ("trace.f32", "line.csv", "column.txt")]
-        assert {answer.split(",", 1)[1].rsplit(",", 1)[0] for answer in answers} == {
-            cell.ask(asked(x, "P1")).split(",", 1)[1].rsplit(",", 1)[0]
-        }
-        for name in ("short.csv", "short.f32", "nothing.f32", "."):
-            assert cell.ask(f"decide {tmp_path / name}").startswith("-,verify,malformed,0,1,0,0,")
-        for line in ("decide", "decide a b c", "decide P1, 1,2", "decide 1;2", "decide P\xa01 1,2"):
-            assert cell.ask(line).startswith("-,verify,malformed,0,1,0,0,")
+def test_traces_come_from_files_too(programs: Path, learned: Learned, X: np.ndarray, tmp_path: Path) -> None:
+    X[0].tofile(tmp_path / "trace.f32")
+    (tmp_path / "column.txt").write_text("\n".join(map(str, X[0])))
+    (tmp_path / "short.f32").write_bytes(X[0].tobytes()[:-3])
+    with Program(programs, learned.file) as cell:
+        said = [f"decide P1 {tmp_path / name}" for name in ("trace.f32", "column.txt")]
+        answers = [cell.ask(line) for line in (asked(X[0], "P1"), *said)]
+        assert len({answer.split(",", 1)[1].rsplit(",", 1)[0] for answer in answers}) == 1
+        wrong = ("", "a b c", "P1, 1,2", "1;2", "P\xa01 1,2", f"{tmp_path / 'short.f32'}", f"{tmp_path}")
+        for words in wrong:
+            assert cell.ask(f"decide {words}").startswith("-,verify,malformed,0,1,0,0,")
         assert cell.end()[0] == 1
 
 
 @ONE
-def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
-    programs: Path, learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    X, journal = make_data(60, SAMPLES, seed=9, noise=1.5).X, tmp_path / "cell.csv"
-    limit = 20_000  # bytes that the journal may have
+def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start, X: np.ndarray, tmp_path: Path) -> None:
     acknowledged, refused = [], 0
-
-    def full() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-
-    with program(programs, learned.file, "--journal", journal, preexec_fn=full) as cell:
+    full = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (20_000, 20_000))  # bytes that the journal may have
+    with start(preexec_fn=full) as cell:
         for x in X:
             id_, action, reason = cell.ask(asked(x)).split(",")[:3]
             if id_ == "-":
@@ -289,39 +254,24 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
                 assert "cannot be written: File too large" in said
         assert cell.end()[0] == 1
     assert refused > 10
-    held = read_journal(journal, TraceSpec(SAMPLES))  # no half line is left
+    held = read_journal(tmp_path / "cell.csv", TraceSpec(SAMPLES))  # no half line is left
     assert held.cut == 0
     assert set(acknowledged) <= {line.decision.id for line in held.lines if line.label}
-    with program(programs, learned.file, "--journal", journal) as cell:  # there is room again
+    with start() as cell:  # there is room again
         assert not cell.ask(asked(X[0])).startswith("-")
 
 
 @ONE
-def test_two_programs_do_not_write_one_journal(programs: Path, learned: Learned, tmp_path: Path) -> None:
-    journal = tmp_path / "cell.csv"
-    with program(programs, learned.file, "--journal", journal) as first:
-        assert first.ask("stop nobody").startswith("error")  # it is there
-        with program(programs, learned.file, "--journal", journal) as second:
-            code, said = second.end()
-    assert code == 1
-    assert "is being written by another program" in said
-
-
-@ONE
 def test_with_a_key_only_what_was_signed_with_it_is_loaded(programs: Path, learned: Learned, tmp_path: Path) -> None:
-    def loads(file: Path, key: Path) -> str:
-        with program(programs, file, "--key", key) as cell:
-            return cell.end()[1]
-
-    assert loads(learned.file, learned.key) == ""
-    for name in ("model.ts", "model.ts.sha256", "model.ts.sig"):
+    for name in ("model.ts", "model.ts.sha256"):
         shutil.copy(learned.file.with_name(name), tmp_path / name)
-    file, signature, short = tmp_path / "model.ts", tmp_path / "model.ts.sig", tmp_path / "short.key"
-    line = signature.read_text()
-    assert "its signature is not one by this key" in loads(file, make_key(tmp_path / "other.key"))
-    short.write_text("secret\n")
-    assert "is too short for a key" in loads(file, short)
-    signature.write_text(line.replace(line[12:76], "0" * 64))
-    assert "its signature is not one by this key" in loads(file, learned.key)
-    signature.unlink()
-    assert "the file is not signed" in loads(file, learned.key)
+    signed = learned.file.with_name("model.ts.sig").read_text()
+    (short := tmp_path / "short.key").write_text("secret\n")
+    for key, signature, expected in (
+        (make_key(tmp_path / "other.key"), signed, "its signature is not one by this key"),
+        (learned.key, signed.replace(signed[12:76], "0" * 64), "its signature is not one by this key"),
+        (short, signed, "is too short for a key"),
+    ):
+        (tmp_path / "model.ts.sig").write_text(signature)
+        with Program(programs, tmp_path / "model.ts", "--key", key) as cell:
+            assert expected in cell.end()[1]

@@ -2,23 +2,18 @@
 
 import hashlib
 import hmac
-import json
 import subprocess
-import time
-import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from dengine import DataEngine, Dataset, TraceSpec, export_torchscript, load_exported
-from dengine.export import ExportedModel, import_journal, read_metadata
+from dengine.export import import_journal
 from dengine.records import Action, Reason
 from tests.support.exports import SAMPLES, fitted, trained, wild_traces
 
@@ -44,13 +39,7 @@ def many(make_data: Callable[..., Dataset]) -> np.ndarray:
 def cell(programs: Path, *arguments: Any, stdin: bytes = b"", fails: bool = False) -> tuple[list[list[str]], str]:
     """The program's lines, split at commas, and what it said on stderr."""
     command = [str(programs / "dengine-cell"), *map(str, arguments)]
-    start = partial(subprocess.run, command, input=stdin, capture_output=True, check=False, timeout=120)
-    try:
-        done = start()
-    except OSError as error:  # once in a CI run, between two tests that had started it: what it does is tested here
-        warnings.warn(f"the program did not start ({error}); tried again", stacklevel=2)
-        time.sleep(1.0)
-        done = start()
+    done = subprocess.run(command, input=stdin, capture_output=True, check=False, timeout=120)
     assert done.returncode == (1 if fails else 0), done.stderr.decode()
     return [line.split(",") for line in done.stdout.decode().splitlines()], done.stderr.decode()
 
@@ -132,29 +121,19 @@ def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_th
     assert report.quarantined == 5 * {"cut": 4, "pad": 3, "resample": 3}[fit]
 
 
-class Live(NamedTuple):
-    """What comes in at a cell, and what the exported file in Python makes of it, told as the program tells it."""
-
-    lines: list[bytes]
-    decisions: list[Any]
-    written: list[int]  # journal lines after each trace
-    exported: ExportedModel
-
-
-def live(file: Path, X: np.ndarray, labels: list[str], parts: list[str] | None = None) -> Live:
-    exported, decisions, written = load_exported(file), [], []
-    numbers = [None] * len(X) if parts is None else [part or None for part in parts]
-    for x, label, part in zip(X, labels, numbers, strict=True):
-        decision = exported.decide(x, part)
+def live(file: Path, X: np.ndarray, labels: list[str], parts: list[str]) -> tuple[list[Any], int]:
+    """What the exported file in Python decides, told as the program tells it; how many journal lines that are."""
+    exported, decisions, written = load_exported(file), [], 0
+    for x, label, part in zip(X, labels, parts, strict=True):
+        decision = exported.decide(x, part or None)
         accepted = decision.action is Action.ACCEPT
         if accepted and label == "0":
-            exported.stop(x, part)
+            exported.stop(x, part or None)
         elif label and decision.action is not Action.REJECT:
-            exported.learn(x, label == "1", part)
-        counted = accepted or (label != "" and decision.action is Action.VERIFY)
-        written.append((written[-1] if written else 0) + counted)
+            exported.learn(x, label == "1", part or None)
+        written += accepted or (label != "" and decision.action is Action.VERIFY)
         decisions.append(decision)
-    return Live(csv(X, labels, parts).splitlines(keepends=True), decisions, written, exported)
+    return decisions, written
 
 
 def a_live_stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, list[str], list[str]]:
@@ -163,65 +142,37 @@ def a_live_stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray
     X = data.X.copy()
     X[rng.random(n) < 0.04] *= 5.0
     X[rng.random(n) < 0.02, 3] = np.nan
-    parts = [f"P{rng.integers(2 * n)}" if rng.random() < 0.7 else "" for _ in range(n)]
+    parts = [f"Ω {rng.integers(2 * n)}" if rng.random() < 0.7 else "" for _ in range(n)]
     y = data.y ^ ((np.arange(n) > 0.75 * n) & (rng.random(n) < 0.5))  # at last the world is another one
     heard = np.where(y == 0, 0.95, 0.6)
     return X, [str(label) if rng.random() < p else "" for label, p in zip(y, heard, strict=True)], parts
 
 
-@pytest.fixture(scope="module", params=["local-some", "pooled-some", "pooled-all"])
-def learning(
-    request: pytest.FixtureRequest, make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, Path]:
-    """A store after its engine's first retrain, and the exported file."""
-    guarantee, stops = request.param.split("-")
-    folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=3.0)
-    store, settings = folder / "engine.db", {"audit_rate": 0.2, "guarantee": guarantee, "stops": stops}
-    with trained(data, store, fraction=0.1, **settings) as engine:
-        return store, export_torchscript(engine, folder / "model.ts")
-
-
+@pytest.mark.parametrize(("guarantee", "stops"), [("local", "some"), ("pooled", "some"), ("pooled", "all")])
 def test_the_cell_learns_stops_and_silence_as_python_does(
-    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset], tmp_path: Path
+    programs: Path, guarantee: str, stops: str, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
+    settings = {"audit_rate": 0.2, "guarantee": guarantee, "stops": stops}
+    with trained(make_data(400, SAMPLES, noise=3.0), fraction=0.1, **settings) as engine:
+        learning = export_torchscript(engine, tmp_path / "model.ts")
     X, labels, parts = a_live_stream(make_data, 800)
-    expected = live(learning[1], X, labels, parts)
+    decisions, written = live(learning, X, labels, parts)
     options = ["--parts", "--learn", "--journal", tmp_path / "cell.csv"]
-    lines, _ = cell(programs, learning[1], *options, stdin=b"".join(expected.lines))
-    assert_equal(lines, expected.decisions, 2)
+    lines, _ = cell(programs, learning, *options, stdin=csv(X, labels, parts))
+    assert_equal(lines, decisions, 2)
     head, *journal = (tmp_path / "cell.csv").read_text().splitlines()
-    assert head == f"# dengine 3 {hashlib.sha256(learning[1].read_bytes()).hexdigest()}"
-    assert len(journal) == expected.written[-1]
+    assert head == f"# dengine 3 {hashlib.sha256(learning.read_bytes()).hexdigest()}"
+    assert len(journal) == written
     kinds = Counter((line.split(",")[2], line.split(",")[4]) for line in journal)
     assert kinds.keys() == {("1", "verify"), ("0", "verify"), ("1", "accept"), ("0", "accept"), ("", "accept")}
     reasons = {Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CERTAIN, Reason.UNCERTAIN}
-    stops_all = read_metadata(learning[1])["stops"] == "all"
-    assert {d.reason for d in expected.decisions} >= reasons | ({Reason.SAFE_MODE} if stops_all else set())
+    assert {d.reason for d in decisions} >= reasons | ({Reason.SAFE_MODE} if stops == "all" else set())
 
-
-BOTH = pytest.mark.parametrize("learning", ["local-some", "pooled-all"], indirect=True)  # both of either setting
-
-
-@BOTH
-def test_without_labels_silence_counts_for_nothing(
-    programs: Path, learning: tuple[Path, Path], make_data: Callable[..., Dataset]
-) -> None:
-    X = make_data(200, SAMPLES, seed=6, noise=3.0).X
-    exported, decisions = load_exported(learning[1]), []
-    for x in X:
-        decisions.append(exported.decide(x))
+    exported, unlabelled = load_exported(learning), []
+    for x in X[:200]:  # where no labels are read, silence counts for nothing
+        unlabelled.append(exported.decide(x))
         exported.module.drop()
-    assert_equal(cell(programs, learning[1], stdin=csv(X))[0], decisions, 2)
-    assert_equal(cell(programs, learning[1], "--binary", stdin=X.tobytes())[0], decisions, 2)
-
-
-def test_a_part_has_the_same_hash_in_both_languages(programs: Path, file: Path, many: np.ndarray) -> None:
-    parts = ["P1", "0", "", "007", "Ω-17", "a b", "P1"]  # one that comes again has no vote on itself
-    X = np.concatenate([many[:6], many[:1]])
-    expected = live(file, X, ["1"] * 7, parts)
-    assert_equal(cell(programs, file, "--parts", "--learn", stdin=b"".join(expected.lines))[0], expected.decisions, 2)
-    plain = live(file, X, ["1"] * 7)
-    assert [d[2:6] for d in plain.decisions[:6]] == [d[2:6] for d in expected.decisions[:6]]
+    assert_equal(cell(programs, learning, "--binary", stdin=X[:200].tobytes())[0], unlabelled, 2)
 
 
 @pytest.fixture(scope="module")
@@ -243,10 +194,7 @@ def test_a_journal_line_that_cannot_be_read_is_named(programs: Path, file: Path,
     wrong = {
         "shorter": second[:-1],
         "a flipped digit": second[:-30] + str((int(second[-30]) + 1) % 10 if second[-30].isdigit() else 1) + second[-29:],
-        "no label": with_crc(",".join([*words[:2], *words[3:]])),
         "another action": with_crc(",".join([*words[:4], "think", *words[5:]])),
-        "another reason": with_crc(",".join([*words[:6], "because", *words[7:]])),
-        "a NUL": second[:-30] + "\0" + second[-29:],
         "plain": second.split(",", 2)[2].rsplit(",", 1)[0],  # without id and checksum
     }
     for line in wrong.values():
@@ -272,30 +220,19 @@ def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
 def test_a_file_that_is_no_journal_of_this_export_is_left_as_it_is(programs: Path, file: Path, tmp_path: Path) -> None:
     other = tmp_path / "notes.txt"
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    for text in ("no line end", "# dengine 3 0123", "one\ntwo", f"# dengine 2 {'0' * 64}\n", f"# dengine {digest}\n"):
+    for text in ("no line end", f"# dengine 2 {'0' * 64}\n", f"# dengine {digest}\n"):
         other.write_text(text)
         _, said = cell(programs, file, "--learn", "--journal", other, fails=True)
         assert "belongs to another export" in said
         assert other.read_text() == text
 
 
-def test_a_file_of_an_older_schema_is_refused(programs: Path, file: Path, tmp_path: Path) -> None:
-    exported, old = load_exported(file), tmp_path / "old.ts"
-    torch.jit.save(exported.module, str(old), {"dengine.json": json.dumps(exported.metadata | {"schema": 1}).encode()})
-    old.with_name("old.ts.sha256").write_text(hashlib.sha256(old.read_bytes()).hexdigest())
-    _, said = cell(programs, old, fails=True)
-    assert "it was written by an older dengine" in said
-    assert "export it anew" in said
-
-
 def test_a_malformed_line_label_or_block_is_verified(programs: Path, file: Path, many: np.ndarray) -> None:
     good = csv(many[:1]).decode().strip()
     wrong = {
         good.rsplit(",", 1)[0]: "expected 100 samples, got 99",
-        good + ",1": "expected 100 samples, got 101",
         good.replace(",", ";"): "expected a number in column 1",
         good.rsplit(",", 1)[0] + ",12N": 'expected a number in column 100, got "12N"',
-        good.rsplit(",", 1)[0] + ",": 'expected a number in column 100, got ""',
     }
     stdin = "\n".join([*wrong, "", "  ", good + "\r"]).encode()
     lines, said = cell(programs, file, stdin=stdin, fails=True)
@@ -303,12 +240,13 @@ def test_a_malformed_line_label_or_block_is_verified(programs: Path, file: Path,
     assert_equal(lines[-1:], [load_exported(file).decide(many[0])], 2)
     for number, expected in enumerate(wrong.values(), start=1):
         assert f"trace {number} is malformed: {expected}" in said
-    lines, said = cell(programs, file, "--learn", stdin=csv(many[:2], ["yes", 1]), fails=True)
-    assert [line[1] == "malformed" for line in lines] == [True, False]
-    assert 'expected a label of 1, 0 or nothing, got "yes"' in said
-    lines, said = cell(programs, file, "--binary", stdin=many[:2].tobytes()[:-5], fails=True)
-    assert [line[1] == "malformed" for line in lines] == [False, True]
-    assert "expected 400 bytes, got 395" in said
+    for option, stdin, malformed, expected in (
+        ("--learn", csv(many[:2], ["yes", 1]), [True, False], 'expected a label of 1, 0 or nothing, got "yes"'),
+        ("--binary", many[:2].tobytes()[:-5], [False, True], "expected 400 bytes, got 395"),
+    ):
+        lines, said = cell(programs, file, option, stdin=stdin, fails=True)
+        assert [line[1] == "malformed" for line in lines] == malformed
+        assert expected in said
 
 
 @pytest.mark.parametrize(
@@ -316,11 +254,10 @@ def test_a_malformed_line_label_or_block_is_verified(programs: Path, file: Path,
     [
         (lambda content: content[:5000] + bytes([content[5000] ^ 1]) + content[5001:], False, "is damaged or truncated"),
         (lambda content: content[:5000], False, "is damaged or truncated"),
-        (lambda content: b"", False, "is damaged or truncated"),
         (lambda content: b"garbage" * 1000, True, "no loadable TorchScript"),
         (lambda content: content, None, "holds no SHA-256 sum"),
     ],
-    ids=["flip", "truncated", "empty", "garbage", "not a sum"],
+    ids=["flip", "truncated", "garbage", "not a sum"],
 )
 def test_a_file_that_must_not_be_used_is_refused(
     programs: Path, file: Path, tmp_path: Path, spoil: Callable[[bytes], bytes], summed: bool | None, message: str
@@ -334,11 +271,3 @@ def test_a_file_that_must_not_be_used_is_refused(
     assert message in said
     total.unlink()
     assert "cannot read" in cell(programs, path, fails=True)[1]
-
-
-def test_wrong_arguments_show_the_usage(programs: Path, file: Path) -> None:
-    wrong = ([], ["--fast"], ["--learn", "--binary"], ["--parts", "--binary"], ["--parts", "--journal", "x"], ["--key"])
-    for arguments in ([str(file)] * bool(each) + each for each in wrong):
-        done = subprocess.run([programs / "dengine-cell", *arguments], capture_output=True, text=True, check=False)
-        assert done.returncode == 2
-        assert done.stderr.startswith("usage: dengine-cell MODEL")

@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("onnx")
-pytest.importorskip("onnxruntime")
+onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
 from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dataset  # after the skips
@@ -22,10 +21,7 @@ from dengine.records import Action, Reason
 
 def library() -> Path:
     """onnxruntime's shared library, as its package for Python brings it."""
-    found = find_spec("onnxruntime")
-    assert found is not None
-    assert found.origin is not None
-    names = sorted((Path(found.origin).parent / "capi").glob("libonnxruntime.so*"))
+    names = sorted((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
     if not names:
         pytest.skip("this onnxruntime brings no shared library of its own")
     return names[0]
