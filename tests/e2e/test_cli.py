@@ -259,6 +259,7 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
         "replay --recipe missing.toml --data DATA",
         "replay --data DATA --cycles 5000",
         "replay --data DATA --part serial",
+        "data DATA --label ((",
         "run --cell replay --data DATA --store e.db --reducer nowhere:Nothing",
         "simulate --n 1 --out x.npz --scenario missing",
     ],

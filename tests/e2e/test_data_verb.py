@@ -65,21 +65,6 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
     assert "Expected the channels FZ_Base, got FX_Base" in other.stderr
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ("--channel FQ_Base", "Expected a column FQ_Base"),
-        ("--fit strict", "Expected recordings of one length"),
-        ("--label ((", "regular expression"),
-    ],
-)
-def test_an_option_that_does_not_fit_is_one_line(folder: Path, options: str, words: str) -> None:
-    result = dengine("data", folder, *options.split())
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert words in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-
-
 def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
     data = make_data(120, samples=60)
     X, y = data.X.copy(), data.y.copy()
