@@ -53,10 +53,9 @@ def test_every_row_of_a_grid_can_be_told_from_the_others() -> None:
     assert shown[: shown.index("Means a replay")].count("binomial") == 4
 
 
-@pytest.mark.parametrize("address", ["nonsense", "foo://host:1"])
-def test_an_address_that_is_none_of_a_scheduler_says_what_is_expected(address: str) -> None:
+def test_an_address_that_is_none_of_a_scheduler_says_what_is_expected() -> None:
     pytest.importorskip("distributed")
-    result = dengine(*words(f"--reducers pca --repeats 1 --scheduler {address}"))
+    result = dengine(*words("--reducers pca --repeats 1 --scheduler nonsense"))
     assert result.exit_code == 1
     assert "Expected --scheduler to be the address of a running dask scheduler" in result.output
 

@@ -49,6 +49,8 @@ def test_settings_and_counts_out_of_range_are_named() -> None:
         failure_bound(10, 11, 0.05)
     with pytest.raises(SettingError, match="0 < tolerance < 1, got 0"):
         certify(Outcomes(), 0.05, 0.0, "all", 0.0)
+    with pytest.raises(SettingError, match="0 < target < 1"):
+        certificate().accepted.audits_needed(1.0)
 
 
 def test_what_is_known_one_way_and_the_other_spends_alpha_once() -> None:
@@ -81,14 +83,6 @@ def test_as_many_more_audits_as_are_asked_for_bring_the_bound_to_the_target(targ
     assert more is not None
     assert failure_bound(found.n + more * 10, found.n_bad, found.alpha, 0.1) <= target + 1e-12
     assert failure_bound(found.n + (more - 1) * 10, found.n_bad, found.alpha, 0.1) > target
-
-
-def test_the_advice_says_how_many() -> None:
-    assert certificate("all", accepted=1203, stops=24).advice.startswith("To show 2.5 % takes about ")
-    assert certificate("all", accepted=1203, stops=60).advice.endswith("at the present rate no number would do.")
-    assert certificate("all", accepted=1203, stops=0).advice == "Even 2.5 % is shown."
-    with pytest.raises(SettingError, match="0 < target < 1"):
-        certificate().accepted.audits_needed(1.0)
 
 
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)
@@ -151,9 +145,11 @@ def test_one_sentence_says_what_was_kept_or_what_audits_tell() -> None:
     end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
     kept = certificate("all", accepted=1203, stops=24)
     assert kept.kept
+    assert kept.advice.startswith("To show 2.5 % takes about ")
     assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden
     assert kept.sentence == "Of 1,203 parts that went on without a check, at most 3.5 %" + end
     audited = certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20)
     of = "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 %"
     assert audited.sentence == of + end
-    assert not certificate("all", accepted=1203, stops=60).kept
+    beyond = certificate("all", accepted=1203, stops=60)
+    assert (beyond.kept, beyond.advice.endswith("at the present rate no number would do.")) == (False, True)
