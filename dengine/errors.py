@@ -54,6 +54,10 @@ class SettingError(DengineError, ValueError):
     """A setting (policy, recipe, reducer, cell) outside its range or unknown by name."""
 
 
+class ImportRefusedError(SettingError):
+    """A class that a store names, and that its caller neither named again nor allowed to be imported."""
+
+
 class DataError(DengineError, ValueError):
     """A data set that cannot be read, or whose parts do not fit together."""
 

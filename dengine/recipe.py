@@ -94,6 +94,12 @@ class Recipe:
         """What to call it in a table: its reducer."""
         return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
 
+    @property
+    def own_classes(self) -> list[str]:
+        """Each `module:Class` that it names, of its reducer and its rule, and that is not of the package."""
+        names = (_named(self.reducer, self.params)[0], self.policy.guarantee)
+        return [name for name in names if ":" in name and not name.startswith("dengine.reducers")]
+
     @classmethod
     def load(cls, recipe: Any) -> Recipe:
         """A recipe by its name in `RECIPES`, from a TOML file's path, for a reducer of your own, or as it is.

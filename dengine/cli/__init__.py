@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import DengineError, without_password
+from ..errors import DengineError, ImportRefusedError, without_password
 from .data import data, simulate, train
 from .export import export
 from .history import explain, history
@@ -28,7 +28,7 @@ from .store import correct, forget, import_labels, policy, retrain, rollback, ve
 
 
 class Verbs(click.Group):
-    """A group whose foreseen failures are one line on stderr and exit code 1."""
+    """A group whose foreseen failures are one line on stderr and exit code 1; 2 where an option would do."""
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the verb."""
@@ -38,7 +38,8 @@ class Verbs(click.Group):
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
         except (DengineError, OSError, UnicodeError) as error:  # the last of a name that no file system has
-            raise click.ClickException(without_password(" ".join(str(error).split()))) from error
+            kind = click.UsageError if isinstance(error, ImportRefusedError) else click.ClickException
+            raise kind(without_password(" ".join(str(error).split()))) from error
         except click.ClickException as error:
             # click repeats the words that it was called with.
             error.message = without_password(error.message)  # type: ignore[misc]  # final for click, not for us

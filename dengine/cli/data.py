@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -132,9 +132,12 @@ WITHIN = "At most so many, each within the recipe's seconds and going on from th
 @options.data_options(None)
 @options.store_option("Where the engine remembers; made if need be.", "--cell", required=True)
 @options.recipe_options
+@options.allow_import_option
 @options.new_seed_option
 @click.option("--retrains", type=options.COUNT, default=10, show_default=True, help=WITHIN)
-def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, retrains: int) -> None:
+def train(
+    choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, retrains: int, allow_import: bool
+) -> None:
     """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant) is kept, but never
@@ -157,11 +160,12 @@ def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None
 
     try:
         with steps(f"importing {data.name}", len(data)) as count:
-            imported = import_labelled(store, data, choice.if_asked(), seed, count)
+            imported = import_labelled(store, data, choice.if_asked(), seed, count, allow_import)
     except EndAskedError as end:
         there = f"{end.args[0]} of {len(data)} traces are in {store}"
         end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
-    with DataEngine.open(store, wait=UNHURRIED) as engine:
+    asked: dict[str, Any] = {"recipe": choice.if_asked(), "allow_import": allow_import}
+    with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
         try:
             with steps("training", retrains) as count:
                 train_until_done(engine, retrains, trained)

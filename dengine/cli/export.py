@@ -27,9 +27,17 @@ CPP = "Write into this new folder the C and C++ sources that run an exported fil
 @click.option("--key", type=click.Path(exists=True, dir_okay=False, path_type=Path), help=KEY)
 @click.option("--make-key", "new_key", type=FILE, help=NEW_KEY)
 @click.option("--cpp", type=FOLDER, help=CPP)
+@options.allow_import_option
 @options.force_option
 def export(
-    store: str | None, out: Path | None, form: str, key: Path | None, new_key: Path | None, cpp: Path | None, force: bool
+    store: str | None,
+    out: Path | None,
+    form: str,
+    key: Path | None,
+    new_key: Path | None,
+    cpp: Path | None,
+    allow_import: bool,
+    force: bool,
 ) -> None:
     """Write an engine's decision to a file for the controller.
 
@@ -52,7 +60,7 @@ def export(
         made["cpp"] = export_sources(cpp)
         said.append(f"Wrote {cpp}; build it as {cpp / 'CMakeLists.txt'} says.")
     if store is not None and out is not None:
-        with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
+        with DataEngine.open(store, reading=True, allow_import=allow_import) as engine:  # the cell may run meanwhile
             {"torchscript": export_torchscript, "onnx": export_onnx}[form](engine, out, key=key, force=force)
             version, references = engine.version, len(engine.model.index)
         n_bytes = out.stat().st_size

@@ -134,8 +134,9 @@ def _told(each: StoredVersion | Event) -> str:
 @options.store_argument
 @click.argument("decision", metavar="DECISION")
 @click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
+@options.allow_import_option
 @options.picture_option
-def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None:
+def explain(store: str, decision: str, neighbours: int, allow_import: bool, out: Out | None) -> None:
     """Say why a decision came out as it did.
 
     DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
@@ -154,7 +155,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
             if newest is None:
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
             decision = newest.decision.id
-        found = explain_stored(opened, decision, neighbours)
+        found = explain_stored(opened, decision, neighbours, allow_import)
     record, past = {"store": store} | found.record(), found.decision
     tables = [facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))]
     if found.neighbours:

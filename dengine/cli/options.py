@@ -293,6 +293,8 @@ def must_have(what: str, extra: str, *needed: str) -> None:
 _SCENARIO = "What changes while the simulated cell runs: nominal (nothing), wear, variant or bias_jump."
 _SEED = "An integer; the same seed, the same run."
 _NEW_SEED = "An integer, of a new store's engine.  [default: 0]"
+_ALLOW = "Import the reducer and the rule of one's own, module:Class, that STORE names: only of a store that you trust."
+allow_import_option = click.option("--allow-import", is_flag=True, help=_ALLOW)
 force_option = click.option("--force", is_flag=True, help="Replace the files that are there; a store never is.")
 
 

@@ -37,6 +37,7 @@ KINDS = "replay: the parts of --data, in their order. simulated: physics in MuJo
 @options.store_option("Remembers everything; without one the run is forgotten.")
 @options.recipe_options
 @options.new_seed_option
+@options.allow_import_option
 @click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
 @options.out_option
 def run(
@@ -46,6 +47,7 @@ def run(
     store: str | None,
     seed: int | None,
     shadow: bool,
+    allow_import: bool,
     out: Out | None,
     **cell_of: Any,
 ) -> None:
@@ -61,7 +63,8 @@ def run(
         options.must_have("the simulated cell", "sim", "mujoco")
     from ..engine.engine import DataEngine
 
-    with ExitStack() as opened, DataEngine.open_or_create(store, seed, recipe=choice.if_asked()) as engine:
+    used = DataEngine.open_or_create(store, seed, recipe=choice.if_asked(), allow_import=allow_import)
+    with ExitStack() as opened, used as engine:
         if shadow:
             engine.set_shadow(True)
         cell, name = CELLS[kind](store=engine.store, seed=engine.seed, cycles=cycles, **cell_of)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..engine.engine import DataEngine
-    from ..recipe import Recipe
 
 NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
@@ -55,6 +54,7 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
 @click.option("--samples", type=COUNT, default=1000, show_default=True, help="Of a recorded trace.")
+@options.allow_import_option
 @options.new_seed_option
 @options.recipe_options
 def serve(
@@ -63,6 +63,7 @@ def serve(
     demo: bool,
     speed: float,
     shadow: bool,
+    allow_import: bool,
     xmlrpc: bool,
     page: bool,
     robot: str | None,
@@ -101,15 +102,15 @@ def serve(
         if robot:
             host, port = host_and_port(robot)
             how["recorder"] = partial(RtdeRecorder, host, trigger, samples, port=port)
-        make = partial(_opened, store, seed, recipe, shadow)
+        make = partial(_opened, store, seed, shadow, recipe=recipe, allow_import=allow_import)
         serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
 
 
-def _opened(store: str, seed: int | None, recipe: Recipe | None, shadow: bool, executor: Executor) -> DataEngine:
+def _opened(store: str, seed: int | None, shadow: bool, executor: Executor, **how: Any) -> DataEngine:
     from ..engine.engine import DataEngine
     from ..serve.server import tell_safe_mode
 
-    engine = DataEngine.open_or_create(store, seed, recipe=recipe, executor=executor, on_safe_mode=tell_safe_mode)
+    engine = DataEngine.open_or_create(store, seed, executor=executor, on_safe_mode=tell_safe_mode, **how)
     if shadow:
         engine.set_shadow(True, "dengine serve --shadow")
     return engine

@@ -41,12 +41,12 @@ interval_option = click.option("--interval", type=Known("interval"), help="The c
 author_option = click.option("--author", default=_login, help="Who says so, for the record.  [default: the login name]")
 
 
-def _changed(store: str, author: str, change: Callable[[DataEngine], Changed]) -> None:
+def _changed(store: str, author: str, allow_import: bool, change: Callable[[DataEngine], Changed]) -> None:
     """Open the store's engine, change something, and say what happened."""
     from ..engine.engine import DataEngine
     from ..store.opening import UNHURRIED
 
-    with DataEngine.open(store, wait=UNHURRIED) as engine:
+    with DataEngine.open(store, wait=UNHURRIED, allow_import=allow_import) as engine:
         changed = change(engine)
         certificate, policy = engine.certificate(), engine.policy
     recorded = "" if changed.event is None else f" Event {changed.event}, by {author or 'nobody named'}."
@@ -58,47 +58,51 @@ def _changed(store: str, author: str, change: Callable[[DataEngine], Changed]) -
 @options.store_argument
 @click.argument("decision", metavar="ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@options.allow_import_option
 @author_option
-def correct(store: str, decision: str, label: str, author: str) -> None:
+def correct(store: str, decision: str, label: str, author: str, allow_import: bool) -> None:
     """Say that a label was wrong: the part was good, or bad.
 
     From now on the decision ID counts so. The label as it was reported stays in the store, and so does what was
     decided; the correction is a later row. A forgotten label counts again by it.
     """
-    _changed(store, author, lambda engine: engine.correct(decision, LABELS[label], author))
+    _changed(store, author, allow_import, lambda engine: engine.correct(decision, LABELS[label], author))
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
 @options.store_argument
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
+@options.allow_import_option
 @author_option
-def forget(store: str, decisions: tuple[str, ...], reason: str, author: str) -> None:
+def forget(store: str, decisions: tuple[str, ...], reason: str, author: str, allow_import: bool) -> None:
     """Leave labels out of all that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings one back. All are forgotten, or,
     where one is unknown or has no label, none.
     """
-    _changed(store, author, lambda engine: engine.forget(*decisions, author=author, reason=reason))
+    _changed(store, author, allow_import, lambda engine: engine.forget(*decisions, author=author, reason=reason))
 
 
 @verb("dengine rollback engine.db 1")
 @options.store_argument
 @click.argument("version", metavar="VERSION", type=int)
+@options.allow_import_option
 @author_option
-def rollback(store: str, version: int, author: str) -> None:
+def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
     """Let an earlier model version answer again, as a new one.
 
     Labels that came since are among its references, and corrections count.
     """
-    _changed(store, author, lambda engine: engine.rollback(version, author))
+    _changed(store, author, allow_import, lambda engine: engine.rollback(version, author))
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
 @options.store_argument
 @options.gathered("settings", options.given, POLICY | {"interval": interval_option, "shadow": shadow_option})
+@options.allow_import_option
 @author_option
-def policy(store: str, settings: dict[str, Any], author: str) -> None:
+def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or decide by another one.
 
     What is not given stays as it is. Earlier decisions keep the bounds they were decided by. What the rule learned,
@@ -106,11 +110,11 @@ def policy(store: str, settings: dict[str, Any], author: str) -> None:
     mode lasts over restarts; `dengine status` counts what the model would have done, and how much of that was wrong.
     """
     if settings:
-        _changed(store, author, lambda engine: engine.set_policy(replace(engine.policy, **settings), author))
+        _changed(store, author, allow_import, lambda engine: engine.set_policy(replace(engine.policy, **settings), author))
         return
     from ..engine.engine import DataEngine
 
-    with DataEngine.open(store, reading=True) as engine:  # the cell may run meanwhile
+    with DataEngine.open(store, reading=True, allow_import=allow_import) as engine:  # the cell may run meanwhile
         now = engine.policy
     rows = [(name, str(value)) for name, value in asdict(now).items()]
     tell({"store": store, "changed": False, "policy": now}, facts(f"{store}: the policy in force", rows))
@@ -118,8 +122,9 @@ def policy(store: str, settings: dict[str, Any], author: str) -> None:
 
 @verb("dengine retrain engine.db")
 @options.store_argument
+@options.allow_import_option
 @author_option
-def retrain(store: str, author: str) -> None:
+def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 
     A candidate that fails its gate is dropped and recorded, and the version before goes on answering.
@@ -128,7 +133,7 @@ def retrain(store: str, author: str) -> None:
     from ..experiments.tables import retrain_line
     from ..store.opening import UNHURRIED
 
-    with DataEngine.open(store, wait=UNHURRIED) as engine:
+    with DataEngine.open(store, wait=UNHURRIED, allow_import=allow_import) as engine:
         report = engine.retrain()
         text = f"trained by hand on {report.n_traces} traces: {report.reason}"
         engine.store.put_event("retrain", text, asdict(report), author)

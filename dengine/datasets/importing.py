@@ -91,6 +91,7 @@ def import_labelled(
     recipe: Recipe | str | None = None,
     seed: int | None = None,
     on_traces: Callable[[int], None] | None = None,
+    allow_import: bool = False,
 ) -> ImportReport:
     """Put every labelled trace of a data set into a new or a used store, in order, in chunks that are all or none.
 
@@ -98,11 +99,11 @@ def import_labelled(
 
     dataset : anything `load_dataset` takes.
     recipe, seed : of a new store's engine, conv and 0 by default; a used store has its own, and others are a SettingError.
-    on_traces : called with the number of traces that were just dealt with.
+    on_traces : called with the number of traces that were just dealt with.  allow_import : as for `DataEngine.open`.
     Raises TraceError where the traces break the contract that the store's engine agreed on.
     """
     data = load_dataset(dataset, **form_in(store, dataset))
-    engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe)
+    engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import)
     counts = np.zeros(3, dtype=np.int64)
     try:
         agreed = engine.agree_on(data.spec)

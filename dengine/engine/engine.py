@@ -13,7 +13,7 @@ import signal
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import DengineError, StoreError, UnknownDecisionError
+from ..errors import DengineError, ImportRefusedError, StoreError, UnknownDecisionError
 from ..history.explain import Circumstances, Explanation, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
@@ -55,7 +55,7 @@ from .decide import DecisionMaker, as_part, decided_before, unasked
 from .feedback import Feedback
 from .peers import Fleet, agreed, as_peers, peers_trace
 from .resume import resume
-from .settings import EngineSettings, SettingsInForce, chosen_recipe, object_of, refuse_idle
+from .settings import EngineSettings, SettingsInForce, chosen_recipe, classes_of, object_of, refuse_idle
 from .trainer import Clock, Limits, Retrainer, Window
 from .versions import ModelVersions
 
@@ -174,21 +174,29 @@ class DataEngine:
 
     @classmethod
     def open(
-        cls, url: StoreLike, *, reducer: Any = None, model: Model | None = None, wait: float | None = None, **options: Any
+        cls,
+        url: StoreLike,
+        *,
+        reducer: Any = None,
+        model: Model | None = None,
+        wait: float | None = None,
+        allow_import: bool | Collection[str] = False,
+        **options: Any,
     ) -> Self:
         """Go on with a store: the same version, the same decisions, bit for bit.
 
         wait : seconds for a file or URL, as `SqlStore` takes it.
         reducer, model : where the engine had an object of yours that the store cannot name, the same one again.
+        allow_import : whether a `module:Class` that the store names is imported, or which of them; what reducer names is.
         options : executor, replaying, clock and on_safe_mode, as `DataEngine` takes them; reading=True looks at a
             store that another engine may own, to export it for one, and neither decides nor learns.
         Raises StoreError where there is nothing to go on with or another engine owns the cell, SettingError where an object
-        is missing.
+        is missing, ImportRefusedError, a SettingError, where a class would have to be imported that is not allowed.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
             name = "the store" if isinstance(url, Store) else str(url)
-            settings = EngineSettings.from_store(store.settings(), name, reducer, model)
+            settings = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
             engine._start(*settings.with_template(model), store, **options)
             with engine._closed_on_failure():
                 engine._versions.resume()
@@ -198,20 +206,27 @@ class DataEngine:
 
     @classmethod
     def open_or_create(
-        cls, store: StoreLike | None, seed: int | None = None, *, wait: float | None = None, **settings: Any
+        cls,
+        store: StoreLike | None,
+        seed: int | None = None,
+        *,
+        wait: float | None = None,
+        allow_import: bool = False,
+        **settings: Any,
     ) -> Self:
         """Go on with a store that has been used, or start on a new one: the same line at every start of a program.
 
-        wait : as for `open`.
+        wait, allow_import : as for `open`; what the settings name is allowed.
         settings : as `DataEngine` takes them. Those given must be what a used store was made with, or a SettingError
             says so: a running cell's settings do not change in silence.
         """
         with opening(store, wait=wait) as opened:
+            allowed = allow_import or classes_of(**settings)
             if not opened.settings():
-                return cls(store=opened, **as_peers(settings | {"seed": seed}, opened))
+                return cls(store=opened, **as_peers(settings | {"seed": seed}, opened, allowed))
             of_open = ("model", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in of_open if name in settings}
-            engine = cls.open(opened, reducer=object_of(**settings), **options)
+            engine = cls.open(opened, reducer=object_of(**settings), allow_import=allowed, **options)
             with engine._closed_on_failure():
                 engine._settings.now.must_agree_with(settings | {"seed": seed})
             return engine
@@ -524,17 +539,21 @@ class DataEngine:
         self.close()
 
 
-def explain_stored(store: Store, decision_id: str, neighbours: int = 10) -> Explanation:
-    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes."""
-    return explain(store, decision_id, neighbours, present=lambda: _present(store))
+def explain_stored(store: Store, decision_id: str, neighbours: int = 10, allow_import: bool = False) -> Explanation:
+    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes. allow_import : as for `open`."""
+    return explain(store, decision_id, neighbours, present=lambda: _present(store, allow_import))
 
 
-def _present(store: Store) -> tuple[EngineModel | None, int]:
+def _present(store: Store, allow_import: bool) -> tuple[EngineModel | None, int]:
     """The model that answers now, rebuilt, and its version; None where it needs an object that the store cannot name."""
     try:
-        settings, template = EngineSettings.from_store(store.settings(), "the store").with_template(None)
+        settings, template = EngineSettings.from_store(
+            store.settings(), "the store", allow_import=allow_import
+        ).with_template(None)
         resumed = resume(store, template, Window(settings.recipe.window), settings.evidence)
         return resumed.model, resumed.version
+    except ImportRefusedError:
+        raise
     except DengineError as error:
         log.info("the present model cannot be rebuilt from the store alone: %s", error)
         return None, 0

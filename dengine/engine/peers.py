@@ -8,7 +8,7 @@ two cycles, never by `decide`; a cell whose connection is lost goes on with what
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from ..records import TraceSpec, trace_in
 from ..store.base import Store
 from ..store.records import ModelVersion, without_rule
 from .resume import join_since, known_to, restored
-from .settings import EngineSettings
+from .settings import EngineSettings, must_allow
 from .trainer import TrainedOn
 from .versions import ModelVersions
 
@@ -42,8 +42,8 @@ def peers_trace(store: Store) -> TraceSpec | None:
     return next(filter(None, map(trace_in, store.peers_settings().values())), None)
 
 
-def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
-    """What a new engine is asked for; what was left open, as a peer has it if there is one."""
+def as_peers(asked: Mapping[str, Any], store: Store, allow_import: bool | Collection[str]) -> dict[str, Any]:
+    """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
     known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)
     if filled.get("seed") is None:
@@ -51,6 +51,7 @@ def as_peers(asked: Mapping[str, Any], store: Store) -> dict[str, Any]:
     chosen = any(filled.get(name) is not None for name in ("reducer", "recipe", "model"))
     if "recipe" in known and not chosen and "described" not in known:  # an object must be handed in
         filled["recipe"] = Recipe.from_toml(known["recipe"])
+        must_allow(filled["recipe"], "a peer in the store", allow_import)
     return filled
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Self
 
 from .. import __version__
 from ..decision.policy import Policy
-from ..errors import SettingError, StoreError, shortened
+from ..errors import ImportRefusedError, SettingError, StoreError, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT, Recipe, described
@@ -72,9 +72,17 @@ class EngineSettings:
         return known | {name: str(value) for name, value in zip(MARKS, marks, strict=True) if value}
 
     @classmethod
-    def from_store(cls, known: Mapping[str, str], name: str, reducer: Any = None, model: Model | None = None) -> Self:
+    def from_store(
+        cls,
+        known: Mapping[str, str],
+        name: str,
+        reducer: Any = None,
+        model: Model | None = None,
+        allow_import: bool | Collection[str] = False,
+    ) -> Self:
         """What `to_store` gave. name : of the store, for errors.  reducer, model : objects that it cannot bring back.
 
+        allow_import : as for `must_allow`, beside what the reducer names.
         Raises StoreError for an unused store, SettingError for a missing object, or another than it was made with.
         """
         if "recipe" not in known:
@@ -100,6 +108,7 @@ class EngineSettings:
                 raise SettingError(
                     f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out."
                 )
+        must_allow(recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)})
         inferred = "inferred" in known
         seed = known.get("seed", "0")
         if not (seed.isdecimal() and seed.isascii() and len(seed) < 100):
@@ -148,6 +157,26 @@ def chosen_recipe(reducer: Any, recipe: Any, beside: Mapping[str, Any]) -> Recip
     if recipe is not None and reducer is not None and reducer != base.reducer:
         raise SettingError(f"The recipe names its reducer, {base.name}; got reducer {reducer!r} beside it: leave one out.")
     return base.with_settings(**beside)
+
+
+def classes_of(reducer: Any = None, recipe: Any = None, policy: Policy | None = None, **others: Any) -> list[str]:
+    """Each `module:Class` that a caller names himself, in settings as `DataEngine` takes them."""
+    said = [Recipe.load(each) for each in (reducer, recipe) if each is not None]
+    return [name for each in (*said, Recipe(policy=policy or Policy())) for name in each.own_classes]
+
+
+def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
+    """ImportRefusedError where a store's recipe names a class that may not be imported: who writes there would run code.
+
+    allow_import : True: any may; else the names of those that may.
+    """
+    refused = [] if allow_import is True else [name for name in recipe.own_classes if name not in (allow_import or ())]
+    if refused:
+        raise ImportRefusedError(
+            f"Expected leave to import {shortened(refused[0])}, which {store} names: name it again "
+            "(reducer=, recipe=, policy=; --reducer, --guarantee), or allow it, where you "
+            "trust the store (allow_import=True; --allow-import)."
+        )
 
 
 def object_of(reducer: Any = None, recipe: Any = None, **others: Any) -> Any:

@@ -9,6 +9,7 @@ says by which. A store keeps each version's references, each trace's place, and 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -113,6 +114,8 @@ def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Leve
 
 
 def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> DecisionRule | None:
+    if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
+        return None  # nothing is imported because a store says so; an engine that runs here has imported it
     rule, kept = policy.rule(), _buffers(stored, "rule.")
     if {name: value.shape for name, value in rule.state_dict().items()} != {name: v.shape for name, v in kept.items()}:
         return None  # the rule was another one, handed in with its model, or had missed something

@@ -207,8 +207,7 @@ class MemoryStore(Store):
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first; forgotten ones are not among them."""
         waiting = [item for item in self._open.values() if item.decision.action is Action.ACCEPT and not item.quarantined]
-        waiting = [item for item in waiting if item.decision.model_version >= since_version]
-        return [item.decision.id for item in sorted(waiting, key=lambda item: item.time)]  # a stable sort
+        return [item.decision.id for item in waiting if item.decision.model_version >= since_version]  # as they came
 
     def silent_total(self, since_version: int = 0) -> int:
         return sum(n for version, n in self._silent.items() if version >= since_version)

@@ -337,11 +337,10 @@ class SqlStore(Store):
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
         query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        # In the order of insertion: rows never change.
-        inserted: sa.ColumnElement[Any] = sa.literal_column("decision.ctid" if self._remote else "decision.rowid")
-        return [
-            row.id for row in self._read(query.where(_since(DECISION, since_version)).order_by(DECISION.c.time, inserted))
-        ]
+        # In the order of insertion, whatever the clock said: rows never change. PostgreSQL may fill an earlier page again.
+        names = ("decision.entry", "decision.ctid") if self._remote else ("decision.rowid",)
+        inserted = query.where(_since(DECISION, since_version)).order_by(*map(sa.literal_column, names))
+        return [row.id for row in self._read(inserted)]
 
     def silent_total(self, since_version: int = 0) -> int:
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))

@@ -200,7 +200,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
 
 
 def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, monkeypatch) -> None:
-    for words in (["--reducer", "his:FirstAndLast"], ["--retrains", 1]):  # made, and opened again
+    for words in (["--reducer", "his:FirstAndLast"], ["--retrains", 1, "--allow-import"]):  # made, and opened again
         monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own)])
         sys.modules.pop("his", None)
         out = succeed("train", "--data", data, "--store", "e.db", *words)

@@ -107,11 +107,11 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(ou
         paused = engine.decide(good(data))
         assert paused.lower >= 0.9  # only the rule holds it back
         assert paused.action is Action.VERIFY
-    with DataEngine.open(url) as engine:
+    with DataEngine.open(url, allow_import=True) as engine:
         again = engine.decide(good(data))
         assert (again.action, again.lower) == (Action.VERIFY, paused.lower)
         engine.retrain()
-    with DataEngine.open(url) as engine:  # now from the version's own state
+    with DataEngine.open(url, allow_import=True) as engine:  # now from the version's own state
         assert engine.decide(good(data)).action is Action.VERIFY
         for x, y in zip(data.X[:60], data.y[:60], strict=True):
             decision = engine.decide(np.roll(x, 1))
@@ -137,7 +137,7 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(outsi
         assert {c.decision.reason for c in cycles[41:]} == {"model_error"}
         assert len(engine.store.labelled().labels) == 100
         assert engine.version == 2
-    with DataEngine.open(url) as engine:
+    with DataEngine.open(url, allow_import=True) as engine:
         assert engine.decide(good(data)).action is Action.VERIFY
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.pipeline import make_pipeline
@@ -25,9 +26,11 @@ from dengine import (
     replay,
     run_grid,
 )
-from dengine.errors import SettingError
+from dengine.cli import main
+from dengine.errors import ImportRefusedError, SettingError
 from dengine.recipe import RECIPES
 from dengine.reducers.features import FIRST_STEPS
+from dengine.store.records import address
 from tests.support.driving import Counting, drive
 
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
@@ -179,9 +182,40 @@ def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(outside, da
             assert 'reducer = "halves:Halves"' in engine.recipe.to_toml()
             drive(engine, data, 0, 60)
             before = engine.decide(data.X[70])
-        with DataEngine.open(tmp_path / f"{i}.db") as engine:
+        with DataEngine.open(tmp_path / f"{i}.db", reducer=reducer) as engine:
             assert engine.recipe.params == ({"gain": 3.0, "n_components": 2} if i else {})
             assert engine.decide(data.X[70]).embedding == before.embedding
+
+
+@pytest.mark.parametrize("mine", [{"reducer": "halves:Halves"}, {"policy": replace(POLICY, guarantee="halves:Rule")}])
+def test_what_a_store_names_is_imported_only_where_its_caller_says_so(outside, mine, data, tmp_path, monkeypatch) -> None:
+    module, ran, url = tmp_path / "halves.py", tmp_path / "ran", str(tmp_path / "engine.db")
+    rule = "\n\nfrom dengine.decision.rule import DecisionRule\n\n\nclass Rule(DecisionRule): ...\n"
+    module.write_text(module.read_text() + rule)
+    made = {"reducer": "pca", "policy": POLICY, "retrain_every": 40} | mine
+    with DataEngine(store=address(url, "a", "nut"), **made) as engine:
+        drive(engine, data, 0, 60)
+        first, last = (past.decision.id for past in list(engine.history())[::59])
+    monkeypatch.delitem(sys.modules, "halves")
+    module.write_text(module.read_text() + f"open({str(ran)!r}, 'w').close()\n")
+
+    def exit_code(verb: str, *words: str) -> int:
+        return CliRunner().invoke(main, [verb, url, *words, "--cell", "a"]).exit_code
+
+    assert [exit_code(verb) for verb in ("status", "verify", "history")] == [0] * 3
+    assert exit_code("explain", last) in (0, 2)  # by what is kept of the version, or not at all
+    assert [exit_code(*words) for words in (("explain", first), ("retrain",), ("policy",))] == [2] * 3
+    for opened in (DataEngine.open, DataEngine.open_or_create):
+        with pytest.raises(ImportRefusedError, match=r"halves:.*, which .* names: name it again .*allow_import=True"):
+            opened(address(url, "a"))
+    with pytest.raises(ImportRefusedError, match=r"halves:.*, which a peer"):
+        DataEngine.open_or_create(address(url, "b", "nut"))
+    assert not ran.exists()
+    assert exit_code("explain", first, "--allow-import") == 0
+    assert ran.exists()
+    monkeypatch.delitem(sys.modules, "halves")
+    DataEngine.open_or_create(address(url, "a"), **mine).close()
+    DataEngine.open_or_create(address(url, "b", "nut"), allow_import=True).close()
 
 
 def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp_path: Path) -> None:
