@@ -98,7 +98,7 @@ class Recipe:
     def own_classes(self) -> list[str]:
         """Each `module:Class` that it names, of its reducer and its rule, and that is not of the package."""
         names = (_named(self.reducer, self.params)[0], self.policy.guarantee)
-        return [name for name in names if ":" in name and not name.startswith("dengine.reducers")]
+        return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 
     @classmethod
     def load(cls, recipe: Any) -> Recipe:
