@@ -88,6 +88,10 @@ class StoreError(DengineError, RuntimeError):
     """A store that cannot be opened, belongs to something else, or lost its writer."""
 
 
+class NotTakenError(StoreError):
+    """A label that is not known to be on the disk: say the same again; it counts once."""
+
+
 class BusyError(DengineError, RuntimeError):
     """A server that has as much to do as it takes, or is closing: whoever asked goes on without it, and verifies."""
 

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import DengineError, ImportRefusedError, StoreError, UnknownDecisionError
+from ..errors import DengineError, ImportRefusedError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.explain import Circumstances, Explanation, explain
 from ..history.status import history
 from ..model.base import EngineModel, Exportable, Model
@@ -46,7 +46,7 @@ from ..records import (
     source_of,
 )
 from ..store.base import Store
-from ..store.opening import opening
+from ..store.opening import UNHURRIED, opening
 from ..store.outbox import CLOSE, Outbox
 from ..store.records import StoredDecision
 from ..traces import as_agreed
@@ -379,7 +379,7 @@ class DataEngine:
             for index in range(cycles):
                 yield self._cycle(cell, index)
         finally:
-            self.flush()
+            self.flush(UNHURRIED if self.store.wait is not None else None)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         trace = cell.insert()
@@ -396,7 +396,10 @@ class DataEngine:
             cell.reject()
         if success is not None:
             source = source_of(decision.id, decision.action, decision.audit, success)
-            self.report(decision.id, success)
+            try:
+                self.report(decision.id, success)
+            except NotTakenError as error:  # it waits for the disk, and every part is verified until that is well
+                log.warning("the label of %s: %s", decision.id, error)
         return Cycle(index, decision, outcome, success, source, seconds, self.settle(), self.safe_mode)
 
     def settle(self, brief: bool = False) -> RetrainReport | None:
@@ -449,10 +452,10 @@ class DataEngine:
         self.flush()
         self._outbox.know()
 
-    def flush(self) -> None:
-        """Return when all that is known so far is on the disk."""
-        self._feedback.store_waiting()
-        self._outbox.flush()
+    def flush(self, wait: float | None = None) -> None:
+        """Return when all that is known so far is on the disk; NotTakenError after `wait` seconds, None: the store's."""
+        self._feedback.store_waiting(secure=False)
+        self._outbox.flush(wait)
         self._feedback.arrive()
 
     @property

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from ..errors import StoreError
+from ..errors import NotTakenError, StoreError
 from ..records import RetrainReport
 from .base import Store
 from .journal import LostJournalError, Record, TakenLabel, from_bytes, to_bytes
@@ -291,15 +291,19 @@ class Outbox:
         self._changed.notify_all()
         return self._appended
 
-    def _wait_synced(self, place: int) -> None:
-        """Return when the records up to a place are on the disk. StoreError where that takes too long, or fails."""
+    def _wait_synced(self, place: int, wait: float | None = None) -> None:
+        """Return when the records up to a place are on the disk. NotTakenError where that takes too long, or fails.
+
+        wait : seconds at most; None: the limit.
+        """
+        limit = self.limit if wait is None else wait
         with self._changed:
             self._wanted, self._asked, tries = max(self._wanted, place), self._asked + 1, self._tries
             self._changed.notify_all()
-            self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, self.limit)
+            self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, limit)
             if self._synced < place:
-                why = self._stuck or f"the disk gave no answer within {self.limit:g} s."
-                raise StoreError(
+                why = self._stuck or f"the disk gave no answer within {limit:g} s."
+                raise NotTakenError(
                     f"What was told is not known to be taken: {why} "
                     "Say the same again; once the disk is well it is taken, and counts once."
                 )
@@ -388,10 +392,13 @@ class Outbox:
     def _is_away(self) -> StoreError:
         return StoreError(f"The store is away: {self._blocked} Labels wait in its journal; try this again when it is back.")
 
-    def flush(self) -> None:
-        """Return when all that is known so far is in the store, or, where that is away, on the disk in the journal."""
+    def flush(self, wait: float | None = None) -> None:
+        """Return when all that is known so far is in the store, or, where that is away, on the disk in the journal.
+
+        wait : seconds that the disk may take; None: the limit.
+        """
         if self._journal is not None:
-            self._wait_synced(self._appended)
+            self._wait_synced(self._appended, wait)
             with suppress(StoreError):
                 self.drain()
 

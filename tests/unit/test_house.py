@@ -17,7 +17,7 @@ FILES = {".".join(file.relative_to(REPO).with_suffix("").parts): file for file i
 MODULES = {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}  # a family's is named NAME.__init__
 
 
-PACKAGE_LINES, REST_LINES = 28_100, 26_000
+PACKAGE_LINES, REST_LINES = 25_300, 22_150
 KNOWN = {name.removesuffix(".__init__") for name in MODULES} - {"dengine"}
 
 

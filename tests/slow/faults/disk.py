@@ -10,13 +10,16 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 
-from dengine import Action, DataEngine, Decision
+import numpy as np
+
+from dengine import Action, DataEngine, Decision, Reason, ReplayCell
 from dengine.errors import ReportError, StoreError
 
 from .harness import Cell, Outcome, Place, stream
@@ -60,6 +63,11 @@ def closed_while_hung(outcome: Outcome, place: Place) -> None:
     injected(outcome, place, "close")
 
 
+def run_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
+    """A sync hangs for two seconds under a cell's loop."""
+    injected(outcome, place, "run")
+
+
 def without_a_disk(cell: Cell, i: int, timed: Callable[[], AbstractContextManager[None]]) -> Decision:
     """Decide and report while nothing is synced: what is not on the disk is verified, and not acknowledged."""
     engine, outcome, x, good = cell.engine, cell.outcome, stream().X[i], bool(stream().y[i])
@@ -92,8 +100,16 @@ def play(place: Place, said: Path, mode: str) -> Outcome:
         yield
         outcome.longest = max(outcome.longest, time.perf_counter() - begin)
 
-    said.write_text("hang" if mode == "close" else mode)
+    said.write_text("fail" if mode == "fail" else "hang")
     outcome.injected += 1
+    if mode == "run":
+        threading.Timer(2.0, said.write_text, [""]).start()
+        cycles = list(engine.run(ReplayCell(data, np.arange(60, 90)), 30))
+        outcome.must(any(c.decision.reason is Reason.NO_STORE for c in cycles), "a part was decided on over a hung disk")
+        cell.acknowledged |= {c.decision.id: c.success for c in cycles if c.success is not None}
+        cell.play(60)
+        cell.finish()
+        return outcome
     told = {f"part-{i}": without_a_disk(cell, i, timed) for i in range(60, 60 + IDS)}
     with timed():
         outcome.must(bool(engine.store_fault), "the engine says that its disk is well")

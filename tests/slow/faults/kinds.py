@@ -20,7 +20,7 @@ from dengine import Reason
 from dengine.engine import trainer
 from dengine.errors import StoreError
 
-from .disk import closed_while_hung, failing_disk, hung_disk
+from .disk import closed_while_hung, failing_disk, hung_disk, run_over_a_hung_disk
 from .harness import Cell, Outcome, Place, stream
 
 BEFORE, DURING, AFTER = 100, 40, 60  # parts; a version is stored after 40 labels
@@ -299,6 +299,6 @@ def forked(outcome: Outcome, place: Place) -> None:
 
 
 OF_STORES = (locked, full, no_room_for_versions, moved, replaced, deleted, unstorable, lost_journal)
-ON_DISKS = (hung_disk, failing_disk, closed_while_hung)
+ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk)
 ON_SQLITE = (*OF_STORES, killed_executor, hung_executor, interrupted, forked)
 ON_POSTGRES = (frozen, cut_off)
