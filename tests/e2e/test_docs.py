@@ -96,7 +96,7 @@ def desk(tmp_path: Path) -> Path:
     for folder in ("training", "tests", "models", "notebooks"):
         (tmp_path / folder).symlink_to(REPO / folder)
     X, y = recordings()
-    np.savez(tmp_path / "small.npz", X=X[:, ::5], y=y)  # in the place of a large set
+    np.savez(tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y)))  # in the place of a large set
     return tmp_path
 
 

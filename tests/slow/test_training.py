@@ -78,9 +78,9 @@ def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, mo
 
     put_version = SqlStore.put_version
 
-    def slow(*words: Any) -> None:
+    def slow(*words: Any) -> Any:
         time.sleep(0.4)
-        put_version(*words)
+        return put_version(*words)
 
     monkeypatch.setattr(SqlStore, "put_version", slow)
     row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
