@@ -24,9 +24,18 @@ print(f"{len(audited)} packages were audited, {len(bad)} vulnerabilities found; 
 sys.exit(len(audited) < least or bool(bad))
 endef
 export COUNT_AUDITED
+
+define LOCKED
+import json, sys
+found = [(each["metadata"], each["download_info"].get("archive_info", {})) for each in json.load(sys.stdin)["install"]]
+for about, archive in sorted(found, key=lambda each: each[0]["name"].lower()):
+    if "hashes" in archive:
+        print(f"{about['name']}=={about['version']} --hash=sha256:{archive['hashes']['sha256']}")
+endef
+export LOCKED
 REPEATS ?= 200
 
-.PHONY: setup demo test test-merge test-all lint docs proof audit clean
+.PHONY: setup demo test test-merge test-all lint docs proof audit dist clean
 
 setup: $(VENV)/.dev
 
@@ -34,7 +43,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PIP) --no-compile --editable .
+	$(PIP) --no-compile --editable ".[serve,files,mcap]"
 	touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
@@ -43,7 +52,7 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 demo: $(VENV)/.demo
 	$(RUN) compare --data insertion --reducers conv,umap --alpha 0.1 --lower-bound 0.9 --repeats 1 --n-jobs 2 --out $(OUT) --force
-	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cell replay --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
+	@echo 'Go on with:  . $(VENV)/bin/activate && dengine run --cycles 600 --alpha 0.1 --lower-bound 0.9 --store cell.db'
 
 test: $(VENV)/.dev
 	$(PYTEST) -m "not slow" tests/unit tests/contract tests/e2e tests/golden
@@ -76,6 +85,13 @@ audit: $(VENV)/.dev
 	@$(VENV)/bin/python -m pip list --format freeze --exclude-editable | sed 's/+[^ ]*//' > $(AUDIT).txt
 	@$(VENV)/bin/pip-audit --strict --no-deps --disable-pip --requirement $(AUDIT).txt --format json --output $(AUDIT).json || true
 	@$(VENV)/bin/python -c "$$COUNT_AUDITED" $(AUDIT).json $(AUDITED)
+
+# For a project of one's own: a wheel; and what it needs, with versions and hashes, as pip resolves it on this machine.
+dist: $(VENV)/.demo
+	rm -rf build dist
+	$(VENV)/bin/python -m pip wheel --quiet --no-deps --disable-pip-version-check --wheel-dir dist .
+	$(PIP) --dry-run --ignore-installed --report - ".[serve,files,mcap]" | $(VENV)/bin/python -c "$$LOCKED" > dist/requirements.lock
+	@ls dist
 
 clean:
 	rm -rf $(VENV) $(OUT) build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -37,7 +37,6 @@ from .reducers.conv import ConvReducer as ConvReducer
 from .reducers.pca import PcaReducer as PcaReducer
 from .reducers.rocket import RocketReducer as RocketReducer
 from .reducers.umap import UmapReducer as UmapReducer
-from .store.memory import MemoryStore as MemoryStore
 from .store.opening import open_store as open_store
 from .store.sql import SqlStore as SqlStore
 

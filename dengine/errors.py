@@ -3,6 +3,7 @@
 import math
 import re
 import reprlib
+import shlex
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,6 +11,9 @@ HIDDEN = "***"
 # Up to the last @: a password may hold one that is not escaped, or a blank. A path writes // as /.
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 NAMED = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)  # in a URL's query, or of libpq
+QUOTES = ("'", '"')
+OPTIONS = "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic"
+OPTION = re.compile(rf"\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))")
 SHORT = reprlib.Repr()
 SHORT.maxstring = SHORT.maxother = SHORT.maxlong = 60
 
@@ -32,6 +36,16 @@ def listed(names: Iterable[Any]) -> str:
     names = list(names)
     few = ", ".join(str(name)[:100] for name in names[:8])
     return f"{few} and {len(names) - 8} more" if len(names) > 8 else few
+
+
+def as_options(text: str) -> str:
+    """Advice for Python, `TraceSpec(rate_hz=500)`, in the words of the command, `--rate-hz 500`."""
+
+    def typed(found: re.Match[str]) -> str:
+        name, value = f"--{(found[1] or found[3]).replace('_', '-')}", found[2] or ""
+        return f"{name} {shlex.quote(value[1:-1]) if value[:1] in QUOTES else value}".rstrip()
+
+    return OPTION.sub(typed, re.sub(r"(?:DataEngine\(trace=)?TraceSpec\(([^()]*)\)\)?", r"\1", text))
 
 
 def percent(share: float, form: str = ".1f") -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import math
 import os
 import secrets
 import stat
@@ -21,25 +20,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DataError, OutputError
+from .errors import DataError, DengineError, OutputError, expect
 
 MOST = 8 * 2**30  # bytes
-NPY: Any = np.lib.format  # untyped
-HEADERS = {(1, 0): NPY.read_array_header_1_0, (2, 0): NPY.read_array_header_2_0}
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
-UNREADABLE: tuple[type[Exception], ...] = (
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    LookupError,
-    OverflowError,
-    MemoryError,
-)
-UNREADABLE += (RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
+UNREADABLE: tuple[type[Exception], ...] = (OSError, EOFError, ValueError, TypeError, LookupError, OverflowError)
+UNREADABLE += (MemoryError, RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)
 DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")  # a store, and its write-ahead log
 NO_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
 MANIFEST = "manifest.json"
+SHORTEST_KEY = 16  # bytes
+
+
+def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
+    """The secret in a key's file; an error of this kind for what cannot be read, or is too short to be one."""
+    try:
+        secret = Path(path).read_bytes().rstrip(b"\r\n")
+    except OSError as raised:
+        said = f"The key's file {path} cannot be read: {raised.strerror}; dengine export --make-key writes one."
+        raise error(said) from raised
+    wanted = f"a key of {SHORTEST_KEY} bytes or more in {path}"
+    expect(len(secret) >= SHORTEST_KEY, wanted, len(secret), "use dengine export --make-key", error)
+    return secret
 
 
 def must_fit(size: float, what: object, limit: int | None = None) -> None:
@@ -92,37 +94,14 @@ def read_archive(
     DataError for what is no archive, is damaged, holds Python objects, or claims too much: nothing is unpacked then.
     """
     called = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
-    with (
-        reading(called, "an .npz file of plain arrays"),
-        zipfile.ZipFile(io.BytesIO(source) if isinstance(source, bytes) else Path(source)) as archive,
-    ):
-        members = {each.filename.removesuffix(".npy"): each for each in archive.infolist()}
-        wanted = {key: each for key, each in members.items() if names is None or key in names}
-        must_fit(sum(each.file_size for each in wanted.values()), called, limit)
-        for member in wanted.values():
-            with archive.open(member) as file:
-                _check_header(file, member)
-        return {key: _read(archive, member) for key, member in wanted.items()}, list(members)
-
-
-def _check_header(file: Any, member: zipfile.ZipInfo) -> None:
-    """ValueError where an array is said to be larger than its member: NumPy would take memory for it."""
-    read = HEADERS.get(NPY.read_magic(file))
-    if read is None:
-        raise ValueError(f"{member.filename} has a header of an unknown version")
-    shape, _, dtype = read(file)
-    if dtype.hasobject:
-        raise ValueError(f"{member.filename} holds Python objects, or something else")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != member.file_size - file.tell():
-        raise ValueError(f"{member.filename} claims the shape {shape} of {dtype}, and has another size")
-
-
-def _read(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    with archive.open(member) as file:
-        values: NDArray[Any] = NPY.read_array(file, allow_pickle=False)
-        if file.read(1):  # the last byte is where zipfile checks the sum
-            raise ValueError(f"{member.filename} is longer than its array")
-    return values
+    content = io.BytesIO(source) if isinstance(source, bytes) else source
+    with reading(called, "an .npz file of plain arrays"), np.load(content, allow_pickle=False) as archive:
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it is a single array")
+        members = {each.filename.removesuffix(".npy"): each.file_size for each in archive.zip.infolist()}
+        wanted = [key for key in members if names is None or key in names]
+        must_fit(sum(members[key] for key in wanted), called, limit)
+        return {key: np.asarray(archive[key]) for key in wanted}, list(members)
 
 
 def is_database(path: Path) -> bool:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .decision.policy import Neighbourhood, Policy
+from .decision.policy import Policy, check_neighbourhood
 from .errors import SettingError, expect, listed
 from .records import is_number, is_whole
 
@@ -47,7 +47,7 @@ class Recipe:
     reducer : a name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer as it is.
     params : the reducer's own settings, where it is a name.
     policy : the user's two numbers, the interval, the rule, the audit rate.
-    radius, fraction, reject_fraction : the neighbourhood, as in `Neighbourhood`.
+    radius, fraction, reject_fraction : the neighbourhood, as in `check_neighbourhood`.
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
@@ -85,7 +85,7 @@ class Recipe:
         named = isinstance(self.reducer, str) or callable(getattr(self.reducer, "fit", None))
         expect(named, "a reducer's name, or a scikit-learn transformer", self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
-        Neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
+        check_neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
         if self.reject_fraction is not None and self.policy.guarantee == "pooled":
             raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import cache
+from html import escape
 from importlib import import_module
 from numbers import Integral, Real
 from typing import Any
@@ -141,13 +143,22 @@ def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
         raise StoreError(f"Expected a trace's contract in the settings, got {got}: {error}; restore the store.") from error
 
 
-@dataclass(frozen=True, slots=True)
+def in_html(record: Any) -> str:
+    """A record's `repr` for a notebook, `_repr_html_`: its parts, a row each, and what it says in sentences below them."""
+    head, _, rest = repr(record).strip("<>").partition(": ")
+    rows = "".join(f"<tr><td style='text-align: left'>{escape(each)}</td></tr>" for each in rest.split(", "))
+    said = "".join(f"<p>{escape(sentence)}</p>" for sentence in getattr(record, "said", ()))
+    return f"<table><tr><th style='text-align: left'>{escape(head)}</th></tr>{rows}</table>{said}"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Decision:
     """What the engine decided on one trace, and on what evidence.
 
     id : the decision's key in the store.  action : what to do.  reason : why.
     predicted : what the model alone would have done; differs from `action` in an audit only.
-    lower, upper : bound on the success probability in the ball around the trace.
+    lower, upper : bound on the success probability in the ball around the trace; under the pooled guarantee what sorts it:
+        of conv and rocket the mean probability by their heads, twice, else an interval at alpha 0.5.
     n_success, n_failure : labels counted in that ball.
     embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
     model_version : of the model that answered; 0 before the first retrain.
@@ -169,6 +180,19 @@ class Decision:
     audit: bool
     propensity: float
     part: str | None = None
+
+    def __repr__(self) -> str:
+        bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {self.n_success} good, {self.n_failure} bad labels around it"
+        alone = "" if self.predicted is self.action else f", alone the model would {self.predicted.value}"
+        what = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
+        return f"<Decision {what}, version {self.model_version}, id {self.id}>"
+
+    _repr_html_ = in_html
+
+    @property
+    def looked(self) -> float:
+        """Probability with which its outcome was asked for: 0 where it went on, and a label can only come unasked."""
+        return self.propensity if self.action is Action.VERIFY else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,8 +287,10 @@ def is_name(value: Any) -> bool:
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
     if not is_name(value):
-        wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
-        expect(False, wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
+        raise ReportError(
+            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
+            "report the `Decision.id` that `decide` returned."
+        )
     return str(value)
 
 
@@ -273,27 +299,31 @@ def plain(value: Any) -> Any:
 
     A field whose metadata say "flat" gives its own fields, one that says "apart" none.
     """
-    if is_dataclass(value) and not isinstance(value, type):
-        return dict(_fields(value))
-    if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(each) for each in value]
+    if isinstance(value, float):  # what there is most of first: every answer of a server is such an object
+        return value if math.isfinite(value) else None
     if isinstance(value, str):
         return without_password(value)
     if isinstance(value, bool | int) or value is None:
         return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [plain(each) for each in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        found: dict[str, Any] = {}
+        for name, flat in _told(type(value)):
+            said = plain(getattr(value, name))
+            found |= said if flat else {name: said}
+        return found
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
     if hasattr(value, "tolist"):  # of NumPy
         return plain(value.tolist())
     return without_password(str(value))
 
 
-def _fields(record: Any) -> Iterator[tuple[str, Any]]:
-    for each in fields(record):
-        said = plain(getattr(record, each.name)) if "apart" not in each.metadata else {}
-        yield from said.items() if {"flat", "apart"} & each.metadata.keys() else [(each.name, said)]
+@cache
+def _told(kind: type) -> tuple[tuple[str, bool], ...]:
+    """A record's fields that do not stand apart, and whether each gives its own fields."""
+    return tuple((each.name, "flat" in each.metadata) for each in fields(kind) if "apart" not in each.metadata)
 
 
 def find_class(where: str) -> type:

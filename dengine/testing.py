@@ -27,7 +27,7 @@ from .decision.rule import script
 from .engine.engine import DataEngine
 from .folds import content_fold
 from .recipe import Recipe
-from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer
+from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer, uses_labels
 
 N, SAMPLES, FOLDS = 100, 120, 2
 SHAPES = ((1, 152), (1, 800), (3, 90))  # channels, samples
@@ -48,9 +48,12 @@ QUERIES = toy_traces(20, seed=5)[0]
 
 
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
-    """`embed` gives (n, K, d) finite float32, the same from two clones, `transform` (n, d), `embed_own` each fold's row."""
+    """`embed` gives (n, K, d) finite float32, the same from two clones, `transform` (n, d), `embed_own` each fold's row.
+
+    The caller's traces are not written to.
+    """
     assert isinstance(reducer, BaseEstimator), f"{type(reducer).__name__} is no scikit-learn estimator"
-    trained, Q = _trained(reducer), QUERIES
+    trained, Q = _trained(reducer), QUERIES.copy()
     assert trained.n_spaces >= 1 + trained.uses_labels, "in one space every label would be counted where it was seen"
     Z, fold = trained.embed(Q), np.arange(20) % trained.n_spaces
     np.testing.assert_array_equal(_trained(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state")
@@ -61,6 +64,7 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     assert np.isfinite(Z).all(), "a point is not finite"
     flat = np.asarray(trained.transform(Q))
     assert flat.shape == (20, Z.shape[2]), f"expected transform to give (20, {Z.shape[2]}), got {flat.shape}"
+    np.testing.assert_array_equal(Q, QUERIES, err_msg="it writes to the caller's traces")
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
@@ -73,6 +77,20 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
         other[fold == k] = np.random.default_rng(k).permutation(1 - y[fold == k])
         found = _trained(reducer, times=2, labels=other).embed(Q)[:, k]
         np.testing.assert_array_equal(found, honest.embed(Q)[:, k], err_msg=f"labels of fold {k} moved space {k}")
+
+
+def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
+    """`fit` is handed labels with `uses_labels = True` alone: without it, one that needs them fails at every retrain."""
+    X, y = toy_traces()
+    try:
+        _trained(reducer)
+    except Exception as error:
+        if uses_labels(reducer):
+            raise
+        clone(reducer).fit(X if isinstance(reducer, Reducer) else X[:, 0], y)  # what it raises then has another reason
+        raise AssertionError(
+            f"its fit works with labels alone, and was given none; set uses_labels = True ({error})"
+        ) from error
 
 
 def fit_starts_afresh(reducer: Any) -> None:
@@ -92,14 +110,6 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
     radius = np.sqrt(together.var(axis=0).sum(axis=-1))  # (K,)
     moved = float((np.linalg.norm(alone - together, axis=2) / np.maximum(radius, 1e-12)).max())
     assert moved <= trained.single_tolerance, f"a trace alone moves by {moved:.2g}, more than {trained.single_tolerance:g}"
-
-
-def embedding_leaves_the_traces_as_they_are(reducer: Any) -> None:
-    """The caller's buffer is not written to."""
-    trained, Q = _trained(reducer), QUERIES
-    before = Q.copy()
-    trained.embed(Q)
-    np.testing.assert_array_equal(Q, before)
 
 
 def any_length_and_several_channels_work(reducer: Any) -> None:
@@ -164,7 +174,7 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
 
 
 REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
-    embedding_leaves_the_traces_as_they_are,
+    labels_come_only_where_it_says_that_it_uses_them,
     it_embeds_every_trace_in_every_space,
     labels_of_a_fold_move_nothing_in_its_space,
     fit_starts_afresh,

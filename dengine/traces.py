@@ -39,7 +39,7 @@ def as_trace(trace: Any, spec: TraceSpec | None) -> NDArray[np.float32]:
     elif len(x) > x.shape[1]:
         raise TraceError(
             f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which looks transposed; "
-            f"pass trace.T, or agree on TraceSpec({x.shape[1]}, channels={len(x)}) first if it is meant."
+            f"turn it, trace.T, or agree on TraceSpec(samples={x.shape[1]}, channels={len(x)}) first if it is meant."
         )
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of what it could write to, a memory-mapped array for one
@@ -120,7 +120,7 @@ def _without_frame(trace: Any, spec: TraceSpec | None) -> Any:
         wanted = "at least one channel" if spec is None else f"{spec.channels} channel(s)"
         raise TraceError(
             f"Expected a DataFrame with {wanted}, a column each, got the columns {listed(have)}; "
-            "pass the right ones, or name them in TraceSpec(columns=...)."
+            "pass the right ones, or name them, TraceSpec(columns=...)."
         )
     return trace[names].to_numpy().T
 
@@ -148,14 +148,15 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
     """(..., C, T) with the contract's channels and samples."""
     channels, samples = x.shape[-2:]
     if channels != spec.channels:
-        turned = "; it looks transposed: pass trace.T" if (samples, channels) == (spec.channels, spec.samples) else ""
+        turned = "; it looks transposed: turn it, trace.T" if (samples, channels) == (spec.channels, spec.samples) else ""
         raise TraceError(f"Expected {spec.channels} channel(s), got {channels}; pass (channels, samples){turned}.")
     if samples == spec.samples:
         return x
     if spec.fit == "strict":
         seconds = spec.samples / spec.rate_hz
         raise TraceError(
-            f"Expected {spec.samples} samples, got {samples}; resample the trace to {spec.rate_hz:g} Hz x {seconds:g} s."
+            f"Expected {spec.samples} samples, got {samples}; resample the trace to {spec.rate_hz:g} Hz x {seconds:g} s, "
+            f"or start a new store with TraceSpec(samples={spec.samples}, fit='pad')."
         )
     return np.asarray(fitted(torch.from_numpy(np.array(x, order="C")), spec.samples, FITS.index(spec.fit)))
 
@@ -175,6 +176,11 @@ class TraceGate(nn.Module):
 
     def forward(self, x: Tensor) -> tuple[int, int]:
         """(C, T) float32 -> position in `Reason` (0: no fault), int64 content hash (`folds.content_hash`)."""
+        return self.check(x, self.limit)
+
+    @torch.jit.export
+    def check(self, x: Tensor, limit: float) -> tuple[int, int]:
+        """The same by another limit of the sensor's range."""
         lowest, highest = torch.aminmax(x)
         low, high = float(lowest.item()), float(highest.item())  # a NaN anywhere comes out of aminmax as NaN
         reason = 0
@@ -183,7 +189,7 @@ class TraceGate(nn.Module):
             x = torch.nan_to_num(x, 0.0, 0.0, 0.0)
         elif low == high:
             reason = self.constant
-        elif max(high, -low) >= self.limit:
+        elif max(high, -low) >= limit:
             reason = self.saturated
         if not max(high, -low) <= self.clamp:  # a NaN among them tells nothing of the others
             x = x.clamp(-self.clamp, self.clamp)
@@ -203,8 +209,14 @@ def as_agreed(trace: Any, spec: TraceSpec | None, may_start_over: bool) -> NDArr
             raise
         raise TraceError(
             f"{error} The contract, {spec.channels} x {spec.samples}, was set by the first trace, and nothing was learned "
-            "by it yet: if that trace was the wrong one, start over with a new store and DataEngine(trace=TraceSpec(...))."
+            f"by it yet: if that trace was the wrong one, start over with a new store and {_contract(trace)}."
         ) from error
+
+
+def _contract(trace: Any) -> str:
+    """How to agree on the form of a trace."""
+    *channels, samples = np.shape(trace)
+    return f"DataEngine(trace=TraceSpec(samples={samples}, channels={channels[0] if channels else 1}))"
 
 
 def first_contract(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]:
@@ -216,7 +228,6 @@ def first_contract(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]
     if spec.samples < LEAST:
         raise TraceError(
             f"Expected a first trace of {LEAST} samples or more, for it sets the contract of all that follow, got "
-            f"{spec.channels} x {spec.samples}; record longer, or pass DataEngine(trace=TraceSpec({spec.samples}, "
-            f"channels={spec.channels})) if it is meant."
+            f"{spec.channels} x {spec.samples}; record longer, or start with {_contract(x)} if it is meant."
         )
     return spec, TraceGate(spec)(torch.from_numpy(x))[0] == 0

@@ -6,6 +6,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is ste
 os.environ.setdefault("DENGINE_STORE_WAIT", "30")  # a disk that others use stalls for longer than a cell would wait
 
 import shutil
+import signal
 import subprocess
 import uuid
 from collections.abc import Callable, Iterator
@@ -18,10 +19,10 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import Dataset, MemoryStore, SqlStore
+from dengine import Dataset, SqlStore
 from dengine.export import export_sources
-from dengine.store import Store
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
 
 
@@ -35,14 +36,7 @@ GROUPS |= dict.fromkeys(("test_estimators", "test_reducers"), "umap")
 SLOW = REPO / "tests" / "slow"
 SLOW_CASES = ("umap", "postgres", "minirocket")
 # What is slow and yet run before each merge; single tests are marked where they stand.
-MERGE = (
-    "test_cpp",
-    "test_c_interface",
-    "test_onnx_program",
-    "test_estimators",
-    "test_store_postgres",
-    "test_site",
-)
+MERGE = ("test_cpp", "test_c_interface", "test_onnx_program", "test_estimators", "test_store_postgres", "test_site")
 
 
 @pytest.hookimpl(tryfirst=True)  # before xdist reads the groups, and -m the marks
@@ -144,15 +138,17 @@ NO_POSTGRES = "DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh"
 DATABASES = ["sqlite", pytest.param("postgres", marks=pytest.mark.skipif(not POSTGRES, reason=NO_POSTGRES))]
 
 
-def url_of(kind: str, directory: Path) -> str:
+def url_of(kind: str, directory: Path) -> str | None:
+    if kind == "memory":
+        return None
     return str(directory / "engine.db") if kind == "sqlite" else str(POSTGRES)
 
 
 @pytest.fixture(params=["memory", *DATABASES])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SqlStore]:
     """A new store of each kind."""
     cell_id = uuid.uuid4().hex  # one PostgreSQL database serves every test
-    made = MemoryStore(cell_id) if request.param == "memory" else SqlStore(url_of(request.param, tmp_path), cell_id)
+    made = SqlStore(url_of(request.param, tmp_path), cell_id)
     yield made
     made.close()
 
@@ -161,18 +157,3 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
 def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
     """A URL and a cell of its own, to open again and again."""
     return url_of(request.param, tmp_path), uuid.uuid4().hex
-
-
-@pytest.fixture
-def make_service(tmp_path: Path, request: pytest.FixtureRequest) -> Callable:
-    """Makes a service over a new store of a recipe; it is closed at the end."""
-    from dengine import DataEngine, Recipe
-    from dengine.serve.service import CellService
-
-    def made(recipe: Recipe) -> CellService:
-        file = tmp_path / "cell.db"
-        service = CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline=30.0)
-        request.addfinalizer(service.close)
-        return service
-
-    return made

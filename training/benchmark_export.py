@@ -3,8 +3,8 @@
     python training/benchmark_export.py --data insertion --reducer conv --cell build/cpp/dengine-cell --out out/
 
 Latency on one thread (Python, the C++ cell program, onnxruntime beside them), the first call after loading, file size;
-parity over every trace of the data set and random ones, bad ones and audits among them; parity while both learn from
-labels, stops and silence, under the pooled guarantee. Ends with exit code 1 where a decision differs.
+parity over every trace of the data set and random ones, bad ones and audits among them. Ends with exit code 1 where a
+decision differs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_datase
 from dengine.datasets.importing import import_labelled, train_until_done
 from dengine.export.onnx import export_onnx, load_onnx
 from dengine.records import Action
-from dengine.store import MemoryStore
+from dengine.store import SqlStore
 from dengine.traces import as_traces
 
 BOUND_TOLERANCE = 1e-6
@@ -43,10 +42,10 @@ def finding(what: str, value: float, unit: str = "", target: str = "") -> Row:
 
 def train(data: Dataset, recipe: Recipe, retrains: int, **policy: Any) -> DataEngine:
     """An engine that has every trace of a data set as a reference, and audits."""
-    store = MemoryStore()
+    store = SqlStore()
     import_labelled(store, data, recipe.with_policy(audit_rate=AUDIT_RATE, **policy))
     engine = DataEngine.open(store)
-    train_until_done(engine, retrains)
+    list(train_until_done(engine, retrains))
     return engine
 
 
@@ -87,47 +86,13 @@ def quantiles(name: str, taken: np.ndarray, targets: tuple[str, str] = ("", ""))
     return [finding(f"{name}, p{p}", np.percentile(taken, p), "µs", t) for p, t in zip((50, 99), targets, strict=True)]
 
 
-def ask(command: list[Any], stdin: bytes, expected: list[Any]) -> tuple[int, np.ndarray]:
-    """Decisions of the C++ program that differ, and the microseconds of each call."""
-    done = subprocess.run(command, input=stdin, capture_output=True, check=True)
-    lines = [line.split(",") for line in done.stdout.decode().splitlines()]
+def ask(cell: Path, file: Path, X: np.ndarray) -> tuple[list[list[Any]], np.ndarray]:
+    """What the C++ program decides, and the microseconds of each call."""
+    said = "".join("decide " + ",".join(f"{value:.9g}" for value in x.ravel()) + "\n" for x in X)
+    done = subprocess.run([cell, file], input=said, capture_output=True, check=True, text=True)
+    lines = [line.split(",")[1:] for line in done.stdout.splitlines()]
     found = [[w[0], w[1], int(w[4]), int(w[5]), float(w[2]), float(w[3])] for w in lines]
-    return differing(found, expected), np.array([float(w[-1]) for w in lines])
-
-
-def compare_learning(data: Dataset, recipe: Recipe, retrains: int, folder: Path, cell: Path | None) -> list[Row]:
-    """Engine and file go on from one retrain on half the data set, through the other half and random traces.
-
-    What was verified is told, an accepted part only where it was bad; a part in four comes again.
-    """
-    half, rng = len(data) // 2, np.random.default_rng(3)
-    first = replace(data, X=data.X[:half], y=data.y[:half], cause=None, part=None)
-    once = recipe.with_settings(retrain_every=1_000_000)  # the file knows nothing of the engine's next retrain
-    engine = train(first, once, retrains, guarantee="pooled", stops="all", alpha=0.1, lower_bound=0.9)
-    file = export_torchscript(engine, folder / "learning.ts")
-    exported = load_exported(file)
-    other = random_traces(data, half, rng)
-    X, y = np.concatenate([as_traces(data.X[half:]), other]), np.concatenate([data.y[half:], rng.integers(2, size=half)])
-    lines, decisions, found = [], [], []
-    for x, success in zip(track(X, description="learning"), y, strict=True):
-        part = f"P{rng.integers(2 * len(X))}"
-        decisions.append(engine.decide(x, part))
-        found.append(exported.decide(x, part))
-        heard = decisions[-1].action is Action.VERIFY or (decisions[-1].action is Action.ACCEPT and not success)
-        if heard:
-            engine.report(decisions[-1].id, bool(success))
-            exported.learn(x, bool(success), part)
-        lines.append(f"{part},{int(success) if heard else ''}," + ",".join(f"{value:.9g}" for value in x.ravel()))
-    rows = [
-        finding("decisions compared while learning", len(X), ""),
-        finding("of them accepted", sum(d.action is Action.ACCEPT for d in decisions), ""),
-        finding("Python differs while learning in", differing(list(map(told, found)), decisions), "", "0"),
-    ]
-    if cell is not None:
-        command = [cell, file, "--parts", "--learn", "--journal", folder / "cell.csv"]
-        wrong, _ = ask(command, "\n".join(lines).encode() + b"\n", decisions)
-        rows.append(finding("C++ differs while learning in", wrong, "", "0"))
-    return rows
+    return found, np.array([float(w[-1]) for w in lines])
 
 
 def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
@@ -149,9 +114,8 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
         *quantiles("Python", microseconds(exported.decide, known, args.calls), ("<= 150 µs", "<= 500 µs")),
     ]
     if args.cell is not None:
-        times, command = 1 + args.calls // len(known), [args.cell, file, "--binary"]
-        wrong, _ = ask(command, X.tobytes(), expected)
-        _, taken = ask(command, known.tobytes() * times, expected[: len(known)] * times)
+        wrong = differing(ask(args.cell, file, X)[0], expected)
+        _, taken = ask(args.cell, file, known[np.arange(args.calls) % len(known)])
         rows += [finding("C++ differs in", wrong, "", "0"), *quantiles("C++", taken, ("<= 120 µs", "<= 400 µs"))]
     if args.onnx:
         runtime = load_onnx(export_onnx(engine.model, folder / "model.onnx", trace=engine.trace))
@@ -160,7 +124,6 @@ def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
         found = list(map(told, runtime.decide_many(new)))
         rows.append(finding("onnxruntime differs in", differing(found, model.decide_many(new))))
         rows += quantiles("onnxruntime", microseconds(runtime.decide, known, args.calls))
-    rows += compare_learning(data, Recipe.load(args.reducer), args.retrains, folder, args.cell)
     return rows
 
 

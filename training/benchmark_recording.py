@@ -64,7 +64,7 @@ def record(data: Dataset, insertions: int, speed: float | None, wrong: Sequence[
                     "differing": int((trace[known] != data.X[part][known]).sum()),
                     "unreported": int((known & ~expected).sum()),
                     "invented": int((~known & expected).sum()),
-                    **{name: getattr(said, name) for name in ("missing", "late", "repeated", "reconnects")},
+                    **{name: getattr(said, name) for name in ("missing", "repeated", "reconnects")},
                 }
             )
             cell.reject()
@@ -96,7 +96,7 @@ def compare(data: Dataset, recipe: Recipe, cycles: int) -> str:
 
 def counted(found: pd.DataFrame) -> list[dict[str, Any]]:
     """A row a kind of trouble."""
-    columns = ["not_sent", "recorded", "differing", "unreported", "invented", "late", "repeated", "reconnects"]
+    columns = ["not_sent", "recorded", "differing", "unreported", "invented", "repeated", "reconnects"]
     groups = [*((kind or "none", group) for kind, group in found.groupby("trouble")), ("all", found)]
     return [{"trouble": kind, "insertions": len(group), **group[columns].sum().to_dict()} for kind, group in groups]
 

@@ -16,8 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dengine import Dataset
-from dengine.cli.output import duration, size
-from dengine.errors import percent
+from dengine.cli.output import heading, written
 from dengine.experiments.tables import write_csv
 from dengine.traces import as_traces
 
@@ -76,25 +75,10 @@ def tell(rows: Sequence[Mapping[str, Any]], title: str, path: Path | None = None
         write_csv(pd.DataFrame(rows), path, force=True)
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD)
     for name, value in rows[0].items():
-        table.add_column(_heading(name), justify="left" if isinstance(value, str) else "right")
+        table.add_column(heading(name), justify="left" if isinstance(value, str) else "right")
     for row in rows:
-        table.add_row(*(_written(name, value) for name, value in row.items()))
+        table.add_row(*(written(name, value) for name, value in row.items()))
     Console(width=width).print(table)
-
-
-def _heading(name: str) -> str:
-    return name.removesuffix("_s").removesuffix("_bytes").removesuffix("_share").replace("_", " ")
-
-
-def _written(name: str, value: Any) -> str:
-    if isinstance(value, str) or value is None:
-        return value or ""
-    if math.isnan(value):
-        return "-"
-    for ending, write in (("_s", duration), ("_bytes", size), ("_share", percent)):
-        if name.endswith(ending):
-            return write(value)
-    return f"{value:,}" if float(value).is_integer() else f"{value:,.3g}"
 
 
 def noisy(data: Dataset, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

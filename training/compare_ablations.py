@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from dengine import Dataset, Recipe, Replay, load_dataset
-from dengine.experiments.figures import GREEN, LIMIT, save
+from dengine.experiments.figures import GREEN, LIMIT, blank, finish, save
 from dengine.experiments.grid import Task, play_tasks
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import frame_of, pool, pooled_table, write_csv
@@ -130,12 +130,6 @@ AXES: dict[str, Callable[[Dataset, Recipe], Variants]] = {
 }
 
 
-def play(axis: str, data: Dataset, base: Recipe, args: argparse.Namespace) -> list[Replay]:
-    """The replays of every variant of an axis, named by it."""
-    variants = AXES[axis](data, base)
-    return [replay for name, one in variants.items() for replay in shuffles(f"{axis} {name}", one, args)]
-
-
 def shuffles(name: str, one: Variant, args: argparse.Namespace) -> list[Replay]:
     """The replays of one variant, a seed each."""
     cycles = min(args.cycles, len(one.data))
@@ -144,24 +138,14 @@ def shuffles(name: str, one: Variant, args: argparse.Namespace) -> list[Replay]:
 
 
 def picture(rows: list[dict[str, Any]], as_it_is: float, title: str) -> Figure:
-    """Certain decisions of each variant with their deviation over the shuffles, a panel an axis."""
-    axes_of: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        axes_of.setdefault(row["recipe"].split(" ")[0], []).append(row)
-    figure = Figure(figsize=(9.0, 1.0 + 0.34 * (len(rows) + 2 * len(axes_of))), layout="constrained")
-    panels = figure.subplots(
-        len(axes_of), 1, sharex=True, height_ratios=[len(r) + 1 for r in axes_of.values()], squeeze=False
-    )
-    for axes, (axis, some) in zip(panels.flat, axes_of.items(), strict=True):
-        names = [row["recipe"].removeprefix(f"{axis} ") for row in some]
-        deviation = np.nan_to_num([row["certain_sd"] for row in some])
-        axes.barh(names, [row["certain"] for row in some], xerr=deviation, color=GREEN, alpha=0.7, height=0.7)
-        axes.axvline(as_it_is, **LIMIT)
-        axes.invert_yaxis()
-        axes.set_ylabel(axis)
-        axes.spines[["top", "right"]].set_visible(False)
-    panels.flat[-1].set_xlabel("certain decisions a replay; dotted: the recipe as it is")
-    figure.suptitle(title)
+    """Certain decisions of each variant with their deviation over the shuffles."""
+    figure = blank(9.0, 1.0 + 0.34 * len(rows), title)
+    axes, deviation = figure.subplots(), np.nan_to_num([row["certain_sd"] for row in rows])
+    names = [row["recipe"] for row in rows]
+    axes.barh(names, [row["certain"] for row in rows], xerr=deviation, color=GREEN, alpha=0.7, height=0.7)
+    axes.axvline(as_it_is, **LIMIT)
+    axes.invert_yaxis()
+    finish(axes, legend=0, xlabel="certain decisions a replay; dotted: the recipe as it is")
     return figure
 
 
@@ -186,11 +170,12 @@ def main() -> None:
     base = Recipe.load(args.recipe).with_policy(alpha=args.alpha, lower_bound=args.lower_bound)
     with TemporaryDirectory() as kept:  # what stands on several axes, the recipe as it is, is played once
         args.keep = args.keep or kept
-        as_it_is = shuffles("as it is", Variant(data, base), args)
-        played = {axis: play(axis, data, base, args) for axis in axes}
-    for axis in (axis for axis, some in played.items() if not some):
-        print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
-    replays = as_it_is + [replay for some in played.values() for replay in some]
+        replays = shuffles("as it is", Variant(data, base), args)
+        for axis in axes:
+            for name, one in (variants := AXES[axis](data, base)).items():
+                replays += shuffles(f"{axis} {name}", one, args)
+            if not variants:
+                print(f"{axis}: {data.name} has one channel, there is nothing to leave out.")
     frame = frame_of(replays)
     rows = pool(frame, replays)
     level, seeds = f"({args.alpha:g}, {100 * args.lower_bound:g} %)", f"seeds {args.seeds[0]} to {args.seeds[-1]}"

@@ -16,15 +16,14 @@ run writes the table of all that it asked for.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from common import options
+from rich.progress import track
 
 from dengine import Replay, load_dataset
 from dengine.experiments.grid import Task, contenders, iterate_replays
@@ -42,10 +41,6 @@ TRIES: dict[str, tuple[float, ...]] = {
 }
 OURS = "Wilson, at one look"
 SWEPT = "none: threshold swept"
-COLUMNS = (
-    "who", "bound", "certain", "accepted", "FP", "rejected", "FN", "bad of accepted (95 %)", "good of rejected (95 %)",
-    "net s", "retrain s, median / worst", "decide µs, median",
-)  # fmt: skip
 
 
 def tries(name: str) -> list[Contender]:
@@ -61,40 +56,24 @@ def tries(name: str) -> list[Contender]:
     return [replace(base, name=f"{name} radius={r:g}", recipe=replace(base.recipe, radius=r)) for r in TRIES[name]]
 
 
-def play(data: Any, who: Sequence[Contender], seeds: range, args: argparse.Namespace) -> dict[str, list[Replay]]:
-    """The replays of each contender, by name."""
-    tasks = [Task(one, seed, args.cycles, True, args.confirm) for one in who for seed in seeds]
-    found: dict[int, Replay] = {}
-    for played in iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep):
-        found[played.position] = played.replay
-        if not played.kept:
-            print(f"{len(found)} of {len(tasks)}: {played.replay.name}, {played.replay.seconds:.1f} s", flush=True)
-    by_name: dict[str, list[Replay]] = {one.name: [] for one in who}
-    for position in range(len(tasks)):
-        by_name[found[position].name].append(found[position])
-    return by_name
-
-
 def row_of(name: str, replays: Sequence[Replay]) -> dict[str, str]:
     """A row of the table: means a replay ± their deviation, pooled shares with their interval."""
     (row,) = pool(frame_of(replays))
     kind = RIVALS.get(name.split(" ")[0])
-    retrain = f"{row['retrain_p50_s']:.3f} / {row['retrain_max_s']:.3f}"
-    cells = (
-        name if kind is None else f"{name}: {kind.title}",
-        OURS if kind is None else kind.bound or (SWEPT if any(kind.tries) else "none"),
-        f"{row['certain']:.0f} ± {np.nan_to_num(row['certain_sd']):.0f}",
-        f"{row['accepted']:.0f}",
-        f"{row['false_positive']:.1f}",
-        f"{row['rejected']:.0f}",
-        f"{row['false_negative']:.1f}",
-        _error(replays, "accepted"),
-        _error(replays, "rejected"),
-        f"{row['net_s']:.0f}",
-        "-" if np.isnan(row["retrain_p50_s"]) else retrain,
-        f"{row['decide_p50_us']:.0f}",
-    )
-    return dict(zip(COLUMNS, cells, strict=True))
+    return {
+        "who": name if kind is None else f"{name}: {kind.title}",
+        "bound": OURS if kind is None else kind.bound or (SWEPT if any(kind.tries) else "none"),
+        "certain": f"{row['certain']:.0f} ± {np.nan_to_num(row['certain_sd']):.0f}",
+        "accepted": f"{row['accepted']:.0f}",
+        "FP": f"{row['false_positive']:.1f}",
+        "rejected": f"{row['rejected']:.0f}",
+        "FN": f"{row['false_negative']:.1f}",
+        "bad of accepted (95 %)": _error(replays, "accepted"),
+        "good of rejected (95 %)": _error(replays, "rejected"),
+        "net s": f"{row['net_s']:.0f}",
+        "retrain s, median / worst": f"{row['retrain_p50_s']:.3f} / {row['retrain_max_s']:.3f}",
+        "decide µs, median": f"{row['decide_p50_us']:.0f}",
+    }
 
 
 def _error(replays: Sequence[Replay], side: str) -> str:
@@ -115,8 +94,9 @@ def chosen(by_name: dict[str, list[Replay]], lower_bound: float) -> str | None:
 
 def markdown(rows: Sequence[dict[str, str]]) -> str:
     """Rows as a Markdown table."""
-    head = [f"| {' | '.join(COLUMNS)} |", f"|{' --- |' * len(COLUMNS)}"]
-    return "\n".join([*head, *(f"| {' | '.join(row[name] for name in COLUMNS)} |" for row in rows)])
+    return "\n".join(
+        f"| {' | '.join(line)} |" for line in (rows[0], ["---"] * len(rows[0]), *(row.values() for row in rows))
+    )
 
 
 def policies(text: str) -> list[tuple[float, float]]:
@@ -147,25 +127,23 @@ def main() -> None:
     who = contenders([one for name in asked for one in (tries(name) if choosing else [name])])
     replays, pages = [], []
     for alpha, bound in args.policies or ([(0.1, 0.9)] if choosing else [(0.1, 0.9), (0.05, 0.95)]):
-        by_name = play(data, [one.with_policy(alpha=alpha, lower_bound=bound) for one in who], seeds, args)
-        title = (
-            f"{args.do}: {data.name}, ({alpha:g}, {100 * bound:g} %), seeds {seeds[0]} to {seeds[-1]}, {args.cycles} cycles"
-        )
-        pages.append(f"{title}\n\n{markdown([row_of(name, some) for name, some in by_name.items()])}\n")
+        them = [one.with_policy(alpha=alpha, lower_bound=bound) for one in who]
+        tasks = [Task(one, seed, args.cycles, True, args.confirm) for one in them for seed in seeds]
+        found = iterate_replays(data, tasks, n_jobs=args.n_jobs, keep=args.keep)
+        ended = {each.position: each.replay for each in track(found, "replaying", len(tasks))}
+        played = [ended[i] for i in range(len(tasks))]
+        by_name = {one.name: [each for each in played if each.name == one.name] for one in who}
+        which = f"({alpha:g}, {100 * bound:g} %), seeds {seeds[0]} to {seeds[-1]}, {args.cycles} cycles"
+        rows = markdown([row_of(name, some) for name, some in by_name.items()])
+        pages.append(f"{args.do}: {data.name}, {which}\n\n{rows}\n")
         print(f"\n{pages[-1]}")
-        replays += [replay for some in by_name.values() for replay in some]
-        if choosing:
-            show_chosen(asked, by_name, bound)
+        replays += played
+        for name in asked if choosing else ():
+            some = {one: each for one, each in by_name.items() if one.split(" ")[0] == name}
+            print(f"Chosen of {name}: {chosen(some, bound) or 'none; no try was certain of anything and kept to LB'}")
     path = write_csv(frame_of(replays), args.out / f"{args.do}_{data.name}.csv", force=True)
     path.with_suffix(".md").write_text("\n".join(pages), encoding="utf-8")
     print(f"Wrote {path} and {path.with_suffix('.md')}")
-
-
-def show_chosen(asked: Sequence[str], by_name: dict[str, list[Replay]], lower_bound: float) -> None:
-    """Which try was the best of each that was asked for."""
-    for name in asked:
-        some = {one: replays for one, replays in by_name.items() if one.split(" ")[0] == name}
-        print(f"Chosen of {name}: {chosen(some, lower_bound) or 'none; no try was certain of anything and kept to LB'}")
 
 
 if __name__ == "__main__":

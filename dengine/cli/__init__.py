@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import DengineError, ImportRefusedError, without_password
+from ..errors import DengineError, ImportRefusedError, as_options, without_password
 from .data import data, simulate, train
 from .export import export
 from .history import explain, history
@@ -24,35 +24,28 @@ from .replay import compare, costs, replay
 from .run import run
 from .serve import serve
 from .status import status
-from .store import correct, forget, import_labels, policy, retrain, rollback, verify
+from .store import correct, forget, import_labels, policy, report, retrain, rollback, verify
 
 
 class Verbs(click.Group):
     """A group whose foreseen failures are one line on stderr and exit code 1; 2 where an option would do."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the verb."""
-        _find_own_modules()
+        if (here := str(Path.cwd())) not in sys.path:  # where `module:Class` is looked for, last: it shadows nothing
+            sys.path.append(here)
         try:
             return super().invoke(ctx)
         except BrokenPipeError:  # `dengine status x.db | head`: click ends quietly
             raise
         except (DengineError, OSError, UnicodeError) as error:  # the last of a name that no file system has
             kind = click.UsageError if isinstance(error, ImportRefusedError) else click.ClickException
-            raise kind(without_password(" ".join(str(error).split()))) from error
+            raise kind(as_options(without_password(" ".join(str(error).split())))) from error
         except click.ClickException as error:
             # click repeats the words that it was called with.
             error.message = without_password(error.message)  # type: ignore[misc]  # final for click, not for us
             raise
         except KeyboardInterrupt:
             end_interrupted("Interrupted.")
-
-
-def _find_own_modules() -> None:
-    """Let `module:Class` name a module of the current folder; last in the path, so that it shadows nothing."""
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
 
 
 @click.group(
@@ -71,6 +64,6 @@ def main() -> None:
 
 for verb in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(correct, forget, rollback, policy, retrain, export, import_labels),
+    *(report, correct, forget, rollback, policy, retrain, export, import_labels),
 ):
     main.add_command(verb)

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import percent
 from . import options
 from .options import DataChoice, RecipeChoice, left_out, short_name, verb
-from .output import EndAskedError, Out, duration, end_interrupted, facts, imported_line, progress, steps, tell
+from .output import EndAskedError, Out, end_interrupted, facts, progress, rows_of, steps, tell
 
 if TYPE_CHECKING:
-    from ..experiments.survey import Survey
+    from ..experiments.survey import Drift
     from ..records import RetrainReport
 
 MOST = 10  # faults that are named
 CLEAR = 0.01  # p-values below it are called drift
-FITTED = {
-    "cut": "longer ones lose their end",
-    "pad": "longer ones lose their end, shorter ones repeat their last sample",
-    "resample": "the whole of each on so many points",
-}
 
 
 @verb("dengine data insertion --out out/")
@@ -34,69 +27,35 @@ FITTED = {
 def data(source: DataChoice, out: Out | None) -> None:
     """Say what a data set is, and what is wrong with it.
 
-    A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz or .h5
-    with X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
+    A folder of CSV files, one an insertion, its label in its name; a wide .csv or .parquet, a row an insertion; .npz with
+    X (traces, samples) and y (1 success, 0 failure); one long .mcap, cut by --trigger; the file of a store, for what
     is labelled in it; or the bundled set, insertion.
     """
     from ..datasets import load_dataset
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey
+    from ..model.neighbours import SUSPICIOUS
 
     dataset = load_dataset(source.data, **source.how)
     found = survey(dataset)
-    lines = [facts(found.name, [*_form(found), *_state(found), *_order(found)]), *left_out(dataset, MOST)]
+    tables: list[Any] = [facts(found.name, rows_of(found, "name", "faults", "drift"))]
+    tables.append(facts("By tenths of the recorded order", map(_drift, found.drift), ("", "means", "")))
+    if found.near_repeats > SUSPICIOUS * found.looked_at:
+        tables.append("Many traces nearly repeat another part's: if parts come twice, give their numbers (--part).")
     tell(
         {"data": source.data, "survey": found},
-        *lines,
+        *(*tables, *left_out(dataset, MOST)),
         out=out,
         made=lambda: {"data.png": data_picture(dataset, found.name)},
     )
 
 
-def _form(found: Survey) -> Iterator[tuple[str, str]]:
-    yield "traces", f"{found.traces}, {len(found.faults)} left out" if found.faults else str(found.traces)
-    named = f" ({', '.join(found.names)})" if found.names else ""
-    several = f"{found.channels} channel{'s' if found.channels > 1 else ''}{named}"
-    yield "form", f"{several} of {found.samples} samples, {duration(found.seconds)}, in {found.unit}"
-    if found.lengths is not None:
-        low, median, high = (f"{x:g}" for x in (found.lengths.low, found.lengths.median, found.lengths.high))
-        yield "lengths", f"all {low}" if low == high else f"{low} to {high} samples, median {median}"
-    if found.fit != "strict":
-        yield "fit", f"{found.fit}, to {found.samples} samples: {FITTED[found.fit]}"
-    rate = f"{found.rate_hz:g} Hz, as stated: there are no timestamps that say so"
-    if found.rates is not None:
-        low, median, high = (f"{x:g}" for x in (found.rates.low, found.rates.median, found.rates.high))
-        rate = (f"{low} Hz each" if low == high else f"{low} to {high} Hz, median {median}") + ", by the timestamps"
-        rate += (
-            "" if math.isclose(found.rate_hz, found.rates.median, rel_tol=1e-3) else f"; of the traces {found.rate_hz:g} Hz"
-        )
-    yield "rate", rate
-
-
-def _state(found: Survey) -> Iterator[tuple[str, str]]:
-    from ..model.neighbours import SUSPICIOUS
-
-    yield "labels", f"{found.good} good, {found.bad} bad: {percent(found.good / found.traces)} good"
-    if found.parts is not None:
-        yield "parts", f"{found.parts}, {found.traces - found.parts} traces are of a part that came before"
-    bad = [f"{n} {what}" for n, what in ((found.not_finite, "not finite"), (found.constant, "constant")) if n]
-    yield "bad traces", f"{', '.join(bad)}: verified, never learned from" if bad else "none"
-    again = f", {found.contradicting} of them with another label" if found.contradicting else ""
-    yield "duplicates", f"{found.duplicates} equal an earlier trace{again}" if found.duplicates else "none"
-    if found.near_repeats > SUSPICIOUS * found.looked_at:
-        near = f"{found.near_repeats} of the newest {found.looked_at} nearly repeat another part's"
-        yield "near repeats", f"{near}: if parts come twice, give their numbers (--part)"
-
-
-def _order(found: Survey) -> Iterator[tuple[str, str]]:
-    for each in found.drift:
-        shares = " ".join(f"{100 * x:.0f}" for x in each.tenths) + " %"
-        means = " ".join("-" if math.isnan(x) else f"{x:.3g}" for x in each.tenths)
-        trend = "never changes"
-        if not math.isnan(each.rho):
-            went = "no drift is seen" if each.p >= CLEAR else f"{'rises' if each.rho > 0 else 'falls'} with the order"
-            trend = f"{went} (Spearman's rho {each.rho:+.2f}, p {each.p:.2g})"
-        yield f"{each.name} by tenths", f"{shares if each.name == 'good' else means}\n{trend}"
+def _drift(one: Drift) -> tuple[str, str, str]:
+    means = " ".join(f"{x:.2g}" for x in one.tenths)
+    if math.isnan(one.rho):
+        return one.name, means, "never changes"
+    went = "no drift is seen" if one.p >= CLEAR else f"{'rises' if one.rho > 0 else 'falls'} with the order"
+    return one.name, means, f"{went} (Spearman's rho {one.rho:+.2f}, p {one.p:.2g})"
 
 
 OUT = "The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y (n,) labels."
@@ -119,10 +78,10 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
     from ..cells.simulation.generate import simulate as simulated
 
     with progress(f"simulating {scenario}", n) as advance:
-        insertions = simulated(n, seed, scenario, n_jobs, progress=lambda done, of: advance(1))
+        insertions = simulated(n, seed, scenario, n_jobs, progress=advance)
     path, good = save_insertions(out, insertions, seed, scenario, force), sum(each.success for each in insertions)
     record = {"simulated": True, "scenario": scenario, "n": n, "successes": good, "file": path}
-    tell(record, f"Simulated {n} insertions ({scenario}): {good} successes, {n - good} failures.", f"Wrote {path}")
+    tell(record, f"Simulated {n} insertions ({scenario}): {good} successes. Wrote {path}")
 
 
 WITHIN = "At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one."
@@ -154,10 +113,6 @@ def train(
     reports: list[RetrainReport] = []
     interrupted = False
 
-    def trained(report: RetrainReport) -> None:
-        reports.append(report)
-        count(1)
-
     try:
         with steps(f"importing {data.name}", len(data)) as count:
             imported = import_labelled(store, data, choice.if_asked(), seed, count, allow_import)
@@ -166,17 +121,23 @@ def train(
         end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
     asked: dict[str, Any] = {"recipe": choice.if_asked(), "allow_import": allow_import}
     with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
+        if not (imported.imported or engine.new_labels) and engine.version:
+            record = {"store": store, "interrupted": False, "faults": data.faults, "import": imported, "retrains": []}
+            name = short_name(engine.recipe.name)
+            tell(record, f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers.")
+            return
         try:
             with steps("training", retrains) as count:
-                train_until_done(engine, retrains, trained)
+                for report in train_until_done(engine, retrains):
+                    reports.append(report)
+                    count(1)
         except EndAskedError:
             interrupted = True
         name, labels = short_name(engine.recipe.name), engine.store.status()["labels"]
-    kind = "a used store" if imported.resumed else "a new store"
     answers = f"Version {reports[-1].version} of {name} answers. {retrain_line(reports)}"
     answers = answers if reports[-1].version else "No version answers yet: every part is verified."
     record = {"store": store, "interrupted": interrupted, "faults": data.faults, "import": imported, "retrains": reports}
-    tell(record, imported_line(imported, f"{store}, {kind}"), answers, f"{store} holds {labels} labels.")
+    tell(record, facts(f"{data.name} into {store}", rows_of(imported)), answers, f"{store} holds {labels} labels.")
     if interrupted:
         end_interrupted(f"Interrupted after {len(reports)} of at most {retrains} retrains; they are in {store}.")
     if not reports[-1].accepted:

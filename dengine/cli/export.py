@@ -67,8 +67,6 @@ def export(
         made |= {"store": store, "out": out, "format": form, "version": version, "references": references}
         made |= {"bytes": n_bytes, "signed": key is not None}
         what = f"version {version} with {references} labelled references"
-        said += [
-            f"Wrote {out} ({size(n_bytes)}) and {out.name}.sha256: {what}.",
-            UNSIGNED if key is None else SIGNED % (key, out.name),
-        ]
+        said.append(f"Wrote {out} ({size(n_bytes)}) and {out.name}.sha256: {what}.")
+        said.append(UNSIGNED if key is None else SIGNED % (key, out.name))
     tell(made, *said)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
+from heapq import merge
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -15,11 +15,10 @@ import click
 from ..errors import percent
 from . import options
 from .options import Known, verb
-from .output import Out, duration, facts, tell, when
+from .output import Out, duration, facts, listed, tell, when
 
 if TYPE_CHECKING:
-    from ..history.explain import Explanation, Neighbour
-    from ..records import Decision
+    from ..history.explain import Explanation
     from ..store.records import Event, StoredDecision, StoredVersion
 
 AGO = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -27,6 +26,7 @@ WIDEST = 120  # columns
 SHORTEST = 12  # characters of a part's number that are shown, its last
 SHORT = "%y-%m-%d %H:%M:%S"
 MOST = 5  # excesses that are named
+NEIGHBOUR = ("decision_id", "part", "success", "source", "distance", "space", "inside")
 
 
 class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generic in 8.3
@@ -56,6 +56,7 @@ MODEL = "Only what the model alone would have done so, as in an audit or in the 
 @click.option("--model", "predicted", type=Known("action"), help=MODEL)
 @click.option("--reason", type=Known("reason"), help="Only what was decided for this one.")
 @click.option("--label", type=Known("label"), help="Only what turned out so, or was never reported.")
+@click.option("--part", metavar="NUMBER", help="Only of the part with this number.")
 @click.option("--since", type=Moment(), help="Only from then on: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.")
 @click.option("--until", type=Moment(), help="Only before then, likewise.")
 @click.option("--events", is_flag=True, help="With the retrains and events that happened meanwhile.")
@@ -66,7 +67,7 @@ def history(store: str, events: bool, **asked: Any) -> None:
     is what they say of the success rate, v the model's version, and label what the part turned out to be. `dengine explain`
     says more of one.
     """
-    from ..history.status import beside, interleaved
+    from ..history.status import beside
     from ..history.status import history as read
     from ..records import plain
     from ..store.opening import open_store
@@ -76,11 +77,7 @@ def history(store: str, events: bool, **asked: Any) -> None:
         since = asked["since"] if asked["since"] is not None or not found else found[0].time
         others = beside(opened, since, asked["until"]) if events else {}
     record = {"store": store, "decisions": [plain(past) | {"label": past.label} for past in found]} | others
-    tell(record, _table(interleaved(found, others)))
-
-
-def _bound(made: Decision) -> str:
-    return "-" if math.isnan(made.lower) else f"{made.lower:.2f}-{made.upper:.2f}"
+    tell(record, _table(merge(*others.values(), found, key=lambda each: each.time)))
 
 
 def _label(past: StoredDecision) -> str:
@@ -94,7 +91,7 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {  # "<" or ">": to which 
     "<part": lambda past: (past.decision.part or "-")[-SHORTEST:],
     "<action": lambda past: past.decision.action.value,
     "<model": lambda past: "" if past.decision.predicted is past.decision.action else past.decision.predicted.value,
-    "<bound": lambda past: _bound(past.decision),
+    "<bound": lambda past: f"{past.decision.lower:.2f}-{past.decision.upper:.2f}".replace("nan-nan", "-"),
     ">good": lambda past: str(past.decision.n_success),
     ">bad": lambda past: str(past.decision.n_failure),
     "<reason": lambda past: past.decision.reason.value,
@@ -134,19 +131,19 @@ def _told(each: StoredVersion | Event) -> str:
 @options.store_argument
 @click.argument("decision", metavar="DECISION")
 @click.option("--neighbours", type=click.IntRange(0), default=10, show_default=True, help="Nearest references, shown.")
-@options.allow_import_option
 @options.picture_option
-def explain(store: str, decision: str, neighbours: int, allow_import: bool, out: Out | None) -> None:
+def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None:
     """Say why a decision came out as it did.
 
     DECISION is its id, as `dengine history STORE` lists it, or the word last. Counts, bound and action are shown as they
-    were recorded; neighbours are found again by the version that answered where the store keeps it, and it says by which.
+    were recorded; neighbours are found again by the version that answered, where the store keeps it.
     The picture shows the trace with its neighbours and with the band that 95 % of the known successes lie in.
     """
-    from ..engine.engine import explain_stored
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
+    from ..history.explain import explain as explained
     from ..history.status import history
+    from ..records import plain
     from ..store.opening import open_store
 
     with closing(open_store(store, must_exist=True)) as opened:
@@ -155,13 +152,15 @@ def explain(store: str, decision: str, neighbours: int, allow_import: bool, out:
             if newest is None:
                 raise ReportError(f"Expected a decision in {store}, there is none yet; let an engine decide first.")
             decision = newest.decision.id
-        found = explain_stored(opened, decision, neighbours, allow_import)
-    record, past = {"store": store} | found.record(), found.decision
+        found = explained(opened, decision, neighbours)
+    record, past = {"store": store} | plain(found), found.decision
     tables = [facts(f"{past.decision.id}: {past.decision.action.value}, {past.decision.reason.value}", _rows(found))]
+    if found.envelope is not None and found.envelope.excesses:
+        columns = ("", "from", "to", "in widths")
+        tables.append(facts("Where it leaves the band, the farthest first", _excesses(found), columns))
     if found.neighbours:
-        title = f"Nearest references of version {found.neighbours_version}; the ball's radius is {found.radius:.3g}"
-        columns = ("decision", "part", "label", "distance", "fold", "ball")
-        tables.append(facts(title, map(_neighbour, found.neighbours), columns))
+        title = f"Nearest references of version {past.decision.model_version}; the ball's radius is {found.radius:.3g}"
+        tables.append(listed(title, found.neighbours, *NEIGHBOUR))
     tell(record, *tables, out=out, made=lambda: {"": explained_picture(found)})
 
 
@@ -180,17 +179,10 @@ def _rows(found: Explanation) -> Iterator[tuple[str, str]]:
     yield "envelope", f"{percent(band.outside, '.0f')} of its samples leave the band of {band.n:,} successes; {usual}"
     if band.not_finite:
         yield "", f"{band.not_finite} samples are NaN or infinite"
-    spec, farthest = found.spec, sorted(band.excesses, key=lambda each: -each.widths)
-    for i, each in enumerate(farthest[:MOST]):
-        name = spec.columns[each.channel] if spec.columns else f"channel {each.channel + 1}"
-        where = (f"{name}, " if spec.channels > 1 else "") + f"{each.from_s:.3f} to {each.to_s:.3f} s"
-        samples = f"(samples {each.first} to {each.last}) {'above' if each.above else 'below'}"
-        yield "" if i else "leaves it", f"{where} {samples}, by up to {each.widths:.1f} band widths"
-    if len(farthest) > MOST:
-        yield "", f"and {len(farthest) - MOST} times less far"
 
 
-def _neighbour(each: Neighbour) -> tuple[str, ...]:
-    label = f"{'good' if each.success else 'bad'}{'' if each.source is None else f', {each.source.value}'}"
-    ball = "inside" if each.inside else "outside"
-    return each.decision_id or "not known", each.part or "-", label, f"{each.distance:.3f}", str(each.space), ball
+def _excesses(found: Explanation) -> Iterator[tuple[str, ...]]:
+    names = found.spec.columns or [f"channel {i + 1}" for i in range(found.spec.channels)]
+    for each in found.envelope.excesses[:MOST] if found.envelope else ():
+        times = (f"{each.from_s:.3f} s", f"{each.to_s:.3f} s")
+        yield names[each.channel], *times, f"{each.widths:.1f} {'above' if each.above else 'below'}"

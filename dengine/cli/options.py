@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import SettingError
+from ..errors import SettingError, as_options
 from .output import Out, as_json, json_option
 
 if TYPE_CHECKING:
     from ..datasets import Dataset
     from ..experiments.replay import Contender
     from ..recipe import Recipe
+    from ..records import TraceSpec
 
 Command = Callable[..., Any]
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -62,7 +63,6 @@ class Known(click.ParamType[Any]):
         self.kind, self.own = kind, own
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """[local|pooled|module:Class]."""
         return f"[{'|'.join(filter(None, [*names_of(self.kind), self.own]))}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
@@ -83,7 +83,6 @@ class Listed(click.ParamType[Any]):
         self.of = of
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:
-        """[wilson|binomial],... or LIST."""
         return f"{self.of.get_metavar(param, ctx)},..." if isinstance(self.of, Known) else "LIST"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
@@ -192,7 +191,7 @@ class RecipeChoice:
 _ALPHA = "Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
 _LB = "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]"
 _GUARANTEE = (
-    "What keeps to LB: the ball around each part, at one look (local); all accepted parts together (pooled); or a rule of "
+    "What keeps to LB: the ball around each part, at one look (local); all its members together (pooled); or a rule of "
     "your own."
 )
 _STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
@@ -227,7 +226,7 @@ class DataChoice:
         from ..datasets import load_dataset
 
         data = load_dataset(self.data, **self.how)
-        for line in [] if as_json() else left_out(data, 3):
+        for line in [] if as_json() else (*data.notes, *left_out(data, 3)):
             click.echo(line, err=True)
         return data
 
@@ -237,16 +236,20 @@ def left_out(data: Dataset, most: int) -> list[str]:
     n = len(data.faults)
     rest = [f"- and {n - most} more"] if n > most else []
     title = f"Left out {n} of {n + len(data)} recordings of {data.name}:"
-    return [title, *(f"- {fault}" for fault in data.faults[:most]), *rest] if n else []
+    return [title, *(f"- {as_options(str(fault))}" for fault in data.faults[:most]), *rest] if n else []
 
 
-_SAMPLES = "Use only the first so many samples of each trace: decides earlier, on less.  [default: all]"
-_CHANNEL = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
+_SAMPLES = "Of a trace: of recordings only the first so many, which decides earlier, on less.  [default: all]"
+_CHANNELS = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
 _LABEL = (
-    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column.  "
-    "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
+    "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column, of .npz its "
+    "array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
-_FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad]"
+_LABELS = "A CSV file of labels: of a folder's files, or of a long table's parts."
+_LABEL_MAP = "What other words mean, as in 'i.O.=good,n.i.O.=bad'."
+_TIME = "The column of times of a long table, a row a sample, whose --part tells the insertions."
+_HERTZ = "Samples a second.  [default: what timestamps tell, else 500]"
+_FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad; live: strict]"
 _RATE = click.FloatRange(0.0, min_open=True)
 _TRIGGER = (
     "When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
@@ -254,16 +257,21 @@ _TRIGGER = (
 )
 _PART = "The array or column of parts' numbers, if any: a part that comes again has one vote.  [default: part]"
 _DATA = (
-    "The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; or a wide .csv or "
-    ".parquet, .npz or .h5: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db."
+    "The bundled set, insertion; a folder of CSV files, one an insertion, its label in its name; a .csv or .parquet, wide "
+    "or long; .npz: X (traces, samples) and y (1 success, 0 failure); .mcap by --trigger; or a store's .db."
 )
-DATA = {
+TRACE = {
     "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
-    "channel": click.option("--channel", metavar="NAMES", help=_CHANNEL),
-    "label": click.option("--label", metavar="PATTERN", help=_LABEL),
-    "labels": click.option("--labels", metavar="FILE", help="For a folder, a CSV file of file names and labels."),
+    "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
+    "unit": click.option("--unit", metavar="TEXT", help="Of the samples, for people.  [default: N]"),
+    "channel": click.option("--channels", "--channel", "channel", metavar="NAMES", help=_CHANNELS),
     "fit": click.option("--fit", type=Known("fit"), help=_FIT),
-    "rate_hz": click.option("--rate", "rate_hz", type=_RATE, metavar="HZ", help="Instead of what timestamps tell."),
+}
+DATA = TRACE | {
+    "label": click.option("--label", metavar="PATTERN", help=_LABEL),
+    "labels": click.option("--labels", metavar="FILE", help=_LABELS),
+    "label_map": click.option("--label-map", metavar="WORDS", help=_LABEL_MAP),
+    "time": click.option("--time", metavar="COLUMN", help=_TIME),
     "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
     "topic": click.option("--topic", metavar="NAME", help="Of the wrench in an .mcap file.  [default: the only one]"),
     "part": click.option("--part", metavar="KEY", help=_PART),
@@ -276,6 +284,27 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> C
     option = click.option("--data", metavar=metavar, help=_DATA, **({"required": True} if default is None else shown))
     named = click.argument("data", metavar=metavar) if argument else option
     return gathered("source", lambda data, **how: DataChoice(data, given(**how)), {"data": named} | DATA)
+
+
+def recorded_as(how: Mapping[str, Any]) -> dict[str, Any]:
+    """What a robot's recorder is told of TRACE, under its names."""
+    from ..datasets.dataset import names_of as taken_apart
+
+    told = {name: how[name] for name in ("samples", "rate_hz") if name in how}
+    return told | ({"channels": taken_apart(how["channel"])} if "channel" in how else {})
+
+
+def trace_of(how: Mapping[str, Any]) -> TraceSpec | None:
+    """The contract of live traces by those of TRACE that were given; None: the first trace sets it."""
+    from ..datasets.dataset import names_of as taken_apart
+    from ..records import TraceSpec
+
+    asked = {name: how[name] for name in TRACE if name in how}
+    names = taken_apart(asked.pop("channel", None))
+    n = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1
+    if (asked or names) and "samples" not in asked:
+        raise click.UsageError("--samples, too, is needed for a contract of traces; without it the first one sets it all.")
+    return TraceSpec(**asked, channels=n, columns=names if names != (str(n),) else ()) if asked else None
 
 
 def n_jobs_option(default: int, text: str) -> Callable[[Command], Command]:
@@ -307,4 +336,7 @@ out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; made if n
 picture_option = _out_option(FILE, "A picture, .png, .pdf or .svg, drawn into this file.")
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED)
 new_seed_option = click.option("--seed", type=click.IntRange(0), help=_NEW_SEED)
+_CHECK = click.FloatRange(0.0, 3600.0, min_open=True)
+_CHECKED = "That a verification takes in your cell, for every figure of time saved."
+check_option = click.option("--check-seconds", type=_CHECK, default=5.0, show_default=True, metavar="S", help=_CHECKED)
 scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from textwrap import fill
@@ -17,24 +18,30 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
-from ..errors import DengineError, without_password
+from ..errors import DengineError, percent, without_password
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ..datasets.importing import ImportReport
     from ..decision.certificate import Certificate
 
 WIDE = 80  # columns where no terminal says otherwise; every table fits them
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
-JSON = "dengine.json"  # in click's context: whether --json was given
-json_option = click.option(
-    "--json",
-    is_flag=True,
-    expose_value=False,
-    callback=lambda context, option, given: context.meta.update({JSON: given}),
-    help="Print one JSON document and nothing else.",
-)
+JSON, EXPLAIN = "--json", "--explain"  # in click's context too: whether they were given
+
+
+def _flag(name: str, text: str) -> Callable[[Any], Any]:
+    keep: Callable[..., None] = lambda context, option, given: context.meta.update({name: given})  # noqa: E731
+    return click.option(name, is_flag=True, expose_value=False, callback=keep, help=text)
+
+
+json_option = _flag(JSON, "Print one JSON document and nothing else.")
+explain_option = _flag(EXPLAIN, "Say below the table what its columns mean.")
+
+
+def explained(legend: str) -> str:
+    """What a table's columns mean, where the verb that runs was asked for it; else how to ask."""
+    return legend if click.get_current_context().meta.get(EXPLAIN) else "--explain says what the columns mean."
 
 
 def as_json() -> bool:
@@ -110,7 +117,7 @@ def show(*parts: Any) -> None:
         screen.print(part, highlight=False, markup=False, soft_wrap=isinstance(part, str))
 
 
-def facts(title: str, rows: Iterable[tuple[str, ...]], columns: Sequence[str] = ("", "")) -> Table:
+def facts(title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")) -> Table:
     """A table of named facts, a row each: its name, and its values under `columns`; passwords are masked."""
     from rich.table import Table
 
@@ -122,21 +129,45 @@ def facts(title: str, rows: Iterable[tuple[str, ...]], columns: Sequence[str] = 
     return table
 
 
-def figures(title: str, rows: Sequence[Mapping[str, str]], caption: str, total: bool = False) -> Table:
-    """A table of numbers, to the right, under the rows' names. total : whether a line sets the last row apart."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
+def rows_of(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
+    """A record's fields, each by its name and as `written`; None and empty ones are left out."""
+    for each in fields(record):
+        value = getattr(record, each.name)
+        if each.name not in left_out and value is not None and not (isinstance(value, Sized) and not value):
+            yield heading(each.name), written(each.name, value)
 
-    look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
-    look |= {"caption": f"\n{caption}\n", "pad_edge": False, "show_edge": False}
-    table = Table(title=f"\n{without_password(title)}\n", **look)
-    for name in rows[0]:
-        table.add_column(name, justify="right", no_wrap=True)
-    for i, row in enumerate(rows):
-        if total and i == len(rows) - 1:
-            table.add_section()
-        table.add_row(*row.values())
-    return table
+
+def listed(title: str, records: Iterable[Any], *names: str) -> Table:
+    """A table of records, a row each, of these fields."""
+    rows = [[written(name, getattr(one, name)) for name in names] for one in records]
+    return facts(title, rows, list(map(heading, names)))
+
+
+def heading(name: str) -> str:
+    """A field's name without its unit: `retrain_max_s` is retrain max."""
+    return re.sub("_(s|bytes|hz)$", "", name).replace("_", " ")
+
+
+def written(name: str, value: Any) -> str:
+    """A field's value as a person reads it, with the unit that its name ends in."""
+    if isinstance(value, str) or value is None:
+        return without_password(value) if value else "-"
+    if is_dataclass(value) and "__str__" in vars(type(value)):
+        return str(value)
+    if is_dataclass(value):
+        return ", ".join(f"{part} {said}" for part, said in rows_of(value))
+    if isinstance(value, Mapping):
+        return ", ".join(f"{part} {written(part, each)}" for part, each in value.items() if each != 0) or "none"
+    if isinstance(value, list | tuple):
+        return ", ".join(written(name, each) for each in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if math.isnan(value):
+        return "-"
+    for ending, write in UNITS.items():
+        if name.endswith(ending):
+            return write(value)
+    return f"{value:,.0f}" if float(value).is_integer() else f"{value:,.4g}"
 
 
 def duration(seconds: float) -> str:
@@ -154,34 +185,33 @@ def when(seconds: float | None, form: str = "%Y-%m-%d %H:%M:%S UTC") -> str:
 
 
 def size(n_bytes: float) -> str:
-    """A size as a person writes it: 812 B, 296 kB, 1.4 MB, 4.4 GB."""
-    for factor, unit in ((1e9, "GB"), (1e6, "MB")):
-        if n_bytes >= 0.9995 * factor:
-            return f"{n_bytes / factor:.1f} {unit}"
-    return f"{n_bytes / 1e3:.0f} kB" if n_bytes >= 1e3 else f"{n_bytes:.0f} B"
+    """A size as a person writes it: 812 bytes, 296.0 kB, 1.4 MB."""
+    from rich.filesize import decimal
+
+    return decimal(int(n_bytes))
 
 
-def imported_line(report: ImportReport, store: str) -> str:
-    """What became of imported labels; what did not happen is not mentioned."""
-    left = f" Its last line, {report.cut} bytes, was not finished and was left out." if report.cut else ""
-    if report.contradicted:
-        left += f" {report.contradicted} labels say the opposite of what is there and were left out; correct them there."
-    if not report.imported and not report.quarantined:
-        return f"Nothing new for {store}: all {report.known} traces were there from an earlier import.{left}"
-    bad = f" {report.quarantined} bad traces are kept there too and never trained on." if report.quarantined else ""
-    known = f" {report.known} were there from an earlier import and were left out." if report.known else ""
-    return f"Imported {report.imported} labelled traces into {store}.{bad}{known}{left}"
+UNITS: dict[str, Callable[[float], str]] = {  # by the ending of a field's name
+    **dict.fromkeys(("_s", "seconds", "budget"), duration),
+    **dict.fromkeys(("_time", "last_seen"), when),
+    **dict.fromkeys(("share", "rate", "tolerance"), percent),
+    "_bytes": size,
+    "_hz": lambda hertz: f"{hertz:g} Hz",
+}
 
 
 def certificate_record(certificate: Certificate) -> dict[str, Any]:
     """A certificate as JSON has it: its numbers, and what they say in words."""
-    said = {name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects", "advice")}
+    said = {name: getattr(certificate, name) for name in ("kept", "sentence", "sentence_on_rejects")}
     return asdict(certificate) | said
 
 
 @contextmanager
-def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on stderr that goes when done, none beside JSON; the function it gives advances it by so many."""
+def progress(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A bar on stderr that goes when done, none beside JSON; the function it gives advances it by so many.
+
+    total : None where how many there are is not known.
+    """
     if as_json():
         yield lambda step: None
         return
@@ -202,7 +232,6 @@ class EndAskedError(Exception):
 def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar whose next step ends the work with EndAskedError where Ctrl-C asked for that; a second Ctrl-C ends at once."""
     asked, done, before = False, 0, signal.getsignal(signal.SIGINT)
-    heard = threading.current_thread() is threading.main_thread()  # Python delivers signals to that one alone
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
@@ -218,13 +247,11 @@ def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
             if asked:
                 raise EndAskedError(done)
 
-        if heard:
-            signal.signal(signal.SIGINT, ask)
+        signal.signal(signal.SIGINT, ask)
         try:
             yield count
         finally:
-            if heard:
-                signal.signal(signal.SIGINT, before)
+            signal.signal(signal.SIGINT, before)
 
 
 def end_interrupted(*lines: str) -> NoReturn:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 from click.core import ParameterSource
 
-from ..errors import SettingError, percent
+from ..errors import percent
 from . import options
 from .options import ALPHA, COUNT, LOWER_BOUND, OWN, RULE, DataChoice, Known, Listed, RecipeChoice, short_name, verb
-from .output import Out, duration, end_interrupted, figures, progress, tell
+from .output import Out, end_interrupted, explain_option, explained, heading, progress, tell, written
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,9 +35,9 @@ FEEDBACKS = {"stops": False, "confirmed": True}
 
 @dataclass(frozen=True)
 class Stream:
-    """How streams are played: by which seeds, how many cycles, shuffled or as recorded; and where.
+    """How streams are played, and what a check takes.
 
-    n_jobs : replays at a time.  keep : folder of finished ones.  scheduler : address of a dask cluster.
+    seeds, cycles, shuffle : as in `grid_tasks`.  n_jobs, keep : as in `iterate_replays`.
     """
 
     seeds: range
@@ -45,19 +45,18 @@ class Stream:
     shuffle: bool = True
     n_jobs: int = 1
     keep: Path | None = None
-    scheduler: str | None = None
+    check_seconds: float = 5.0
 
 
 class Finished(NamedTuple):
     """The replays that were finished, in their tasks' order.  interrupted : how many, where some are missing.
 
-    found : how many had been kept from an earlier run.  seconds : wall time.
+    costs : wall time and one core's, in seconds; and how many had been kept from an earlier run.
     """
 
     replays: list[Replay]
     interrupted: str
-    found: int
-    seconds: float
+    costs: dict[str, float]
 
 
 def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Finished:
@@ -66,42 +65,17 @@ def _played(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Finished
 
     done: dict[int, Replay] = {}
     found, begin = 0, time.perf_counter()
-    cycles = len(tasks) * (stream.cycles or len(dataset))
-    with _cluster(stream, dataset) as n_jobs, progress(f"replaying {dataset.name}", cycles) as advance:
+    with progress(f"replaying {dataset.name}", len(tasks) * (stream.cycles or len(dataset))) as advance:
         # A callback cannot travel to other processes: there the bar moves a replay at a time.
-        on_cycle = (lambda cycle: advance(1)) if n_jobs == 1 else None
-        try:
-            for i, one, kept in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=stream.keep, on_cycle=on_cycle):
+        on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
+        with suppress(KeyboardInterrupt):  # what is missing says so
+            for i, one, kept in iterate_replays(dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle):
                 done[i], found = one, found + kept
-                if on_cycle is None or kept:
-                    advance(len(one))
-        except KeyboardInterrupt:
-            pass  # what is missing says so
-    missing = len(done) < len(tasks)
-    interrupted = f"Interrupted: {len(done)} of {len(tasks)} replays were finished" if missing else ""
-    return Finished([done[i] for i in sorted(done)], interrupted, found, time.perf_counter() - begin)
-
-
-@contextmanager
-def _cluster(stream: Stream, dataset: Dataset) -> Iterator[int]:
-    """n_jobs: replays go to a dask cluster where a scheduler is named, else to processes of this machine."""
-    if stream.scheduler is None:
-        yield stream.n_jobs
-        return
-    options.must_have("--scheduler", "dask", "distributed")
-    from distributed import Client
-    from joblib import parallel_config
-
-    connect: Any = Client  # untyped
-    try:
-        connected = connect(stream.scheduler, timeout="5 s")
-    except (OSError, ValueError, MemoryError) as error:  # the last: what answered there speaks another language
-        raise SettingError(
-            f"Expected --scheduler to be the address of a running dask scheduler, as tcp://host:8786, got "
-            f"{stream.scheduler!r}: {error}"
-        ) from error
-    with connected as client, parallel_config("dask", client=client, scatter=[dataset]):
-        yield -1
+                advance(len(one) if on_cycle is None or kept else 0)
+    some = f"Interrupted: {len(done)} of {len(tasks)} replays were finished" if len(done) < len(tasks) else ""
+    core = sum(each.seconds for each in done.values())
+    costs = {"seconds": time.perf_counter() - begin, "core_seconds": core, "found": found}
+    return Finished([done[i] for i in sorted(done)], some, costs)
 
 
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
@@ -123,7 +97,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             "in_order": click.option("--in-order", is_flag=True, help="Play the stream once, as recorded, drift and all."),
             "n_jobs": options.n_jobs_option(n_jobs, "Replays at a time; -1: one a core. Timings are honest with 1 only."),
             "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=KEEP),
-            "scheduler": click.option("--scheduler", metavar="ADDRESS", help="Play on a dask cluster, as tcp://host:8786."),
+            "check_seconds": options.check_option,
         },
     )
 
@@ -145,6 +119,7 @@ POLICIES = LISTS | {
 @options.recipe_options
 @click.option("--confirm", is_flag=True, help="Accepted good parts are known to be fine afterwards.")
 @stream_options(30, 1, 1, SHUFFLES)
+@explain_option
 @options.out_option
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
@@ -176,6 +151,7 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     help=f"What is known of accepted parts, of {','.join(FEEDBACKS)}: their stops alone, or of good ones too.",
 )
 @stream_options(30, 1, 1, SHUFFLES)
+@explain_option
 @options.out_option
 def compare(
     asked: Sequence[str],
@@ -212,30 +188,27 @@ def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoic
     """Play, and tell what was finished: tables, or one JSON document; CSV, tables and pictures in `out`."""
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
-    from ..experiments.paper import finding_lines, findings
+    from ..experiments.paper import findings
 
     dataset = source.load()
     tasks = grid_tasks(who, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid)
     finished = _played(dataset, tasks, stream)
     if not (replays := finished.replays):
         end_interrupted(f"{finished.interrupted}; there is nothing to show.")
-    frame = tables.frame_of(replays)
+    frame = tables.frame_of(replays, stream.check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _grouped(replays, lambda each: each.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
     # The paper's findings are of a grid under one guarantee and one feedback.
     found = findings(frame) if _is_grid(frame) and not _varies(frame, "guarantee", "stops", "confirm") else []
-    core = sum(each.seconds for each in replays)
-    costs = {"seconds": finished.seconds, "core_seconds": core, "found": finished.found}
     record = {"data": dataset.name, "in_order": not stream.shuffle, "faults": dataset.faults, "rows": rows}
-    record |= {"interrupted": bool(finished.interrupted), "findings": found, "costs": costs}
-    lines = [tables.pooled_table(rows, title), *tables.promise_lines(rows)]
+    record |= {"interrupted": bool(finished.interrupted), "findings": found, "costs": finished.costs}
+    lines = [tables.pooled_table(rows, title, explained(tables.LEGEND)), *tables.promise_lines(rows)]
     for name, some in by_name.items():
         retrains = [each for one in some for each in one.retrains]
         lines.append(f"{name}: {tables.retrain_line(retrains)}")
-    kept = f"; {finished.found} were there from an earlier run" if finished.found else ""
-    took = f"{duration(core)} of one core's time, in {duration(finished.seconds)}{kept}."
-    lines += [*finding_lines(found), f"{len(replays)} replay{'' if len(replays) == 1 else 's'}, {took}"]
+    took = ", ".join(f"{heading(name)} {written(name, value)}" for name, value in finished.costs.items())
+    lines += [*found, f"{len(replays)} replay{'' if len(replays) == 1 else 's'}: {took}."]
     tell(record, *lines, out=out, made=lambda: dict(_made(frame, replays, title)))
     if finished.interrupted:
         end_interrupted(f"{finished.interrupted}; the table shows those.")
@@ -250,8 +223,7 @@ def _grouped(replays: Sequence[Replay], key: Callable[[Replay], str]) -> dict[st
 
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
     each = sorted({len({replay.seed for replay in replays}) for replays in by_name.values()})
-    cycles = len(next(iter(by_name.values()))[0])
-    order = "in recorded order" if in_order else "shuffled"
+    cycles, order = len(next(iter(by_name.values()))[0]), "in recorded order" if in_order else "shuffled"
     how = f"{order}, {' or '.join(map(str, each))} replay{'s' if each[-1] > 1 else ''} of {cycles} cycles"
     return f"{', '.join(by_name)} on {'simulated insertions' if data == 'insertion' else data}, {how}"
 
@@ -265,7 +237,8 @@ def _is_grid(frame: pd.DataFrame) -> bool:
 
 
 def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterator[tuple[str, Any]]:
-    """What is written of replays, by name."""
+    import numpy as np
+
     from ..experiments.figures import curves, embedding_map, grid_figure
     from ..experiments.paper import grid_lines
 
@@ -277,7 +250,7 @@ def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterato
     else:
         yield "curves.png", curves(_grouped(replays, lambda each: _row_name(each, frame)), title)
     for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
-        if one.embedded:
+        if not np.isnan(one.position).all():  # rivals embed nothing
             said = f"{name}, newest parts of one replay (seed {one.seed})"
             yield _file_name(f"map_{name}"), embedding_map(one, title=said)
 
@@ -316,15 +289,16 @@ PRICES = {
 @verb("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 @options.data_options()
 @options.gathered("prices", dict, PRICES)
-@click.option("--unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
+@click.option("--cost-unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @options.recipe_options
 @options.gathered("lists", options.given, LISTS)
 @stream_options(10, 2, -1, "Shuffles of each policy; half choose.")
+@explain_option
 @options.out_option
 def costs(
     choice: RecipeChoice,
     prices: dict[str, float],
-    unit: str,
+    cost_unit: str,
     lists: Mapping[str, Any],
     source: DataChoice,
     stream: Stream,
@@ -336,12 +310,14 @@ def costs(
     seconds of production or money. Ctrl-C shows the curve of the shuffles that every policy has finished.
     """
     _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, cost_tasks, curve_of
+    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of
     from ..experiments.figures import cost_picture
+    from ..experiments.grid import grid_tasks
     from ..experiments.metrics import Costs
+    from ..experiments.tables import figures
 
     priced, tried = Costs(**prices), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
-    tasks = cost_tasks(choice.contender(), **tried, seeds=stream.seeds, cycles=stream.cycles)
+    tasks = grid_tasks([choice.contender()], **tried, seeds=stream.seeds, cycles=stream.cycles)
     finished = _played(source.load(), tasks, stream)
     seeds = [each.seed for each in finished.replays]
     if finished.interrupted and sum(seeds.count(seed) == len(tasks) / len(stream.seeds) for seed in set(seeds)) < 2:
@@ -351,17 +327,17 @@ def costs(
     first = ("" if curve.policy else ">", "-", "all", every, every, "100 %", "-", "-")
     cells = [first, *(_cells(row, row.policy == curve.policy) for row in curve.rows)]
     tell(
-        {"data": curve.dataset, "unit": unit, "interrupted": bool(finished.interrupted)}
+        {"data": curve.dataset, "unit": cost_unit, "interrupted": bool(finished.interrupted)}
         | {name: getattr(curve, name) for name in SAID}
         | {"rows": frame.to_dict("records")},
         figures(
-            f"{curve.recipe} on {curve.dataset}: what a part costs, in {unit}, by alpha and LB",
+            f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}, by alpha and LB",
             [dict(zip(COLUMNS, each, strict=True)) for each in cells],
-            CAPTION.format(reporting=curve.reporting, cycles=curve.cycles),
+            explained(CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)),
         ),
         curve.sentence,
         out=out,
-        made=lambda: {"costs.csv": frame, "costs.png": cost_picture(curve, unit=unit)},
+        made=lambda: {"costs.csv": frame, "costs.png": cost_picture(curve, unit=cost_unit)},
     )
     if finished.interrupted:
         end_interrupted(f"{finished.interrupted}; the shuffles that all have are shown.")

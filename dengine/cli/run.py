@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import asdict
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import click
 
-from ..errors import CellError, SettingError, percent
-from . import options
+from ..errors import CellError, SettingError, expect, percent
+from . import options, output
 from .options import DataChoice, RecipeChoice, short_name, verb
-from .output import EndAskedError, Out, as_json, certificate_record, end_interrupted, figures, steps, tell
+from .output import EndAskedError, Out, as_json, certificate_record, end_interrupted, facts, rows_of, steps, tell, written
 
 if TYPE_CHECKING:
     from ..cells.base import Cell
     from ..engine.engine import DataEngine
     from ..experiments.replay import Replay
-    from ..records import Cycle
-    from ..store.base import Store
+    from ..records import TraceSpec
+    from ..store.sql import SqlStore
 
+Driven = tuple["Cell", str, "TraceSpec | None"]  # what is driven, what it is called, and the form of its traces
 STRETCHES = 6
 KINDS = "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a Universal Robots controller."
 
@@ -33,12 +34,14 @@ KINDS = "replay: the parts of --data, in their order. simulated: physics in MuJo
 @click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
 @options.data_options()
 @options.scenario_option
+@options.check_option
 @click.option("--cycles", type=options.COUNT, default=300, show_default=True, help="Parts to insert, one a cycle.")
 @options.store_option("Remembers everything; without one the run is forgotten.")
 @options.recipe_options
 @options.new_seed_option
 @options.allow_import_option
 @click.option("--shadow", is_flag=True, help="Verify every part; the model only says what it would have done.")
+@output.explain_option
 @options.out_option
 def run(
     choice: RecipeChoice,
@@ -48,6 +51,7 @@ def run(
     seed: int | None,
     shadow: bool,
     allow_import: bool,
+    check_seconds: float,
     out: Out | None,
     **cell_of: Any,
 ) -> None:
@@ -67,10 +71,13 @@ def run(
     with ExitStack() as opened, used as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = CELLS[kind](store=engine.store, seed=engine.seed, cycles=cycles, **cell_of)
+        cell_of |= {"store": engine.store, "seed": engine.seed, "cycles": cycles, "check_s": check_seconds}
+        cell, name, form = CELLS[kind](**cell_of)
+        if form is not None:
+            engine.agree_on(form)
         opened.callback(getattr(cell, "close", lambda: None))
         log, changes, failure = _drive(engine, cell, cycles, name)
-        said: dict[str, Any] = {"safe_mode": engine.safe_mode, "safe_mode_changes": changes}
+        said: dict[str, Any] = {"check_seconds": check_seconds, "safe_mode": engine.safe_mode, "safe_mode_changes": changes}
         certificate = engine.certificate()
     title = f"{name}, {short_name(engine.recipe.name)}{', resumed' if engine.resumed else ''}"
     if len(log):
@@ -89,27 +96,23 @@ def run(
 
 def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> tuple[Replay, list[dict[str, Any]], CellError | None]:
     """What was done, when the safe mode began or ended, and what ended the run, where the cell failed."""
-    from ..experiments.replay import RunRecorder
+    from ..experiments.replay import Seen, follow, gather
 
-    recorder, changes, mode = RunRecorder(cell), list[dict[str, Any]](), engine.safe_mode
-
-    def follow(cycle: Cycle) -> None:
-        nonlocal mode
-        if cycle.safe_mode != mode:
-            mode = cycle.safe_mode
-            changes.append({"cycle": cycle.index + 1, "reason": mode})
-            if not as_json():
-                click.echo(_mode_line(changes[-1]), err=True)
-        count(1)  # which may end the run, between two cycles: no part is left half dealt with
-
-    failure = None
+    seen, changes, mode, failure = list[Seen](), list[dict[str, Any]](), engine.safe_mode, None
     try:
         # Pressed twice, Ctrl-C ends even a cycle that does not end; what was done before it is known.
         with suppress(EndAskedError, KeyboardInterrupt), steps(name, cycles) as count:
-            recorder.follow(engine, cycles, follow)
+            for each in follow(engine, cell, cycles):
+                seen.append(each)
+                if each.cycle.safe_mode != mode:
+                    mode = each.cycle.safe_mode
+                    changes.append({"cycle": each.cycle.index + 1, "reason": mode})
+                    if not as_json():
+                        click.echo(_mode_line(changes[-1]), err=True)
+                count(1)  # which may end the run, between two cycles: no part is left half dealt with
     except CellError as error:
         failure = error
-    return recorder.log(), changes, failure
+    return gather(seen, engine.recipe), changes, failure
 
 
 def _mode_line(change: Mapping[str, Any]) -> str:
@@ -118,17 +121,21 @@ def _mode_line(change: Mapping[str, Any]) -> str:
     return f"After cycle {change['cycle']}: {what}."
 
 
-def _simulated(store: Store, seed: int, scenario: str, cycles: int, **others: Any) -> tuple[Cell, str]:
+def _simulated(
+    store: SqlStore, seed: int, scenario: str, cycles: int, check_s: float, source: DataChoice, **others: Any
+) -> Driven:
     from ..cells.simulation.cell import SimulatedCell
+    from ..cells.simulation.conditions import CellParameters
 
     # Another seed for a resumed run: the same parts again would be counted twice.
     seed += store.status()["decisions"]
     if store.product is not None:  # peers have one seed, and parts of their own all the same
         seed += crc32(store.cell_id.encode())
-    return SimulatedCell(scenario=scenario, seed=seed, cycles=cycles), f"simulated cell, {scenario}"
+    cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=CellParameters(verify_s=check_s))
+    return cell, f"simulated cell, {scenario}", options.trace_of(source.how)
 
 
-def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> tuple[Cell, str]:
+def _recorded(store: SqlStore, source: DataChoice, cycles: int, **others: Any) -> Driven:
     import numpy as np
 
     from ..cells.replay import ReplayCell
@@ -144,24 +151,20 @@ def _recorded(store: Store, source: DataChoice, cycles: int, **others: Any) -> t
     known = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
     first = int(known[-1]) + 1 if len(known) else 0
     left = len(dataset) - first
-    if cycles > left:
-        raise SettingError(
-            f"Expected at most {left} cycles, got {cycles}: {first} of {len(dataset)} parts were played before."
-        )
-    return ReplayCell(dataset, np.arange(first, len(dataset))), f"recording {dataset.name} from part {first + 1}"
+    expect(cycles <= left, f"at most {left} cycles", cycles, f"{first} of {len(dataset)} parts were played before")
+    cell = ReplayCell(dataset, np.arange(first, len(dataset)))
+    return cell, f"recording {dataset.name} from part {first + 1}", dataset.spec
 
 
-def _robot(source: DataChoice, host: str | None, **others: Any) -> tuple[Cell, str]:
+def _robot(source: DataChoice, host: str | None, **others: Any) -> Driven:
     from ..cells.ur.cell import UrCell
-    from ..datasets.dataset import names_of
 
     if not host:
         raise SettingError("Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none.")
-    how: dict[str, Any] = {name: source.how[name] for name in ("samples", "rate_hz", "trigger") if name in source.how}
-    if "channel" in source.how:
-        how["channels"] = names_of(source.how["channel"])
+    how = options.recorded_as(source.how) | options.given(trigger=source.how.get("trigger"))
     name, port = host_and_port(host)
-    return UrCell(name, port=port, **how), f"robot at {host}"
+    cell, said = UrCell(name, port=port, **how), {each: source.how[each] for each in ("unit", "fit") if each in source.how}
+    return cell, f"robot at {host}", replace(cell.recorder.spec, **said)
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -174,58 +177,40 @@ def host_and_port(address: str) -> tuple[str, int]:
     return host, int(port) if port else PORT
 
 
-CELLS: dict[str, Callable[..., tuple[Cell, str]]] = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
+CELLS: dict[str, Callable[..., Driven]] = {"simulated": _simulated, "replay": _recorded, "ur": _robot}
 CAPTION = (
     "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts rejected. Both as far as the "
     "cell tells the truth about parts that were not verified. novel: parts verified for being unlike all known ones; safe: "
-    "cycles of safe mode."
+    "cycles of safe mode; good/h: good parts passed on an hour."
 )
 COLUMNS = {"accepted": "accepted", "FP": "false_positive", "stops": "stops", "rejected": "rejected"}
 COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
 
 
 def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> None:
-    """Tell what a run did, of which the cell may say what its clock shows, and what was missing of its recordings."""
+    """Tell what a run did, and what the cell says of its clock or its recordings."""
     from ..experiments.figures import run_picture
-    from ..experiments.tables import retrain_line
+    from ..experiments.tables import figures, retrain_line
 
     total, stretches = log.stretch(), log.stretches(STRETCHES)
-    clock = asdict(cell.report()) if hasattr(cell, "report") else None
-    recording = {"incomplete": cell.incomplete, **asdict(cell.recorder.report())} if hasattr(cell, "recorder") else None
+    about = cell.report() if hasattr(cell, "report") else None
     rows = []
     for row in (*stretches, total):
-        cells = {
-            "cycles": f"{row['first_cycle']} to {row['last_cycle']}",
-            "verified": percent(row["verified_share"], ".0f"),
-        }
+        between = f"{row['first_cycle']} to {row['last_cycle']}"
+        cells = {"cycles": between, "verified": percent(row["verified_share"], ".0f")}
         cells |= {title: str(row[name]) for title, name in COLUMNS.items()}
-        if clock is not None:
-            cells["good/h"] = "-" if row["parts_per_hour"] is None else f"{row['parts_per_hour']:.1f}"
+        if total["parts_per_hour"] is not None:
+            cells["good/h"] = written("", row["parts_per_hour"])
         rows.append(cells)
-    caption = CAPTION + (" good/h: good parts passed on an hour." if clock is not None else "")
-    lines = [] if clock is None else [_clock_line(clock)]
-    if recording is not None:
-        counts = "{packages} packages, {missing} missing, {late} late, {reconnects} reconnects".format(**recording)
-        lines += [f"Recorded: {counts}. Traces with a gap, verified and never learned from: {recording['incomplete']}."]
+    lines: list[Any] = [] if about is None else [facts("What the cell says of it", rows_of(about))]
+    certain, each_s = total["accepted"] + total["rejected"], said["check_seconds"]
+    lines += [f"{certain} checks of {each_s:g} s were left out: {written('_s', certain * each_s)}."]
     lines += [retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), said["certificate"]["sentence"]]
     worst = max((each.seconds for each in log.retrains), default=None)
     tell(
-        said
-        | {"total": total, "stretches": stretches, "cell": clock, "recording": recording}
-        | {"retrains": log.retrains, "retrain_max_s": worst},
-        figures(said["title"], rows, caption, total=True),
+        said | {"total": total, "stretches": stretches, "cell": about} | {"retrains": log.retrains, "retrain_max_s": worst},
+        figures(said["title"], rows, output.explained(CAPTION), total=True),
         *lines,
         out=out,
         made=lambda: {"run.csv": log.to_frame().reset_index(), "run.png": run_picture(log, said["title"])},
-    )
-
-
-def _clock_line(clock: dict[str, Any]) -> str:
-    """What the simulated clock says. Its seconds saved have the cost of stops and wrong rejects taken off already."""
-    saved = clock["seconds_saved"]
-    result = "nothing was saved" if abs(saved) < 0.5 else f"{abs(saved):.0f} s were {'saved' if saved > 0 else 'lost'}"
-    silent = f" Bad parts that went on unnoticed: {clock['escapes']}." if clock["escapes"] else ""
-    return (
-        f"Simulated: {clock['parts_per_hour']:.1f} good parts an hour. Against verifying every part {result}; this counts "
-        f"what stops ({clock['stops']}) and good parts sent back to the bin ({clock['sent_back']}) cost.{silent}"
     )

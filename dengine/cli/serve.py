@@ -12,7 +12,7 @@ import click
 
 from ..errors import SettingError
 from . import options
-from .options import COUNT, FILE, RecipeChoice
+from .options import COUNT, FILE, TRACE, RecipeChoice
 from .run import host_and_port
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ NEEDED = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 PATIENT = 5.0  # seconds that a decision of the demonstration may wait: nobody but who watches waits for it
 SPEED, DEADLINE, PORT = click.FloatRange(0.01, 1000.0), click.FloatRange(0.001, 60.0), click.IntRange(1, 65535)
 DEMO = "Play the bundled recordings as a robot would; forgotten at the end, or in a new --store."
-SECONDS = click.FloatRange(0.0, 3600.0)
 NAMED = "A name by which the server is called, beside its own."
 WAITS = "Seconds that a decision may wait in line; then it is verify, and recorded so."
 RATE = "Requests a second of one client; 0: any."
@@ -41,7 +40,8 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
 @click.option("--allow-host", "allow_hosts", multiple=True, metavar="NAME", help=NAMED)
 @click.option("--deadline", type=DEADLINE, default=0.5, show_default=True, metavar="S", help=WAITS)
-@click.option("--check-seconds", type=SECONDS, default=5.0, show_default=True, help="That a verification takes.")
+@options.check_option
+@options.gathered("form", options.given, TRACE)
 @click.option("--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help=RATE)
 @click.option("--largest", type=click.IntRange(1024), default=2**20, show_default=True, help="Bytes of a request's body.")
 @click.option("--connections", type=COUNT, default=100, show_default=True, help="Connections at once.")
@@ -53,7 +53,6 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--opcua-key", type=FILE, help="Its key, in PEM.  [default: --key]")
 @click.option("--robot", metavar="HOST[:PORT]", help="Record the force of this Universal Robots controller, for XML-RPC.")
 @click.option("--trigger", default="register@output_int_register_25", show_default=True, help="When the robot records.")
-@click.option("--samples", type=COUNT, default=1000, show_default=True, help="Of a recorded trace.")
 @options.allow_import_option
 @options.new_seed_option
 @options.recipe_options
@@ -64,11 +63,9 @@ def serve(
     speed: float,
     shadow: bool,
     allow_import: bool,
-    xmlrpc: bool,
-    page: bool,
     robot: str | None,
     trigger: str,
-    samples: int,
+    form: dict[str, Any],
     seed: int | None,
     **how: Any,
 ) -> None:
@@ -76,24 +73,25 @@ def serve(
 
     It goes on with its store, or starts a new one, and retrains in a process beside it. SIGTERM and Ctrl-C end it in order:
     what is in line is answered, what is known is written. The machine that it runs on may ask without a token; other
-    machines reach it only with --host, which wants --token-file, and should have --cert and --key.
+    machines reach it only with --host, which wants --token-file, and should have --cert and --key. --samples, --rate-hz,
+    --unit, --channels and --fit are the contract that traces keep to; without them a new store takes its first trace's.
     """
     options.must_have("the server", "serve", *NEEDED)
     if how["opcua"]:
         options.must_have("OPC UA", "opcua", "asyncua")
     from ..cells import RtdeRecorder
+    from ..datasets import load_dataset
     from ..recipe import Recipe
     from ..serve.demo import POLICY, playing
-    from ..serve.server import Serving
     from ..serve.server import serve as serve_cell
 
-    interfaces = ("http", *(["xmlrpc"] if xmlrpc else []), *(["page"] if page else []))
     recipe = choice.if_asked()
     with ExitStack() as stack:
         if demo:
             if store is not None and Path(store).exists():
                 raise SettingError(f"Expected a new file to keep the demonstration in, {store} is there; name another one.")
-            how["beside"] = [partial(playing, speed=speed, seed=seed or 0)]
+            data = load_dataset("insertion", **{name: value for name, value in form.items() if name != "channel"})
+            how["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             how["deadline"] = max(how["deadline"], PATIENT)
             recipe = recipe or Recipe.load("conv").with_policy(**POLICY)
             store = store or str(Path(stack.enter_context(TemporaryDirectory(prefix="dengine-demo-"))) / "demo.db")
@@ -101,9 +99,11 @@ def serve(
             raise click.UsageError("Expected --store FILE|URL, where everything is remembered; or --demo, to look on.")
         if robot:
             host, port = host_and_port(robot)
-            how["recorder"] = partial(RtdeRecorder, host, trigger, samples, port=port)
-        make = partial(_opened, store, seed, shadow, recipe=recipe, allow_import=allow_import)
-        serve_cell(make, store, Serving(interfaces=interfaces, **how), click.echo)
+            how["recorder"] = partial(RtdeRecorder, host, trigger, port=port, **options.recorded_as(form))
+            form = {"samples": 1000} | form
+        trace = options.trace_of(form)
+        make = partial(_opened, store, seed, shadow, recipe=recipe, trace=trace, allow_import=allow_import)
+        serve_cell(make, store, click.echo, **how)
 
 
 def _opened(store: str, seed: int | None, shadow: bool, executor: Executor, **how: Any) -> DataEngine:

@@ -12,7 +12,7 @@ import click
 
 from . import options
 from .options import POLICY, Known, verb
-from .output import certificate_record, facts, imported_line, progress, tell
+from .output import certificate_record, facts, progress, rows_of, tell
 
 if TYPE_CHECKING:
     from ..engine.corrections import Changed
@@ -52,6 +52,32 @@ def _changed(store: str, author: str, allow_import: bool, change: Callable[[Data
     recorded = "" if changed.event is None else f" Event {changed.event}, by {author or 'nobody named'}."
     record = {"store": store, "author": author, "changed": changed.event is not None} | asdict(changed)
     tell(record | {"policy": policy, "certificate": certificate_record(certificate)}, f"{changed.text}{recorded}")
+
+
+@verb("dengine report engine.db import-d684ff7e4dbab839-0 bad")
+@options.store_argument
+@click.argument("part", metavar="PART|ID")
+@click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@options.allow_import_option
+@author_option
+def report(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
+    """Report what became of a part.
+
+    It is named by its number, where one decision was made on it, or by that decision's id. An accepted part that was bad
+    is a system stop. A label that is wrong is put right by `dengine correct`.
+    """
+    from ..engine.corrections import Changed
+    from ..history.status import of_part
+
+    def change(engine: DataEngine) -> Changed:
+        id_ = of_part(engine.store, part)
+        if (known := engine.find(id_)) is not None and known.success is LABELS[label]:
+            return Changed("report", f"Decision {id_} was {label} already; nothing changed.", None, engine.version)
+        engine.report(id_, LABELS[label])
+        engine.store.put_event("report", f"decision {id_} was {label}", author=author)
+        return Changed("report", f"Decision {id_} was {label}.", engine.store.events(1)[-1].number, engine.version)
+
+    _changed(store, author, allow_import, change)
 
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
@@ -116,8 +142,7 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 
     with DataEngine.open(store, reading=True, allow_import=allow_import) as engine:  # the cell may run meanwhile
         now = engine.policy
-    rows = [(name, str(value)) for name, value in asdict(now).items()]
-    tell({"store": store, "changed": False, "policy": now}, facts(f"{store}: the policy in force", rows))
+    tell({"store": store, "changed": False, "policy": now}, facts(f"{store}: the policy in force", rows_of(now)))
 
 
 @verb("dengine retrain engine.db")
@@ -157,9 +182,9 @@ def verify(context: click.Context, store: str, cell: str | None, expect: str | N
     Every row is held against its sum, and every entry of the ledger against its rows; what was changed, is missing or was
     never chained is named, with exit code 1. Nothing is written, and engines may go on meanwhile.
     """
-    from ..store.verification import count_rows, verify_history
+    from ..store.verification import verify_history
 
-    with progress("rows", count_rows(store, cell)) as advance:
+    with progress("rows", None) as advance:
         report = verify_history(store, cell, expect, advance)
     tell({"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}, *_lines(report))
     if not report.ok:
@@ -188,9 +213,12 @@ def _lines(report: HistoryReport) -> list[str]:
 def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Take a cell program's labels back into the store.
 
-    JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is imported.
+    JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is imported. Where a line was
+    changed or is missing, those before it are taken; the others are set aside, with exit code 1.
     """
     from ..export.cell_journal import import_journal
 
     report = import_journal(store, journal, any_model=any_model)
-    tell({"store": store, "journal": journal} | asdict(report), imported_line(report, store))
+    tell({"store": store, "journal": journal} | asdict(report), facts(f"{journal} into {store}", rows_of(report, "aside")))
+    if report.aside:
+        raise click.ClickException(report.aside)

@@ -6,13 +6,10 @@ the log. Labels are a topic, of which the first message after an insertion has b
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed
 from ..files import must_fit, reading
 from . import labels
-from .dataset import Asked, Collected, Dataset, Fault, UnreadableError, as_dataset, must
+from .dataset import Asked, Collected, Dataset, UnreadableError, as_dataset, must
 from .tables import natural
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
@@ -39,43 +36,27 @@ ODD = 0.3  # of a step: so far off what they come to, single steps are of bursts
 Times = NDArray[np.float64]
 
 
-@dataclass
-class Messages:
-    """What was read. stamped, logged : (n,) nanoseconds of each wrench, by its stamp and by the log.  wrench : (n, 6).
+class Messages(NamedTuple):
+    """What was read. times : (n,) seconds since the first.  logged : (n,) nanoseconds of the log.  wrench : (n, 6).
 
     others : of each topic asked for, (nanoseconds of the log, value) of its messages.
     """
 
+    times: Times
+    logged: NDArray[np.int64]
+    wrench: NDArray[np.float64]
     others: dict[str, list[tuple[int, Any]]]
-    stamped: list[int] = field(default_factory=list)
-    logged: list[int] = field(default_factory=list)
-    wrench: list[tuple[float, ...]] = field(default_factory=list)
-
-    def add(self, message: Any, logged: int) -> None:
-        header, wrench = getattr(message, "header", None), getattr(message, "wrench", message)
-        self.stamped.append(0 if header is None else header.stamp.sec * BILLION + header.stamp.nanosec)
-        self.logged.append(logged)
-        force, torque = wrench.force, wrench.torque
-        self.wrench.append((force.x, force.y, force.z, torque.x, torque.y, torque.z))
-
-    def times(self) -> Times:
-        """(n,) seconds since the first, by the stamps where every message has one."""
-        exact = np.array(self.logged if 0 in self.stamped else self.stamped, dtype=np.int64)
-        return np.asarray((exact - exact[0]) / BILLION)
 
     def signal(self, name: str) -> NDArray[np.float64]:
         """(n,) an axis, or the newest value of a topic when each wrench was logged; NaN before its first."""
         if name not in self.others:
-            return np.array(self.wrench)[:, axis_of(name)]
+            return self.wrench[:, axis_of(name)]
         known = np.array([np.nan, *(float(value) for _, value in self.others[name])])
         return known[np.searchsorted([time for time, _ in self.others[name]], self.logged, side="right")]
 
 
-def is_stream(source: Any) -> bool:
+def is_stream(path: Path) -> bool:
     """Whether it is an MCAP file, or a folder that rosbag2 wrote."""
-    if not isinstance(source, str | os.PathLike):
-        return False
-    path = Path(source)
     if not path.is_dir():
         return path.is_file() and path.suffix.lower() == SUFFIX
     return any(path.glob(f"*{SUFFIX}")) or ((path / "metadata.yaml").is_file() and any(path.glob("*.db3")))
@@ -114,38 +95,31 @@ def _topics(files: Sequence[Path]) -> dict[str, str]:
     return found
 
 
-def _wrench(have: dict[str, str], path: Path, asked: str | None) -> str:
-    """The topic of the force; DataError where there is none, or several and none was asked for."""
-    wrenches = [topic for topic, kind in have.items() if kind in WRENCHES]
-    if asked is not None and asked not in wrenches:
-        raise DataError(f"Expected a topic of a wrench in {path}, got {asked}; there are {listed(wrenches) or 'none'}.")
-    if asked is None and len(wrenches) != 1:
-        found = listed(wrenches or have) or "none"
-        raise DataError(f"Expected one topic of a wrench in {path}, or the name of one (topic='...'), found {found}.")
-    return asked or wrenches[0]
-
-
 def _messages(files: Sequence[Path], wrench: str, topics: Sequence[str]) -> Messages:
-    """Every message of the wrench, and of the other topics, in the order of the log."""
-    found = Messages({topic: [] for topic in topics})
+    """Every message of the wrench, by its stamp where all have one, and of the other topics, in the order of the log."""
+    others: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in topics}
+    stamped, logged, forces = [], [], []
     for path in files:
         with _reader(path) as reader:
             for each in reader.iter_decoded_messages(topics=[wrench, *topics]):
-                topic, message, logged = each.channel.topic, each.decoded_message, each.message.log_time
+                topic, message, time = each.channel.topic, each.decoded_message, each.message.log_time
                 if topic == wrench:
-                    found.add(message, logged)
-                if topic in found.others:
+                    stamp, said = getattr(message, "header", None), getattr(message, "wrench", message)
+                    stamped.append(0 if stamp is None else stamp.stamp.sec * BILLION + stamp.stamp.nanosec)
+                    logged.append(time)
+                    forces.append([getattr(vector, axis) for vector in (said.force, said.torque) for axis in "xyz"])
+                if topic in others:
                     if not hasattr(message, "data"):
                         raise DataError(f"Expected messages with a field data on {topic}, as of std_msgs, got others.")
-                    found.others[topic].append((logged, message.data))
-    return found
+                    others[topic].append((time, message.data))
+    must(len(logged) >= 2, f"messages of {wrench} in {files[0]}", len(logged))
+    exact = np.array(logged if 0 in stamped else stamped, dtype=np.int64)
+    return Messages((exact - exact[0]) / BILLION, np.array(logged), np.array(forces), others)
 
 
 def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
     """The insertions of an MCAP file, or of a folder of them."""
-    if asked.trigger is None:
-        raise DataError(f"Expected a trigger that cuts {path} into insertions, as 'contact=5' or 'register@/phase'.")
-    trigger, channels = as_trigger(asked.trigger), asked.channels or ("FZ",)
+    channels = asked.channels or ("FZ",)
     for channel in channels:
         must(axis_of(channel) >= 0, f"a channel among {', '.join(AXES)} of a wrench", channel)
     files = sorted(path.glob(f"*{SUFFIX}"), key=lambda each: natural(each.name)) if path.is_dir() else [path]
@@ -153,57 +127,66 @@ def read_bag(path: Path, name: str, asked: Asked) -> Dataset:
         raise DataError(f"Expected MCAP files in the bag {path}, found none; ros2 bag convert makes them of .db3 files.")
     with reading(path, "MCAP files", "mcap_ros2", "mcap"):
         have = _topics(files)
-    wrench = _wrench(have, path, asked.topic)
+    if asked.trigger is None:
+        kinds = {kind.rpartition("/")[2]: topic for topic, kind in have.items()}
+        phase = next((f"register@{topic}" for kind, topic in kinds.items() if "Int" in kind), "contact=5")
+        told = f"label={kinds['Bool']!r}" if "Bool" in kinds else "labels='labels.csv'"
+        raise DataError(f"Expected what cuts {path} into insertions, and their labels, as trigger={phase!r} and {told}.")
+    trigger = as_trigger(asked.trigger)
+    wrenches = [topic for topic, kind in have.items() if kind in WRENCHES and asked.topic in (None, topic)]
+    found = listed(wrenches or have) or "none"
+    must(len(wrenches) == 1, f"a topic of a wrench in {path}, named where there are several (topic='...')", found)
     topics = [signal for signal in trigger.signals if axis_of(signal) < 0] + ([asked.label] if asked.label else [])
     for topic in topics:
         if topic not in have:
             raise DataError(f"Expected the topic {topic} in {path}, found {listed(have) or 'none'}.")
-    messages = _messages(files, wrench, topics)
-    must(len(messages.logged) >= 2, f"messages of {wrench} in {path}", len(messages.logged))
-    return _dataset(messages, trigger, channels, name, asked)
+    return _dataset(_messages(files, wrenches[0], topics), trigger, channels, name, asked)
 
 
 def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], name: str, asked: Asked) -> Dataset:
     active = trigger.active({signal: messages.signal(signal) for signal in trigger.signals})
-    values, times = np.array(messages.wrench)[:, [axis_of(channel) for channel in channels]], messages.times()
-    rate = asked.rate_hz or float(f"{1.0 / _usual_step(times):.4g}")
+    values = messages.wrench[:, [axis_of(channel) for channel in channels]]
+    rate = asked.rate_hz or float(f"{1.0 / _usual_step(messages.times):.4g}")
     samples = asked.samples or round(2.0 * rate)  # two seconds
-    cuts = list(_cut_stream(times, values, active, samples, trigger.quiet_s, asked.rate_hz))
+    cuts = list(_cut_stream(messages.times, values, active, samples, trigger.quiet_s, asked.rate_hz))
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
-    names = [f"{name}/{i}" for i in range(1, len(cuts) + 1)]
-    faults = [Fault(source, 0, cut.fault) for source, cut in zip(names, cuts, strict=True) if cut.fault]
-    traces = [None if cut.fault else cut.trace for cut in cuts]
+    insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
+    names = list(insertions)
     if asked.labels is not None:
-        told = labels.listed(asked.labels, asked.part, names)
+        told = labels.listed(asked.labels, asked.part, names, asked.words)
     elif asked.label is not None:
-        told = _told(asked.label, messages, cuts, names)
+        told = _told(asked, messages, cuts, names)
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
-    found = Collected(name, channels, faults)
-    labels.collect(zip(names, traces, repeat(None if asked.rate_hz else rate), strict=False), told, found)
+
+    def read(cut: Insertion) -> tuple[NDArray[np.float32], float | None]:
+        if cut.fault:
+            raise UnreadableError(cut.fault)
+        return cut.trace, None if asked.rate_hz else rate
+
+    found = Collected(name, channels)
+    labels.collect(insertions, read, told, found)
     return as_dataset(found, asked)
 
 
-def _told(topic: str, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:
+def _told(asked: Asked, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:
     """Labels from a topic: of each insertion the value that was told next, if it was before another one began."""
-    words: dict[str, Any] = {}
-    begins = [messages.logged[cut.first] for cut in cuts]
+    topic = str(asked.label)
+    words, begins = dict[str, Any](), messages.logged[[cut.first for cut in cuts]]
     for logged, word in messages.others[topic]:
-        place = int(np.searchsorted(begins, logged, side="right")) - 1
-        if place >= 0:
-            words.setdefault(names[place], word)
+        if before := int(np.searchsorted(begins, logged, side="right")):
+            words.setdefault(names[before - 1], word)
 
     def find(name: str) -> labels.Known:
         if name not in words:
             raise UnreadableError(f"Expected a message of {topic} before the next insertion begins, found none")
-        return labels.label_of(words[name]), None
+        return labels.label_of(words[name], asked.words), None
 
     return labels.Labels(find, f"give the topic that tells them, {topic} does not, or a file of labels")
 
 
-@dataclass(frozen=True, slots=True)
-class Insertion:
+class Insertion(NamedTuple):
     """One, cut out of a stream. trace : (C, T) float32.  first : its first message.  fault : why it is no trace, if any."""
 
     trace: NDArray[np.float32]
@@ -255,9 +238,7 @@ def _cut_stream(
             fault = "Expected the message that it begins with, that one fell into a gap"
         elif len(back) and not rate_hz:
             fault = f"Expected later times from message to message, sample {int(back[0]) + 1} is not later"
-        elif placed.missing:
-            fault = (
-                f"Expected a message each {step:.3g} s, {placed.missing} of {samples} are missing, the first at sample "
-                f"{placed.gaps[0][0]}"
-            )
+        elif len(placed.missing):
+            lost = f"{len(placed.missing)} of {samples} are missing, the first at sample {placed.missing[0]}"
+            fault = f"Expected a message each {step:.3g} s, {lost}"
         yield Insertion(placed.trace, i, fault)

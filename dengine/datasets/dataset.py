@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,9 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, expect
-from ..records import FITS, TraceSpec
-from ..traces import fits, fitted
+from ..errors import DataError, TraceError, expect
+from ..records import FITS, TraceSpec, in_html
+from ..traces import as_traces, fits, fitted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,17 +45,22 @@ class Fault:
 
 
 class UnreadableError(DataError):
-    """Why one recording is left out; becomes its `Fault`."""
+    """Why one recording is left out; becomes its `Fault`. line : of its file, 0 where it is the whole."""
 
     def __init__(self, what: str, line: int = 0) -> None:
         super().__init__(what)
-        self.what, self.line = what, line
-
-    def fault(self, source: str) -> Fault:
-        return Fault(source, self.line, self.what)
+        self.line = line
 
 
-@dataclass(frozen=True, slots=True)
+class UnknownWordError(UnreadableError):
+    """A label in a word that nobody said the meaning of."""
+
+    def __init__(self, word: str) -> None:
+        super().__init__(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
+        self.word = word
+
+
+@dataclass(frozen=True, slots=True, repr=False)
 class Dataset:
     """Labelled traces in the order they were recorded.
 
@@ -62,6 +68,7 @@ class Dataset:
     name, rate_hz, unit : for people.  cause : (n,) why a part failed, where that is known.
     part : (n,) the number of the part that each trace was recorded on; None: every trace is a part of its own.
     faults : what could not be read and was left out.  channels : the channels' names, where they have any.
+    notes : what was found about the files, and is no fault.
     source : (n,) the file, or row, that each trace came from.  fit : how other lengths became T, as in `TraceSpec`.
     lengths : (n,) samples as recorded.  rates : (n,) hertz, from each recording's own timestamps.
     """
@@ -79,9 +86,18 @@ class Dataset:
     fit: str = "strict"
     lengths: NDArray[np.int64] | None = None
     rates: NDArray[np.float64] | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.y)
+
+    def __repr__(self) -> str:
+        good, names = int(self.y.sum()), f" of {', '.join(self.channels)}" if self.channels else ""
+        form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {self.rate_hz:g} Hz"
+        known = f"{good} good, {len(self) - good} bad, {len(self.faults)} left out"
+        return f"<Dataset {self.name}: {len(self)} traces, {form}, {known}>"
+
+    _repr_html_ = in_html
 
     @property
     def spec(self) -> TraceSpec:
@@ -107,21 +123,9 @@ class Dataset:
         """The first `samples` samples of every trace: an earlier, harder moment to decide at."""
         have = self.X.shape[-1]
         must(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
-        if samples < have and self.fit == "resample":
-            raise DataError(f"The traces of {self.name} are resampled: give the samples where they are loaded.")
+        must(samples == have or self.fit != "resample", f"{have} samples of {self.name}, which was resampled", samples)
         fit = "cut" if samples < have and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
-
-
-def _real(X: ArrayLike) -> NDArray[np.float32]:
-    try:
-        array: NDArray[Any] = np.asarray(X)
-        if array.dtype.kind not in "cmMSU":
-            with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which the engine finds
-                return array.astype(np.float32, copy=False)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"Expected X of real numbers, (n, T) or (n, C, T), got something else: {error}.") from error
-    raise DataError(f"Expected X of real numbers, got dtype {array.dtype}.")
 
 
 def make_dataset(
@@ -135,14 +139,14 @@ def make_dataset(
     **about: Any,
 ) -> Dataset:
     """A `Dataset` from arrays; DataError where they do not fit together."""
-    X, y = _real(X), np.asarray(y)
-    must(X.ndim in (2, 3) and y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", (X.shape, y.shape))
+    try:
+        X, y = as_traces(X)[:, 0] if np.ndim(X) == 2 else as_traces(X), np.asarray(y)
+    except TraceError as error:
+        raise DataError(str(error)) from error
+    must(y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", (X.shape, y.shape))
     must(len(y) > 0, "at least one trace", 0)
-    if X.ndim == 3 and X.shape[1] > X.shape[2]:
-        raise DataError(
-            f"Expected X (n, channels, samples), got {X.shape[1]} channels of {X.shape[2]} samples, which looks "
-            "transposed; pass X.transpose(0, 2, 1)."
-        )
+    turned = X.ndim == 3 and X.shape[1] > X.shape[2]
+    must(not turned, "X (n, channels, samples)", X.shape, "it looks transposed; pass X.transpose(0, 2, 1)")
     must(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", sorted(set(map(str, y.tolist()))))
     must(0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
@@ -169,6 +173,9 @@ class Asked:
     rate_hz: float | None = None
     trigger: Any = None
     topic: str | None = None
+    time: str | None = None
+    unit: str | None = None
+    words: Mapping[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.label is not None and self.labels is not None:
@@ -203,16 +210,37 @@ class Collected:
     channels: tuple[str, ...]
     faults: list[Fault] = field(default_factory=list)
     read: list[Recorded] = field(default_factory=list)
+    encodings: Counter[str] = field(default_factory=Counter)  # of files that are not UTF-8
+    unknown: Counter[str] = field(default_factory=Counter)  # words for labels
+
+    def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
+        """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
+        try:
+            self.read.append(read())
+        except (OSError, TraceError, UnreadableError) as error:
+            if isinstance(error, UnknownWordError):
+                self.unknown[error.word] += 1
+            self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))
+
+    def must_mean_something(self) -> None:
+        """DataError where most labels are words that nobody said the meaning of."""
+        if sum(self.unknown.values()) <= len(self.read):
+            return
+        words = self.unknown.most_common()
+        got = ", ".join(f"{word[:20]!r} {n} times" for word, n in words[:4])
+        # The one with a syllable before it is more often the bad one; a person has to say so.
+        bad = {word for word, _ in words[:4] if any(word != other and word.endswith(other) for other, _ in words)}
+        said = [f"{word}={'bad' if word in bad or (i and not bad) else 'good'}" for i, (word, _) in enumerate(words[:4])]
+        do = f"say what they mean, label_map={','.join(said)!r} or the other way round"
+        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}; {do}.")
 
     def leave_out(self, why: Mapping[int, str]) -> None:
         """Make faults of those at these places; DataError where nothing is left."""
         self.faults.extend(Fault(self.read[i].source, 0, what) for i, what in why.items())
         self.read = [each for i, each in enumerate(self.read) if i not in why]
-        if not self.read and not self.faults:
-            raise DataError(f"Expected at least one trace in {self.name}, got none.")
         if not self.read:
-            few = f"found none of {len(self.faults)}: {'; '.join(map(str, self.faults[:3]))}"
-            raise DataError(f"Expected recordings that can be read in {self.name}, {few}.")
+            n, few = len(self.faults), "; ".join(map(str, self.faults[:3]))
+            raise DataError(f"Expected recordings that can be read in {self.name}, found none of {n}: {few}.")
 
 
 def as_dataset(found: Collected, asked: Asked) -> Dataset:
@@ -220,18 +248,20 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
 
     A recording at another rate than the others is another trace of the same insertion: it is a fault.
     """
-    known = {i: each.rate_hz for i, each in enumerate(found.read) if each.rate_hz is not None}
-    usual = max(known.values(), key=lambda one: sum(abs(rate - one) <= NEAR * one for rate in known.values()), default=0.0)
-    off = {i: rate for i, rate in known.items() if abs(rate - usual) > NEAR * usual}
-    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {r:g} Hz" for i, r in off.items()})
+    found.must_mean_something()
+    rates = np.array([each.rate_hz or np.nan for each in found.read])
+    known = rates[~np.isnan(rates)]
+    usual = max(known, key=lambda one: (np.abs(known - one) <= NEAR * one).sum(), default=0.0)
+    off = np.flatnonzero(np.abs(rates - usual) > NEAR * usual).tolist()
+    found.leave_out({i: f"Expected timestamps at {usual:g} Hz, as the others have, got {rates[i]:g} Hz" for i in off})
     lengths = np.array([each.trace.shape[1] for each in found.read], dtype=np.int64)
     fit, samples = form_of(lengths, asked.fit, asked.samples)
     stretch = samples / float(np.median(lengths)) if fit == "resample" else 1.0
     unfit = [i for i, have in enumerate(lengths.tolist()) if not fits(have, samples, FITS.index(fit))]
     found.leave_out({i: f"Expected {_wanted(samples, fit)}, got {lengths[i]}" for i in unfit})
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
-    rates = np.array([np.nan if each.rate_hz is None else each.rate_hz for each in found.read])
-    rate = asked.rate_hz or (float(np.nanmedian(rates)) if known else 500.0)
+    rates = np.array([each.rate_hz or np.nan for each in found.read])
+    rate = asked.rate_hz or (float(np.nanmedian(rates)) if len(known) else 500.0)
     # A recording without a part's number is of a part of its own.
     parts = [each.source if each.part is None else each.part for each in found.read]
     return make_dataset(
@@ -243,10 +273,11 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
         part=np.array(parts) if any(each.part is not None for each in found.read) else None,
         faults=tuple(found.faults),
         channels=found.channels,
-        unit=_unit_of(found.channels),
+        unit=asked.unit or _unit_of(found.channels),
+        notes=tuple(f"{n} file{'' if n == 1 else 's'} read as {name}, not UTF-8." for name, n in found.encodings.items()),
         source=np.array([each.source for each in found.read]),
         lengths=np.delete(lengths, unfit),
-        rates=rates if known else None,
+        rates=rates if len(known) else None,
     )
 
 
@@ -270,8 +301,12 @@ def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) ->
     if fit == "strict" and low != high:
         choose = "choose fit='pad', 'cut' or 'resample'"
         raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
-    if fit == "strict" and samples not in (None, low):
-        raise DataError(f"Expected {low} samples, as recorded, with fit='strict', got {samples}; choose fit='cut'.")
+    must(
+        fit != "strict" or samples in (None, low),
+        f"{low} samples, as recorded, with fit='strict'",
+        samples,
+        "choose fit='cut'",
+    )
     if samples is None:
         samples = int(lengths[2 * lengths >= median].min()) if fit == "cut" else median
     return fit, samples
@@ -279,12 +314,11 @@ def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) ->
 
 def refit(data: Dataset, asked: Asked) -> Dataset:
     """A data set whose traces have one length already, as it was asked for: its channels by name, its length, its rate."""
-    missing = [name for name in asked.channels if name not in data.channels]
-    if missing:
+    for name in (name for name in asked.channels if name not in data.channels):
         have = ", ".join(data.channels) or "none that has a name"
-        raise DataError(f"Expected the channel {missing[0]} in {data.name}, it has {have}.")
-    if asked.rate_hz is not None:
-        data = replace(data, rate_hz=asked.rate_hz)
+        raise DataError(f"Expected the channel {name} in {data.name}, it has {have}.")
+    if asked.rate_hz is not None or asked.unit is not None:
+        data = replace(data, rate_hz=asked.rate_hz or data.rate_hz, unit=asked.unit or data.unit)
     if asked.channels and data.X.ndim == 3:
         places = [data.channels.index(name) for name in asked.channels]
         X = np.ascontiguousarray(data.X[:, places[0]] if len(places) == 1 else data.X[:, places])
@@ -308,7 +342,6 @@ def _fitted(x: NDArray[np.float32], samples: int, fit: str) -> NDArray[np.float3
 
 
 def _wanted(samples: int, fit: str) -> str:
-    """How long a recording must be."""
     if fit == "cut":
         return f"at least {samples} samples"
     return f"{(samples + 1) // 2} to {2 * samples} samples, to {fit} them to {samples}"

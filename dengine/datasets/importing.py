@@ -11,33 +11,36 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..engine.decide import as_part
 from ..engine.engine import DataEngine
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, RetrainReport, TraceSpec, trace_in
-from ..store.base import Store
 from ..store.journal import Record, labelled
 from ..store.opening import UNHURRIED, opening
-from ..store.records import checked_decision
+from ..store.records import StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
 from .loading import TABLES
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 CHUNK = 500  # traces committed together
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
-def form_in(store: str | os.PathLike[str] | Store, source: Any) -> dict[str, Any]:
+def form_in(store: str | os.PathLike[str] | SqlStore, source: Any) -> dict[str, Any]:
     """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
@@ -59,10 +62,9 @@ def must_agree(data: Dataset, agreed: TraceSpec) -> None:
     spec = data.spec
     stretched = spec.fit != agreed.fit and "resample" in (spec.fit, agreed.fit)
     if data.lengths is not None and (stretched or spec.samples != agreed.samples):
-        raise TraceError(
-            f"Expected recordings brought to {agreed.samples} samples by {agreed.fit}, {data.name} was to {spec.samples} "
-            f"by {spec.fit}; load it with samples={agreed.samples}, fit={agreed.fit!r}, or what is known would count again."
-        )
+        do = f"load it with samples={agreed.samples}, fit={agreed.fit!r}, or what is known would count again"
+        wanted = f"recordings brought to {agreed.samples} samples by {agreed.fit}"
+        raise TraceError(f"Expected {wanted}, {data.name} was to {spec.samples} by {spec.fit}; {do}.")
     if not math.isclose(agreed.rate_hz, spec.rate_hz, rel_tol=RATE):
         raise TraceError(f"Expected traces at {agreed.rate_hz:g} Hz, {data.name} has {spec.rate_hz:g} Hz; resample it.")
     if data.channels and agreed.columns and data.channels != agreed.columns:
@@ -75,6 +77,7 @@ class ImportReport:
 
     cut : bytes of a journal's last line that was not finished, and was left out.
     contradicted : labels that say the opposite of what an earlier import took in, and were left out.
+    aside : what of a journal was set aside, in a sentence; "" where nothing was.
     """
 
     imported: int
@@ -83,10 +86,11 @@ class ImportReport:
     resumed: bool
     cut: int = 0
     contradicted: int = 0
+    aside: str = ""
 
 
 def import_labelled(
-    store: str | os.PathLike[str] | Store,
+    store: str | os.PathLike[str] | SqlStore,
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
@@ -104,68 +108,51 @@ def import_labelled(
     """
     data = load_dataset(dataset, **form_in(store, dataset))
     engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import)
-    counts = np.zeros(3, dtype=np.int64)
+    counts = Counter[str]()
     try:
         agreed = engine.agree_on(data.spec)
         must_agree(data, agreed)
-        gate, traces = TraceGate(agreed), as_traces(data.X, agreed)
-        own, decisions = _verified(traces, data)
+        gate, traces, kept = TraceGate(agreed), as_traces(data.X, agreed), engine.store
+        verified = list(zip(_verified(traces, data), traces, data.y, strict=True))
         for start in range(0, len(data), CHUNK):
-            part = slice(start, start + CHUNK)
-            counts += _import_chunk(engine.store, gate, traces[part], data.y[part], own[part], decisions[part])
+            records: list[Record] = []
+            for (own, decision), x, label in verified[start : start + CHUNK]:
+                if kept.get_decision(decision.id) is not None:
+                    counts["known"] += 1
+                    continue
+                fault = gate(torch.from_numpy(x))[0]
+                if fault:  # a bad one is kept, but never given to training
+                    decision = replace(decision, reason=REASONS[fault])
+                made = StoredDecision(decision, x.copy(), own, bool(fault), kept.clock())
+                records += labelled(made, label)
+                counts["quarantined" if fault else "imported"] += 1
+            kept.take(records)
             if on_traces is not None:
-                on_traces(len(decisions[part]))
+                on_traces(min(CHUNK, len(data) - start))
     finally:
-        if not isinstance(store, Store):
+        if isinstance(store, str | os.PathLike):
             engine.close()
-    imported, quarantined, known = counts.tolist()
-    return ImportReport(imported, quarantined, known, engine.resumed)
+    return ImportReport(counts["imported"], counts["quarantined"], counts["known"], engine.resumed)
 
 
-def train_until_done(
-    engine: DataEngine, retrains: int, on_retrain: Callable[[RetrainReport], None] | None = None
-) -> list[RetrainReport]:
+def train_until_done(engine: DataEngine, retrains: int) -> Iterator[RetrainReport]:
     """Retrain up to so many times: a reducer that learns in steps goes on from the last one, each within its budget.
 
-    Stops after the first where no steps are taken (UMAP, PCA), and where a candidate was dropped.
+    Ends after the first where no steps are taken (UMAP, PCA), and where a candidate was dropped.
     """
-    reports: list[RetrainReport] = []
     for _ in range(retrains):
-        reports.append(engine.retrain())
-        if on_retrain is not None:
-            on_retrain(reports[-1])
-        if not reports[-1].accepted or reports[-1].n_steps == 0:
-            break
-    return reports
+        yield (report := engine.retrain())
+        if not report.accepted or report.n_steps == 0:
+            return
 
 
-def _verified(traces: NDArray[np.float32], data: Dataset) -> tuple[NDArray[np.int64], list[Decision]]:
-    """The hashes (n,) that traces (n, C, T) go by, and the decisions that verified them, in the order of their file."""
-    times, own, decisions = Counter[int](), [], []
-    parts = [None] * len(data) if data.part is None else data.part.tolist()
+def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[tuple[int, Decision]]:
+    """For each of the traces (n, C, T) the hash that it goes by, and the decision that verified it."""
+    times = Counter[int]()
+    parts = [None] * len(data) if data.part is None else [as_part(part) for part in data.part.tolist()]
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
         id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
         times[hash_] += 1
-        own.append(own_hash(hash_, part))
         nothing = (0.0, 1.0, 0, 0, None, 0)
-        decisions.append(Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part))
-    return np.array(own, dtype=np.int64), decisions
-
-
-def _import_chunk(
-    store: Store,
-    gate: TraceGate,
-    traces: NDArray[np.float32],
-    labels: NDArray[np.int8],
-    own: NDArray[np.int64],
-    decisions: list[Decision],
-) -> tuple[int, int, int]:
-    """Numbers of traces imported, quarantined and known."""
-    faults = {i: gate(torch.from_numpy(traces[i]))[0] for i, d in enumerate(decisions) if store.get_decision(d.id) is None}
-    records: list[Record] = []
-    for i, fault in faults.items():  # a bad one is kept, but never given to training
-        decision = replace(decisions[i], reason=REASONS[fault]) if fault else decisions[i]
-        records += labelled(checked_decision(decision, traces[i], own[i], bool(fault), store.clock()), labels[i])
-    store.take(records)
-    bad = sum(map(bool, faults.values()))
-    return len(faults) - bad, bad, len(decisions) - len(faults)
+        decision = Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part)
+        yield own_hash(hash_, part), decision

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from .dataset import Collected, Fault, Recorded, UnreadableError
+from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
 from .text import read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
@@ -29,7 +30,10 @@ IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
 LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
 FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion")
 
+Words = Mapping[str, bool]
+NONE: Words = {}
 Known = tuple[int, str | None]  # a recording's label, and its part's number
+Read = Callable[[Any], tuple[NDArray[np.float32], float | None]]
 
 
 class Labels(NamedTuple):
@@ -44,18 +48,30 @@ class Labels(NamedTuple):
     faults: Sequence[Fault] = ()
 
 
-def label_of(word: Any) -> int:
-    """1 or 0; UnreadableError for a word that is neither."""
-    text = str(word).strip().lower().removesuffix(".0")
-    found = WORD.fullmatch(text)
+def label_of(word: Any, words: Words = NONE) -> int:
+    """1 or 0; words : of one's own, in lower case, and whether they are good. UnknownWordError for what is no label."""
+    text = str(word).strip().lower()
+    if text in words:
+        return int(words[text])
+    found = WORD.fullmatch(text.removesuffix(".0"))
     if found is None:
-        raise UnreadableError(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {str(word)[:20]!r}")
+        raise UnknownWordError(str(word).strip())
     return int((found[2] in GOOD) != bool(found[1]))
 
 
-def named(pattern: str | None = None) -> Labels:
+def meanings(told: Mapping[str, Any] | str | None) -> dict[str, bool]:
+    """`"i.O.=good,n.i.O.=bad"`, or a dict of words and labels: each word, in lower case, and whether it is good."""
+    pairs = told.items() if isinstance(told, Mapping) else [pair.rpartition("=")[::2] for pair in (told or "").split(",")]
+    words = {str(word).strip().lower(): str(label).strip().lower() for word, label in pairs if told}
+    for word, label in words.items():
+        must(bool(word) and WORD.fullmatch(label) is not None, "word=good or word=bad, with commas between", told)
+    return {word: bool(label_of(label)) for word, label in words.items()}
+
+
+def named(pattern: str | None = None, words: Words = NONE) -> Labels:
     """A label in the name: at the end of the file's, or as its folder's; or what a pattern's group finds in the path.
 
+    words : as of `label_of`.
     DataError for a pattern that is no regular expression with one group.
     """
     try:
@@ -67,17 +83,21 @@ def named(pattern: str | None = None) -> Labels:
 
     def find(name: str) -> Known:
         if expression is None:
-            return _usual(PurePosixPath(name)), None
+            return _usual(PurePosixPath(name), words), None
         match = expression.search(name)
         if match is None or match[1] is None:
             raise UnreadableError(f"Expected a label where the pattern {pattern} finds it, found none")
-        return label_of(match[1]), None
+        return label_of(match[1], words), None
 
     return Labels(find, "give the pattern of it in the path (label='_(OK|NOK)'), or a file of labels")
 
 
-def _usual(path: PurePosixPath) -> int:
+def _usual(path: PurePosixPath, words: Words) -> int:
     """What the name ends with, or a folder that it is in is called: in good/1.csv, and in 1/x_OK.csv, the 1 is a number."""
+    ends = [name.lower() for name in (path.stem, *path.parent.parts)]
+    for word in sorted(words, key=len, reverse=True):
+        if any(re.search(rf"(?:^|[_\- ]){re.escape(word)}$", end) for end in ends):
+            return int(words[word])
     found = IN_NAME.search(COPY.sub("", path.stem))
     folder = next((name for name in reversed(path.parent.parts) if WORD.fullmatch(name) and not name.isdecimal()), "")
     by_name = None if found is None else label_of(found[0].lstrip("_-. "))
@@ -101,39 +121,56 @@ class _Row(NamedTuple):
     part: str | None
 
 
-def listed(path: str | os.PathLike[str], part: str, names: Sequence[str]) -> Labels:
+def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words: Words = NONE) -> Labels:
     """A labels file: CSV with a column of files and one of labels. DataError where it cannot be read as one.
 
     A recording is listed by its path, its end, or longer by a folder; without suffix, in any case.
-    part : the column of parts' numbers.  names : of all recordings.
+    part : the column of parts' numbers.  names : of all recordings.  words : as of `label_of`.
     A file without a header, which names a .csv in its first line, has files, labels in this order.
     """
-    source = Path(path).name
-    rows, faults = _rows(path, part)
-    by_file, by_name = defaultdict[str, list[_Row]](list), defaultdict[str, list[str]](list)
+    source, (rows, faults) = Path(path).name, _rows(path, part)
+    ends = defaultdict[str, list[_Row]](list)  # by the file's name alone
     for row in rows:
-        by_file[row.words[0]].append(row)
-    for each in names:
-        by_name[_words(each)[0]].append(each)
+        ends[row.words[0]].append(row)
+    alike = {name: [row for row in ends[_words(name)[0]] if _alike(row.words, _words(name))] for name in names}
+    times = Counter(row for each in alike.values() for row in each)
+    lost = [row for row in rows if not times[row]]
+    faults += [Fault(source, row.line, f"Expected the name of a recording, found no file {row.file}") for row in lost]
 
     def find(name: str) -> Known:
-        words = _words(name)
-        found = [row for row in by_file[words[0]] if _alike(row.words, words)]
-        if not found:
+        if not alike[name]:
             raise UnreadableError(f"Expected a row of {source} that names it, found none")
-        row = max(found, key=lambda row: (row.words == words, len(row.words)))
-        others = [other for other in by_name[words[0]] if other != name and _alike(row.words, _words(other))]
-        if others and row.words != words:
-            raise UnreadableError(f"Expected its folder in {source}, line {row.line}, which names {others[0]} too")
+        row = max(alike[name], key=lambda row: (row.words == _words(name), len(row.words)))
+        if times[row] > 1 and row.words != _words(name):
+            raise UnreadableError(f"Expected its folder in {source}, line {row.line}, which names {times[row]} recordings")
         try:
-            return label_of(row.label), row.part
-        except UnreadableError as error:
-            raise UnreadableError(f"{error.what} in {source}, line {row.line}") from error
+            return label_of(row.label, words), row.part
+        except UnknownWordError as error:
+            error.args = (f"{error} in {source}, line {row.line}",)
+            raise
 
-    lost = [row for row in rows if not any(_alike(row.words, _words(name)) for name in by_name[row.words[0]])]
-    faults += [Fault(source, row.line, f"Expected the name of a recording, found no file {row.file}") for row in lost]
     few = ", ".join(row.file for row in rows[:3]) or "no files"
     return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
+
+
+def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
+    try:
+        table, faults = read_table(Path(path))
+    except (OSError, UnreadableError) as error:
+        raise DataError(f"Cannot read the labels in {path}: {error}.") from error
+    header, cells = list(table.columns), dict(zip(table.index, table.to_numpy().tolist(), strict=True))
+    if header[0].lower().endswith(".csv"):
+        header, cells = ["file", "label", *header[2:]], {1: header, **cells}
+    of_file, of_label = _columns(header, path)
+    if part != "part" and part not in header:
+        raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
+    rows: dict[tuple[str, ...], _Row] = {}
+    for line, said in cells.items():
+        number = said[header.index(part)] if part in header else ""
+        row = _Row(line, _words(said[of_file]), said[of_file], said[of_label], number or None)
+        if rows.setdefault(row.words, row) is not row:
+            faults.append(Fault(Path(path).name, line, f"Expected each file once, {row.file} came before"))
+    return list(rows.values()), faults
 
 
 def _words(path: str) -> tuple[str, ...]:
@@ -143,39 +180,18 @@ def _words(path: str) -> tuple[str, ...]:
 
 
 def _alike(one: Sequence[str], other: Sequence[str]) -> bool:
-    """Whether one of two paths, as `_words`, is the end of the other."""
     return all(a == b for a, b in zip(one, other, strict=False))
 
 
-def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
-    try:
-        table = read_table(Path(path))
-    except (OSError, UnreadableError) as error:
-        raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    header, cells, lines = table.header, table.rows, table.lines
-    if header[0].lower().endswith(".csv"):
-        cells, lines, header = [header, *cells], [1, *lines], ["file", "label", *header[2:]]
-    of_file, of_label = _columns(header, path)
-    if part != "part" and part not in header:
-        raise DataError(f"Expected a column {part} of parts' numbers in {path}, got {', '.join(header)}.")
-    rows: dict[tuple[str, ...], _Row] = {}
-    for line, said in zip(lines, cells, strict=True):
-        words = _words(said[of_file])
-        if words in rows:
-            what = f"Expected each file once, {said[of_file]} came before"
-            table.faults.append(Fault(Path(path).name, line, what))
-        else:
-            number = said[header.index(part)] if part in header else ""
-            rows[words] = _Row(line, words, said[of_file], said[of_label], number or None)
-    return list(rows.values()), table.faults
+def column_among(header: Sequence[str], known: Sequence[str]) -> int | None:
+    """Where the first of some known names stands in a header, in any case; None where none does."""
+    lower = [name.lower() for name in header]
+    return next((lower.index(name) for name in known if name in lower), None)
 
 
 def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, int]:
     """Where the files and where the labels are; of two columns, the first and the second, or the one that is left."""
-    lower = [name.lower() for name in header]
-    of_file, of_label = (
-        next((lower.index(name) for name in known if name in lower), None) for known in (FILE_COLUMNS, LABEL_COLUMNS)
-    )
+    of_file, of_label = column_among(header, FILE_COLUMNS), column_among(header, LABEL_COLUMNS)
     if len(header) == 2:
         of_file = of_file if of_file is not None else 0 if of_label is None else 1 - of_label
         of_label = 1 - of_file
@@ -185,23 +201,22 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
     return of_file, of_label
 
 
-def collect(read: Iterable[tuple[str, NDArray[np.float32] | None, float | None]], labels: Labels, found: Collected) -> None:
-    """Add recordings with their labels: of each its name, (C, T) and rate; a trace of None is a fault already."""
-    total = unlabelled = 0
+def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collected) -> None:
+    """Add recordings by name, with their labels. read : what is at a place: (C, T), and a rate where it has timestamps."""
+    unlabelled: list[str] = []
     found.faults.extend(labels.faults)
-    for name, trace, rate in read:
-        total += 1
+
+    def recorded(name: str, place: Any) -> Recorded:
         try:
             label, part = labels.find(name)
         except UnreadableError as error:
-            unlabelled += 1
-            if trace is not None:  # one reason a file is enough
-                found.faults.append(error.fault(name))
-            continue
-        if trace is not None:
-            found.read.append(Recorded(trace, label, name, part, rate))
-    if unlabelled > total / 2:
-        raise DataError(
-            f"Expected a label for each recording, {unlabelled} of {total} have none, {found.faults[-1].source} for one; "
-            f"{labels.advice}."
-        )
+            unlabelled.extend([] if isinstance(error, UnknownWordError) else [name])
+            raise
+        trace, rate = read(place)
+        return Recorded(trace, label, name, part, rate)
+
+    for name, place in places.items():
+        found.take(name, partial(recorded, name, place))
+    if len(unlabelled) > len(places) / 2:
+        none = f"{len(unlabelled)} of {len(places)} have none, {unlabelled[-1]} for one"
+        raise DataError(f"Expected a label for each recording, {none}; {labels.advice}.")

@@ -1,16 +1,16 @@
-"""Tables: a folder of CSV files, one an insertion; or a wide one, a row an insertion, as CSV, Parquet or a DataFrame.
+"""Tables: a folder of CSV files, one an insertion; one as CSV, Parquet or a DataFrame, wide, a row an insertion, or long.
 
 Columns `FZ_0 … FZ_999` of a wide table are a channel FZ, `0 … 999` or `x1 … x1000` one without need of a name; further
-channels have as many.
+channels have as many. A long table has a row a sample, as historians export it, and a column of parts.
 """
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
-from collections.abc import Iterator
-from importlib import import_module
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import must_fit, reading
+from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import floats, header_of, numbers, read_recording, read_table
+from .text import cells_of, decoded, floats, numbers, rate_of, read_recording, read_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,13 +39,41 @@ def read_folder(folder: Path, name: str, asked: Asked) -> Dataset:
     named = {p.as_posix(): path for p, path in seen.items() if not any(word.startswith(".") for word in p.parts)}
     if not named:
         raise DataError(f"Expected CSV files, one an insertion, in the folder {folder}, found none.")
-    ordered = {name: named[name] for name in sorted(named, key=natural)}
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
-    told = labels.named(asked.label) if asked.labels is None else labels.listed(asked.labels, asked.part, list(named))
-    found = Collected(name, asked.channels or _usual_channel(ordered, folder))
-    labels.collect(_recordings(ordered, found, timed=asked.rate_hz is None), told, found)
+    if asked.labels is None:
+        told = labels.named(asked.label, asked.words)
+    else:
+        told = labels.listed(asked.labels, asked.part, list(named), asked.words)
+    found = Collected(name, asked.channels or _usual_channel(named.values(), folder))
+    ordered = {name: named[name] for name in sorted(named, key=natural)}
+    read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
+    try:
+        labels.collect(ordered, read, told, found)
+    except DataError as error:
+        if asked.label or asked.labels or (listing := _listing(named)) is None:
+            raise
+        advice = f"{listing.name} names files; give it, labels={str(listing)!r}"
+        raise DataError(f"Expected labels in {folder}: {advice}.") from error
     return as_dataset(found, asked)
+
+
+def _header(path: Path, lines: int = 1) -> list[list[str]]:
+    """The cells of a file's first lines; none where they cannot be read, which is said when the whole file is."""
+    with suppress(OSError, UnreadableError), path.open("rb") as file:
+        text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:lines]))
+        return list(cells_of(text).values())
+    return []
+
+
+def _listing(named: Mapping[str, Path]) -> Path | None:
+    """The file whose second line names another one, as a file of labels does."""
+    stems = {path.stem.lower() for path in named.values()}
+    for path in named.values():
+        words = {word.lower().removesuffix(".csv") for row in _header(path, 2)[1:] for word in row}
+        if words & (stems - {path.stem.lower()}):
+            return path
+    return None
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -54,52 +82,34 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
 
-def _usual_channel(paths: dict[str, Path], folder: Path) -> tuple[str, ...]:
+def _usual_channel(paths: Iterable[Path], folder: Path) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
-    headers = Counter(_header(path) for path in paths.values() if os.access(path, os.R_OK))
-    if not headers or any(FORCE.lower() in map(str.lower, header) for header in headers):
+    headers = [tuple(name for name in row if name and not is_time(name)) for path in paths for row in _header(path)]
+    if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
-    usual = headers.most_common(1)[0][0]
+    usual = Counter(headers).most_common(1)[0][0]
     if len(usual) != 1:
         have = ", ".join(usual) or "none"
-        raise DataError(f"Expected the channel to be named, as in channel={FORCE!r}; the columns of {folder} are {have}.")
+        first = usual[0] if usual else FORCE
+        raise DataError(f"Expected the channel to be named, as in channel={first!r}; the columns of {folder} are {have}.")
     return usual
 
 
-def _header(path: Path) -> tuple[str, ...]:
-    """The channels' names in a file's first line."""
-    with path.open("rb") as file:
-        line = file.readline(2**20).decode("utf-8-sig", errors="replace").rstrip("\r\n")
-    try:
-        return tuple(name for name in header_of(line)[0] if name and not is_time(name))
-    except UnreadableError:  # said when the whole file is read
-        return ()
-
-
-def _recordings(paths: dict[str, Path], found: Collected, timed: bool) -> Iterator[tuple[str, Any, float | None]]:
-    for name, path in paths.items():
-        try:
-            yield name, *read_recording(path, found.channels, timed)
-        except (OSError, UnreadableError) as error:
-            found.faults.append(Fault(name, getattr(error, "line", 0), str(error)))
-            yield name, None, None
-
-
 def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
-    """One wide CSV file with a header."""
+    """One CSV file with a header."""
     import pandas as pd
 
+    encodings = Counter[str]()
     try:
-        table = read_table(path)
-        told = pd.Series([word for word in table.header if not word.isdecimal()], dtype=object)
-        if 2 * (len(told) - len(floats(told)[1])) > len(table.header) > 2:
-            raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
-        if not table.rows:
-            raise DataError(f"Expected rows that can be read in {path}, found none.")
-        frame = pd.DataFrame(table.rows, columns=table.header)
+        frame, faults = read_table(path, encodings)
     except UnreadableError as error:
-        raise DataError(f"Cannot read {path}: {error.fault(path.name)}.") from error
-    return from_frame(frame, asked, name, path.name, table.faults, table.lines)
+        raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
+    told = pd.Series([word for word in frame.columns if not word.isdecimal()], dtype=object)
+    if 2 * (len(told) - len(floats(told)[1])) > len(frame.columns) > 2:
+        raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
+    if frame.empty:
+        raise DataError(f"Expected rows that can be read in {path}, found none.")
+    return from_frame(frame, asked, name, path.name, faults, encodings)
 
 
 def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
@@ -107,11 +117,6 @@ def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
     import pandas as pd
 
     with reading(path, "a Parquet file", "pyarrow", "files"):
-        parquet: Any = import_module("pyarrow.parquet")  # untyped
-        with parquet.ParquetFile(path) as file:
-            about = file.metadata
-        groups = (about.row_group(i).total_byte_size for i in range(about.num_row_groups))
-        must_fit(max(float(sum(groups)), 8.0 * about.num_rows * about.num_columns), path)  # as claimed, or the cells alone
         frame = pd.read_parquet(path)
     return from_frame(frame, asked, name, path.name)
 
@@ -121,53 +126,110 @@ def from_frame(
     asked: Asked,
     name: str = "data",
     source: str = "row",
-    faults: list[Fault] | None = None,
-    lines: list[int] | None = None,
+    faults: Sequence[Fault] | None = None,
+    encodings: Counter[str] | None = None,
 ) -> Dataset:
-    """A wide table in memory. lines : where each row stands in its file; None: rows count from 1.
+    """A table in memory. faults, encodings : of its file, whose lines are its index; None: rows count from 1.
 
     An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
     a shorter trace. A row with text in it, or no label, is a fault.
     """
+    import pandas as pd
+
     frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
+    frame = frame.set_axis(range(1, len(frame) + 1)) if faults is None else frame
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
         raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
+    found = Collected(name, (), list(faults or []), encodings=encodings or Counter())
+    if asked.time is not None or asked.labels is not None:
+        return _from_long(frame, asked, found, source)
     label = _label_column(frame, asked)
     if asked.part != "part" and asked.part not in frame:
         raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
-    wrong: dict[int, str] = {}
-    channels, traces = _traces(frame.drop(columns=[c for c in (label, asked.part) if c in frame]), asked, wrong)
-    found = Collected(name, tuple(n for n in channels if n), list(faults or []))
-    lines = lines or list(range(1, len(frame) + 1))
-    for i, (word, part) in enumerate(zip(frame[label].tolist(), _parts(frame, asked.part), strict=True)):
-        try:
-            if i in wrong:
-                raise UnreadableError(wrong[i])
-            found.read.append(Recorded(traces[i], labels.label_of(word), f"{source}, line {lines[i]}", part))
-        except UnreadableError as error:
-            found.faults.append(Fault(source, lines[i], error.what))
+    columns = _sample_columns([name for name in frame.columns if name not in (label, asked.part)], asked)
+    blocks, wrong = [], dict[int, str]()
+    for names in columns.values():
+        values, odd = numbers(frame[names])
+        blocks.append(values)
+        wrong = odd | wrong
+    found.channels = tuple(filter(None, columns))
+    words = frame[label].tolist()
+    parts = frame.get(asked.part, pd.Series("", frame.index)).astype(object).fillna("")
+
+    def recorded(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recorded:
+        if line in wrong:
+            raise UnreadableError(wrong[line])
+        number = str(part).removesuffix(".0").strip() or None
+        return Recorded(_ended(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
+
+    for row in zip(frame.index, np.stack(blocks, axis=1), words, parts, strict=True):
+        found.take(source, partial(recorded, *row), row[0])
     return as_dataset(found, asked)
 
 
-def _traces(frame: pd.DataFrame, asked: Asked, wrong: dict[int, str]) -> tuple[tuple[str, ...], list[NDArray[np.float32]]]:
-    """The channels' names, and of each row (C, T): a row whose last cells are empty is a shorter trace."""
-    columns = _sample_columns(list(frame.columns), asked)
-    found = [numbers(frame[names]) for names in columns.values()]
-    for what in (what for _, faults in found for what in faults.items()):
-        wrong.setdefault(*what)
-    block = np.stack([values for values, _ in found], axis=1)
-    known: NDArray[np.bool_] = np.asarray(~np.isnan(block).all(axis=1))
-    ends = np.where(known.any(axis=1), block.shape[2] - np.argmax(known[:, ::-1], axis=1), block.shape[2])
-    return tuple(columns), [row[:, :end] for row, end in zip(block, ends.tolist(), strict=True)]
+def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> Dataset:
+    """A row a sample: the rows of a part, by their times, are one insertion. A label is a column, or in a file of parts."""
+    time = asked.time or next((name for name in frame.columns if is_time(name)), "")
+    for name in (asked.part, time):
+        if name not in frame:
+            wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
+            raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+    label = None if asked.labels is not None else _label_column(frame, asked)
+    left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
+    found.channels = _chosen(left, asked)
+    times, odd = floats(frame[time])
+    frame = frame.assign(**{time: frame[time] if odd else times})
+    parts = {str(part): rows for part, rows in frame.groupby(asked.part, sort=False)}
+
+    def read(rows: pd.DataFrame) -> tuple[NDArray[np.float32], float | None]:
+        values, wrong = numbers((rows := rows.sort_values(time, kind="stable"))[list(found.channels)])
+        if wrong:
+            raise UnreadableError(wrong[min(wrong)], min(wrong))
+        return np.ascontiguousarray(values.T), None if asked.rate_hz else rate_of(rows, time)
+
+    def find(part: str) -> labels.Known:
+        words = parts[part][label].dropna().unique().tolist()
+        if len(words) != 1:
+            raise UnreadableError(f"Expected one label in column {label}, got {listed(words) or 'none'}")
+        return labels.label_of(words[0], asked.words), None
+
+    if asked.labels is None:
+        told = labels.Labels(find, "name the column of labels (label)")
+    else:
+        told = labels.listed(asked.labels, "part", list(parts), asked.words)
+    labels.collect(parts, read, told, found)
+    return as_dataset(found, asked)
 
 
-def _parts(frame: pd.DataFrame, column: str) -> list[str | None]:
-    """Parts' numbers as text; None where there is none."""
-    if column not in frame:
-        return [None] * len(frame)
-    words = frame[column].astype("object").where(frame[column].notna(), "").tolist()
-    return [str(part).removesuffix(".0").strip() or None for part in words]
+def _long_columns(frame: pd.DataFrame) -> str:
+    """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
+    numbered = Counter(found[1] for name in frame.columns if (found := NUMBERED.fullmatch(name)))
+    time = next((name for name in frame.columns if is_time(name)), None)
+    changes = {name: int((frame[name] != frame[name].shift()).sum()) for name in frame.columns if name != time}
+    few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
+    if time is None or not few or max(numbered.values(), default=0) > 2:
+        return ""
+    part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
+    told = f"label={label!r}" if label != part else "labels='labels.csv', a file of parts and labels"
+    return f"the columns that tell which part it is, when, and the label, as in part={part!r}, time={time!r} and {told}"
+
+
+def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
+    """The channels that were asked for, the force, or the only one; DataError for one that is not there, or several."""
+    chosen = asked.channels or ((FORCE,) if FORCE in have else tuple(have))
+    missing = [name for name in chosen if name not in have]
+    if missing or not chosen:
+        raise DataError(f"Expected the channel {listed(missing) or 'of the samples'}, found {listed(have) or 'none'}.")
+    if not asked.channels and len(chosen) > 1:
+        raise DataError(f"Expected the channel to be named, as in channel={chosen[0]!r}; there are {listed(have)}.")
+    return chosen
+
+
+def _ended(trace: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(C, T) without the last samples that no channel has; whole where there is none at all."""
+    known = np.flatnonzero(~np.isnan(trace).all(axis=0))
+    return trace[:, : known[-1] + 1] if len(known) else trace
 
 
 def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
@@ -175,11 +237,12 @@ def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
         if asked.label not in frame:
             raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
-    lower = {c.lower(): c for c in frame.columns}
-    for known in labels.LABEL_COLUMNS:
-        if known in lower:
-            return str(lower[known])
-    if any(is_time(c) for c in frame.columns):
+    found = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
+    if asked.time is None and (advice := _long_columns(frame)):
+        raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
+    if found is not None:
+        return str(frame.columns[found])
+    if asked.time is None and any(is_time(name) for name in frame.columns):
         raise DataError(f"Expected a row an insertion, got {listed(frame.columns)}, as in one recording; give its folder.")
     raise DataError(f"Expected a column of labels, y or label, found {listed(frame.columns)}; name it: label='...'.")
 
@@ -199,13 +262,7 @@ def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
         for i in np.flatnonzero(steps != np.median(steps))[:1].tolist():
             after = f"after {those[i][1]} comes {those[i + 1][1]}"
             raise DataError(f"Expected columns that are numbered one by one, {after}.")
-    missing = [name for name in asked.channels if name not in several]
-    if missing:
-        raise DataError(f"Expected the channel {missing[0]}, in columns {missing[0]}_0 and so on, found {listed(several)}.")
-    if not asked.channels and FORCE not in several and len(several) > 1:
-        one = next(iter(several))
-        raise DataError(f"Expected the channel to be named, as in channel={one!r}; there are {listed(several)}.")
-    chosen = asked.channels or ((FORCE,) if FORCE in several else tuple(several))
+    chosen = _chosen(list(several), asked)
     if len({len(several[name]) for name in chosen}) > 1:
         each = ", ".join(f"{name} {len(several[name])}" for name in chosen)
         raise DataError(f"Expected as many samples of each channel, got {each}.")

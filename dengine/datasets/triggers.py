@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,23 +18,15 @@ from ..errors import SettingError, shortened
 
 Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
 Active = NDArray[np.bool_]
-Gaps = tuple[tuple[int, int], ...]
 NEAR = 1.5  # steps: to the next sample, when none is missing
 
 
 SIZE = r"(?=.*[1-9])\d+(\.\d+)?"  # a number above zero
+BITS, REGISTER = "actual_digital_output_bits", "output_int_register_25"
 # Pattern of the number; the number, signal and quiet_s of one that says nothing else; whether it is on, of signals (1, n).
 KINDS: dict[str, tuple[str, float | None, str, float, Callable[[Any, Any], Any]]] = {
-    "bit": (
-        r"[012]?\d|3[01]",
-        *(None, "actual_digital_output_bits", 0.0),
-        lambda held, bit: held[0].astype(np.uint64) >> np.uint64(bit) & np.uint64(1) != 0,
-    ),
-    "register": (
-        r"(-?\d+)?",
-        *(None, "output_int_register_25", 0.0),
-        lambda held, value: held[0] != 0 if value is None else held[0] == value,
-    ),
+    "bit": (r"[012]?\d|3[01]", None, BITS, 0.0, lambda held, bit: held[0].astype(np.int64) >> int(bit) & 1 != 0),
+    "register": (r"(-?\d+)?", None, REGISTER, 0.0, lambda held, n: held[0] != 0 if n is None else held[0] == n),
     "contact": (SIZE, None, "FZ_Base", 0.2, lambda held, newtons: np.abs(held[0]) >= newtons),
     "motion": (f"({SIZE})?", 0.002, "actual_TCP_speed", 0.1, lambda v, speed: np.linalg.norm(v, axis=0) > speed),
 }
@@ -83,21 +75,18 @@ def as_trigger(asked: Any) -> Trigger:
     return Trigger(kind, float(number) if number else usual, signal or usually, quiet_s)
 
 
-@dataclass(frozen=True, slots=True)
-class Placed:
-    """A window of a stream. trace : (C, T) float32, NaN where no sample came.  missing, repeated : samples.
+class Placed(NamedTuple):
+    """A window of a stream.
 
-    gaps : (first, length) of each stretch without samples.
+    trace : (C, T) float32, NaN where no sample came.  missing : (m,) the places of these.  repeated : samples.
     """
 
     trace: NDArray[np.float32]
-    missing: int
+    missing: NDArray[np.int64]
     repeated: int
-    gaps: Gaps
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+class Start(NamedTuple):
     """Where an insertion begins. time : seconds.  seen : its first sample came; False: at `time`, or later in a gap."""
 
     time: float
@@ -141,12 +130,4 @@ def place(times: Sequence[float], values: NDArray[np.float64], start: float, sam
     places, first = np.unique(at[inside], return_index=True)
     with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
         trace[:, places] = values[inside][first].T
-    there = np.zeros(samples, dtype=np.bool_)
-    there[places] = True
-    return Placed(trace, samples - len(places), int(inside.sum()) - len(places), gaps_of(there))
-
-
-def gaps_of(there: NDArray[np.bool_]) -> Gaps:
-    """(first, length) of each stretch that is not there."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], there, [True]]).astype(np.int8)))
-    return tuple((int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True))
+    return Placed(trace, np.setdiff1d(np.arange(samples), places), int(inside.sum()) - len(places))

@@ -5,7 +5,6 @@ from .intervals import clopper_pearson_interval as clopper_pearson_interval
 from .intervals import jeffreys_interval as jeffreys_interval
 from .intervals import wilson_interval as wilson_interval
 from .policy import RULES as RULES
-from .policy import Neighbourhood as Neighbourhood
 from .policy import Policy as Policy
 from .references import RadiusIndex as RadiusIndex
 from .rule import DecisionRule as DecisionRule

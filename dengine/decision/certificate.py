@@ -5,8 +5,9 @@
 
 With probability 1 - alpha the bound is, at all moments together (anytime-valid), at or above the mean of the failure
 probabilities that the parts so far really had. These may differ and drift; the model may be retrained, and its rule may
-learn from every outcome. Assumed: an audit's coin falls with the stated probability whatever the part is, and every audit's
-outcome is reported (a lost one must count as bad). It speaks of parts past, not of those to come.
+learn from every outcome. Assumed: an audit's coin falls with the stated probability whatever the part is. An audit whose
+outcome is owed for too long (`Policy.label_within`) counts as bad until it is reported, so that none that is lost makes the
+bound smaller; a younger one is left out as yet. It speaks of parts past, not of those to come.
 
 The evidence is an e-process, the capital of a bettor. He starts with 1 and bets the same b on every part, that it will be
 good. With x = 1 for a bad part that was looked at, else 0,
@@ -25,33 +26,24 @@ Sources: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures ov
 """
 
 import math
-from bisect import bisect_left
 from dataclasses import dataclass, replace
 
 from ..errors import expect, percent
 
-ENDLESS = 10**8  # more audits than that are none
+BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # for any rate; never 1, by which one bad part would lose all for ever
 
 
-def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0, bets: list[float] | None = None) -> float:
+def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
     """Log capital of a mixture of constant bets that the mean failure probability of n parts is below `tolerance`.
 
     n : parts, looked at or not.  n_bad : those of them that were looked at and were bad.  tolerance : in [0, 1].
     propensity : in (0, 1], with which each part was looked at. Where it changed, the smallest: that is on the safe side.
-    bets : in (0, 1), fixed beforehand; None: a grid for any rate. Few are sharper where the rate is about known.
-    Compiles to TorchScript.
     """
-    if bets is None:
-        bets = [0.05, 0.1, 0.2, 0.4, 0.7, 0.98]  # never 1: one bad part would lose all for ever
     rate = propensity * tolerance
-    logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in bets]
+    logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in BETS]
     top = max(logs)
-    capital = 0.0
-    weights = 0.0  # summed in the same order, so that no parts are no evidence, exactly
-    for bet, log in zip(bets, logs):  # noqa: B905  strict is not TorchScript
-        capital += bet * math.exp(log - top)
-        weights += bet
-    return top + math.log(capital / weights)
+    capital = sum(bet * math.exp(log - top) for bet, log in zip(BETS, logs, strict=True))
+    return top + math.log(capital / sum(BETS))
 
 
 def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> float:
@@ -75,6 +67,36 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     return high  # the refuted end: rounding widens
 
 
+def cusum(share: float, parts: float) -> tuple[int, int]:
+    """(step, limit) of the detector that notices twice a share of wrong parts soonest, with few false alarms.
+
+    A wrong part adds `step` to a sum, a right one takes 1 from it, and it begins anew at 0 wherever it falls below (Page,
+    1954, Biometrika 41; that this is soonest: Moustakides, 1986, Annals of Statistics 14). At `limit` it alarms: after
+    `parts` on average or later, wherever each part is wrong with probability `share`, below 0.5, or less given the past.
+    """
+    twice = min(2.0 * share, 0.99)
+    step = max(1, round(math.log(twice / share) / math.log((1.0 - share) / (1.0 - twice))))
+    limit, least = 1, 1
+    while _run_length(share, step, limit) < parts:
+        least, limit = limit, 2 * limit
+    while limit - least > 1:
+        middle = (least + limit) // 2
+        least, limit = (middle, limit) if _run_length(share, step, middle) < parts else (least, middle)
+    return step, limit
+
+
+def _run_length(share: float, step: int, limit: int) -> float:
+    """Mean number of parts until the alarm, from a sum of 0: exact (Brook and Evans, 1972, Biometrika 59)."""
+    # From the sum s it is a[s] + b[s] t, where t is that from the largest sum: downwards, and at 0 the equation for t.
+    a, b = [0.0] * (limit + step), [0.0] * (limit + step)  # 0 at and beyond the limit
+    b[limit - 1] = 1.0
+    for s in range(limit - 1, 0, -1):
+        a[s - 1] = (a[s] - 1.0 - share * a[s + step]) / (1.0 - share)
+        b[s - 1] = (b[s] - share * b[s + step]) / (1.0 - share)
+    t = (1.0 + share * (a[step] - a[0])) / (share * (b[0] - b[step]))
+    return a[0] + b[0] * t
+
+
 @dataclass(frozen=True, slots=True)
 class Outcomes:
     """How many parts the model was certain of since the policy's settings last changed, and what became of them.
@@ -84,6 +106,7 @@ class Outcomes:
     audited_rejects, audited_rejects_good : checked though the model would have rejected, and the good ones of them.
     forgotten_accepts, forgotten_audited_accepts, forgotten_audited_rejects : those whose label was forgotten, which are in
         none of the counts of labels above.
+    overdue_audited_accepts, overdue_audited_rejects : audits that were not reported in time, in none of the counts above.
     """
 
     accepted: int = 0
@@ -97,6 +120,8 @@ class Outcomes:
     forgotten_accepts: int = 0
     forgotten_audited_accepts: int = 0
     forgotten_audited_rejects: int = 0
+    overdue_audited_accepts: int = 0
+    overdue_audited_rejects: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,26 +141,6 @@ class Bounded:
     alpha: float
     upper: float
     shadowed: bool = False
-
-    @property
-    def bad_rate(self) -> float:
-        """Share of those looked at that were decided wrongly; 0 where none was looked at."""
-        return self.n_bad / max(1, self.n_looked_at)
-
-    def audits_needed(self, target: float, bad_rate: float = 0.0) -> int | None:
-        """About how many more outcomes, of which `bad_rate` are bad, would bring the bound to `target`; None: no number.
-
-        Where nobody looks it counts from now on, as if one part in fifty were audited.
-        """
-        expect(0.0 < target < 1.0, "0 < target < 1", target, "0.05 asks for at most 5 % bad")
-        n, propensity = (self.n, self.propensity) if self.propensity > 0.0 else (0, 0.02)
-
-        def reached(more: int) -> bool:
-            n_bad = self.n_bad + math.ceil(bad_rate * more - 1e-9)
-            return log_evidence(n + int(more / propensity), n_bad, target, propensity) >= math.log(1.0 / self.alpha)
-
-        found = bisect_left(range(ENDLESS), True, key=reached)
-        return None if found == ENDLESS else found
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,21 +173,6 @@ class Certificate:
         unknown = "nobody looks at what is rejected: set audit_rate"
         return self._sentence(self.rejected, "rejected without a check", "reject", "good", unknown)
 
-    @property
-    def advice(self) -> str:
-        """How many more audits the tolerance takes, or where it is kept, half of it; the parts being accepted ones."""
-        what = "parts" if self.accepted.propensity == 1.0 else "audits"
-        target = self.tolerance / 2.0 if self.kept else self.tolerance
-        good, same = (self.accepted.audits_needed(target, rate) for rate in (0.0, self.accepted.bad_rate))
-        if self.accepted.upper <= target:
-            return f"Even {percent(target, '.6g')} is shown."
-        if good is None:
-            return f"No number of {what} would show {percent(target, '.6g')}."
-        asked = f"To show {percent(target, '.6g')} takes about {good:,} more {what} if all are good"
-        if self.accepted.n_bad == 0:
-            return f"{asked}."
-        return f"{asked}; at the present rate {'no number would do' if same is None else f'about {same:,}'}."
-
     def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
         parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
         if bounded.n == 0:
@@ -213,17 +203,20 @@ def certify(outcomes: Outcomes, alpha: float, tolerance: float, stops: str, audi
     Under "some" the bound comes from audits and is about all parts the model would have accepted, let go or audited. It
     never lies below the share known to be bad. A cell that confirmed or stopped every accepted part knows as much as under
     "all". Where both are possible they share alpha: whoever sees now the one and now the other is wrong with probability
-    alpha at most. Rejected parts are known by audits alone. A label that was forgotten counts as a wrong decision.
+    alpha at most. Rejected parts are known by audits alone. A label that was forgotten, or is overdue, counts as a wrong
+    decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")
+    lost_accepts = outcomes.forgotten_audited_accepts + outcomes.overdue_audited_accepts
+    lost_rejects = outcomes.forgotten_audited_rejects + outcomes.overdue_audited_rejects
     o = replace(
         outcomes,
         stops=outcomes.stops + outcomes.forgotten_accepts,
-        audited_accepts=outcomes.audited_accepts + outcomes.forgotten_audited_accepts,
-        audited_accepts_bad=outcomes.audited_accepts_bad + outcomes.forgotten_audited_accepts,
-        audited_rejects=outcomes.audited_rejects + outcomes.forgotten_audited_rejects,
-        audited_rejects_good=outcomes.audited_rejects_good + outcomes.forgotten_audited_rejects,
+        audited_accepts=outcomes.audited_accepts + lost_accepts,
+        audited_accepts_bad=outcomes.audited_accepts_bad + lost_accepts,
+        audited_rejects=outcomes.audited_rejects + lost_rejects,
+        audited_rejects_good=outcomes.audited_rejects_good + lost_rejects,
     )
     share = 1.0 if stops == "all" or audit_rate == 0.0 else 0.1  # of alpha: audits see less and need more
     if stops == "all" or 0 < o.accepted == o.stops + o.confirmed:

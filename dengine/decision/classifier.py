@@ -12,7 +12,7 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ..records import ACTIONS
-from .policy import Neighbourhood, Policy
+from .policy import Policy, check_neighbourhood
 from .references import Counts, RadiusIndex
 from .rule import DecisionRule, RadiusNeighbours
 
@@ -22,7 +22,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     radius : of the ball around a query, in the units of the embedding, surface included.
     alpha, lower_bound, interval : as in `Policy`.
-    fraction, reject_fraction : as in `Neighbourhood`: a ball that grows to a share of the store instead.
+    fraction, reject_fraction : as in `check_neighbourhood`: a ball that grows to a share of the store instead.
     capacity : references held at most; the oldest leave first, blind to labels.
 
     The larger of two classes is the success (1 of 0 and 1). `predict` never abstains, an empty ball has probability 0.5;
@@ -96,13 +96,17 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def policy(self) -> Policy:
         """The user's numbers among the settings; SettingError where one of all is out of range."""
-        Neighbourhood(self.radius, self.fraction, self.reject_fraction)
+        check_neighbourhood(self.radius, self.fraction, self.reject_fraction)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
-    def around(self, index: RadiusIndex, rule: DecisionRule | None = None) -> RadiusNeighbours:
-        """What decides over the points of `index`, by these settings; `rule` in place of the policy's own."""
+    def around(self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False) -> RadiusNeighbours:
+        """What decides over the points of `index`, by these settings; `rule` in place of the policy's own.
+
+        scored : whether the first axis is a probability of success, which a rule that only sorts takes for its score.
+        """
         rule = rule or self.policy().rule()
-        return RadiusNeighbours(index.ring, rule, self.radius, self.fraction or 0.0, self.reject_fraction or 0.0)
+        near = self.radius, self.fraction or 0.0, self.reject_fraction or 0.0
+        return RadiusNeighbours(index, rule, *near, scored and rule.sorts)
 
     def _start(self, dim: int) -> None:
         self.index_ = RadiusIndex(dim, self.capacity)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import SettingError, expect
-from ..records import ACTIONS, Action, find_class, is_number
+from ..records import ACTIONS, Action, find_class, is_number, is_whole
 from .certificate import Certificate, Outcomes, certify
-from .intervals import INTERVALS, Bounds, normal_quantile
+from .intervals import INTERVALS, Bounds, level_of, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
@@ -35,8 +34,12 @@ class Policy:
         own. "local", the paper's, speaks of the ball around one trace, "pooled" of all parts together: see `rule`.
     stops : "all" where every bad accepted part stops the system and is reported before the next decision: then silence
         until that decision confirms the part. "some", the default, where silence says nothing.
-    audit_rate : share of certain decisions that are verified all the same, in [0, 1]; a guarantee on rejects needs it.
+    audit_rate : share of certain decisions that are verified all the same, in [0, 1]; a guarantee on rejects needs it, and
+        so does "pooled" where not all stops are known.
     shadow : the shadow mode: everything is verified, and the model only says what it would have done.
+    label_within : decisions within which a verification or an audit is reported, at least 1; what is owed for longer counts
+        as a wrong decision, in the certificate and in the evidence of a rule, until it is reported. Decisions, and not
+        seconds: a cell that stands still owes nothing by that, and a replay repeats.
     Raises SettingError for a value out of its range.
     """
 
@@ -47,6 +50,7 @@ class Policy:
     guarantee: str = "local"
     stops: Stops = "some"
     shadow: bool = False
+    label_within: int = 1000
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
@@ -61,11 +65,25 @@ class Policy:
         expect(known, f"a guarantee among {', '.join(RULES)}, or module:Class", self.guarantee)
         expect(self.stops in get_args(Stops), f"stops {' or '.join(get_args(Stops))}", self.stops)
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
+        expect(is_whole(self.label_within, 1, 10**9), "label_within of at least one decision", self.label_within)
+        if self.guarantee == "pooled" and self.stops == "some" and self.audited_share == 0.0:
+            raise SettingError(
+                "Expected audits, or stops='all', beside the pooled guarantee, which can claim nothing of parts that "
+                "nobody hears of; set audit_rate=0.1, or stops='all' where every bad accepted part stops the system."
+            )
 
     @property
     def audited_share(self) -> float:
         """Share of certain decisions that are verified all the same: all of them in the shadow mode."""
         return 1.0 if self.shadow else self.audit_rate
+
+    @property
+    def known_share(self) -> float:
+        """Probability with which the outcome of a certain decision is known; 1 of rejects, too, where all stops are.
+
+        Nothing is claimed of rejects there: few audits would keep them shut for hundreds of parts.
+        """
+        return 1.0 if self.stops == "all" else self.audit_rate or 1.0
 
     def rule(self) -> DecisionRule:
         """A new rule by these settings, which has been told nothing yet. SettingError where its class cannot be found."""
@@ -75,8 +93,9 @@ class Policy:
         found = find_class(self.guarantee) if own is None else getattr(rule, own[self.stops])
         if not issubclass(found, rule.DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
+        rate = {"rate": self.known_share} if issubclass(found, rule.PooledRule) else {}
         try:
-            made: DecisionRule = found(self.alpha, self.lower_bound, self.interval)
+            made: DecisionRule = found(self.alpha, self.lower_bound, self.interval, **rate)
         except TypeError as error:
             raise SettingError(f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}.") from error
         return made
@@ -88,8 +107,8 @@ class Policy:
         return certify(outcomes, self.alpha, 1.0 - self.lower_bound, self.stops, self.audited_share)
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
-        """(lower, upper) of the success probability, by the policy's interval and alpha."""
-        return INTERVALS[self.interval](n_success, n_failure, self.alpha)
+        """(lower, upper) of the success probability, by the policy's interval."""
+        return INTERVALS[self.interval](n_success, n_failure, level_of(self.alpha, self.guarantee))
 
     def action(self, lower: float, upper: float) -> Action:
         """What one bound allows, by the paper's rule."""
@@ -97,30 +116,18 @@ class Policy:
 
         return ACTIONS[action_of(float(lower), float(upper), self.lower_bound, 1.0 - self.lower_bound)]
 
-    def actions(self, lower: ArrayLike, upper: ArrayLike) -> NDArray[Any]:
-        """What each bound allows, by the paper's rule: an object array of `Action`, of the bounds' shape."""
-        return np.asarray(np.frompyfunc(self.action, 2, 1)(lower, upper), dtype=object)
 
-
-@dataclass(frozen=True, slots=True)
-class Neighbourhood:
-    """Which references count for a query; chosen without looking at any label.
+def check_neighbourhood(radius: float, fraction: float | None, reject_fraction: float | None) -> None:
+    """Which references count for a query, chosen without looking at any label. SettingError for values out of range.
 
     radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
     fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
     reject_fraction : a second, smaller share that a rejection is decided by; None: the same ball for both. A ball wide
         enough to certify the many successes blurs the few failures.
     """
-
-    radius: float = 0.3
-    fraction: float | None = None
-    reject_fraction: float | None = None
-
-    def __post_init__(self) -> None:
-        expect(is_number(self.radius) and 0.0 < self.radius < math.inf, "a finite radius > 0", self.radius)
-        for name in ("fraction", "reject_fraction"):
-            value = getattr(self, name)
-            held = value is None or (is_number(value) and 0.0 < value <= 1.0)
-            expect(held, f"{name} in (0, 1] or None for the fixed radius", value)
-        if self.reject_fraction is not None and self.fraction is None:
-            raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")
+    expect(is_number(radius) and 0.0 < radius < math.inf, "a finite radius > 0", radius)
+    for name, value in (("fraction", fraction), ("reject_fraction", reject_fraction)):
+        held = value is None or (is_number(value) and 0.0 < value <= 1.0)
+        expect(held, f"{name} in (0, 1] or None for the fixed radius", value)
+    if reject_fraction is not None and fraction is None:
+        raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")

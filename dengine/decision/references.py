@@ -62,17 +62,26 @@ def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part:
     return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
 
 
+def math_ceil(x: float) -> int:
+    """Smallest integer not below x; `math.ceil` under a name that scripts in a method."""
+    whole = int(x)
+    return whole if x <= float(whole) else whole + 1
+
+
 FARTHEST = 1e38  # squared: what is beyond all measure, the query's own part too, is in no ball
 Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
-class ReferenceRing(nn.Module):
-    """A bounded block of labelled points; the oldest leaves first, whatever its label.
+class RadiusIndex(nn.Module):
+    """A bounded block of labelled points in K spaces, and counts around queries. The oldest leaves first, blind to labels.
 
+    dim : dimension d of a point.  capacity : points held at most.
     points (d, capacity) float32; labels (2, capacity) float32, ones, and 1.0 or 0.0; spaces (capacity,) int64; parts
     (capacity,) int64 hashes, 0 for no known part; first (capacity,) int64, the slot that a part's votes are gathered in;
     repeats () int64, points of parts that are there already; agreement () float64, `label_agreement`; total () int64,
     points ever added.
+    numbers (capacity,) int64 of the labels, 0 for none.  known : hashes of all parts that are held, and of some that
+    have left: a query of another part need not be compared. Neither compiles.
     """
 
     points: Tensor
@@ -84,11 +93,9 @@ class ReferenceRing(nn.Module):
     agreement: Tensor
     total: Tensor
 
-    def __init__(self, dim: int, capacity: int) -> None:
+    def __init__(self, dim: int, capacity: int = 10_000) -> None:
         super().__init__()
-        self.dim = dim
-        self.capacity = capacity
-        self.farthest = FARTHEST
+        self.dim, self.capacity, self.farthest = dim, capacity, FARTHEST
         self.register_buffer("points", torch.zeros(dim, capacity))
         self.register_buffer("labels", torch.ones(2, capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
@@ -97,6 +104,17 @@ class ReferenceRing(nn.Module):
         self.register_buffer("repeats", torch.zeros((), dtype=torch.int64))
         self.register_buffer("agreement", torch.ones((), dtype=torch.float64))
         self.register_buffer("total", torch.zeros((), dtype=torch.int64))
+        self.numbers = np.zeros(capacity, dtype=np.int64)
+        self.known: set[int] = set()
+
+    def __len__(self) -> int:
+        return self.size()
+
+    def held(self, name: str) -> NDArray[Any]:
+        """Of the n points held, in the order of their places: points (n, d), labels (n,), spaces, parts or numbers."""
+        block = self.numbers if name == "numbers" else getattr(self, name).numpy()
+        held: NDArray[Any] = block[..., : len(self)]
+        return held.T if name == "points" else held[1].astype(np.int8) if name == "labels" else held
 
     @torch.jit.export
     def size(self) -> int:
@@ -117,11 +135,13 @@ class ReferenceRing(nn.Module):
     @torch.jit.export
     def join(self, slot: int, part: int) -> None:
         """Make `part` that of a slot that is held, and find the slot in which its votes are gathered."""
-        same = self.parts == self.parts[slot]
-        if int(same.sum().item()) > 1 and int(self.parts[slot].item()) != 0:  # the leaving part's others stay together
-            same[slot] = False
-            self.first.masked_fill_(same, int(same.nonzero()[0].item()))
-            self.repeats.sub_(1)
+        leaving = int(self.parts[slot].item())
+        if leaving != 0 and int(self.repeats.item()) > 0:
+            same = self.parts == leaving
+            if int(same.sum().item()) > 1:  # the leaving part's others stay together
+                same[slot] = False
+                self.first.masked_fill_(same, int(same.nonzero()[0].item()))
+                self.repeats.sub_(1)
         self.parts[slot] = part
         self.first[slot] = slot
         if part != 0:
@@ -140,7 +160,7 @@ class ReferenceRing(nn.Module):
         own = z.t()  # (d, K)
         if z.size(0) > 1:
             own = own.index_select(1, self.spaces[:n])  # (d, size): a reference of fold k is met in space k only
-        distances = (self.points[:, :n] - own).square_().sum(0)
+        distances = (self.points.narrow(1, 0, n) - own).square_().sum(0)
         if part != 0:
             distances.masked_fill_(self.parts[:n] == part, float("inf"))
         return distances
@@ -161,10 +181,8 @@ class ReferenceRing(nn.Module):
             limit = min(limit, self.farthest)
         if int(self.repeats.item()) > 0:
             return self.votes(distances <= limit)
-        # 1.0 or 0.0, without a mask in between; of a copy, as a rule may look twice, and scripted, le_ right after a sum
-        # gave wrong counts (917 for 586).
-        inside = distances.clone().le_(limit)
-        counts: list[float] = torch.mv(self.labels[:, :n], inside).tolist()  # exact below 2**24 points
+        inside = torch.le(distances, limit, out=torch.empty_like(distances))  # in float32, as the product takes it
+        counts: list[float] = torch.mv(self.labels.narrow(1, 0, n), inside).tolist()  # exact below 2**24 points
         return int(counts[1]), int(counts[0]) - int(counts[1])
 
     def votes(self, inside: Tensor) -> tuple[int, int]:
@@ -180,69 +198,20 @@ class ReferenceRing(nn.Module):
         failures = float(worth.sum().item()) - successes
         return int(successes + 0.5), int(failures + 0.5)
 
-
-def math_ceil(x: float) -> int:
-    """Smallest integer not below x; `math.ceil` under a name that scripts in a method."""
-    whole = int(x)
-    return whole if x <= float(whole) else whole + 1
-
-
-class RadiusIndex:
-    """Labelled points in K spaces, and counts around queries.
-
-    dim : dimension d of a point.  capacity : points held at most; the oldest leave first, blind to labels.
-    """
-
-    def __init__(self, dim: int, capacity: int = 10_000) -> None:
-        self.dim, self.capacity = dim, capacity
-        self.ring = ReferenceRing(dim, capacity)
-        self._numbers = np.zeros(capacity, dtype=np.int64)
-
-    def __len__(self) -> int:
-        return self.ring.size()
-
-    @property
-    def points(self) -> NDArray[np.float32]:
-        """(n, d) the points held, in the order of their places in the block."""
-        return self.ring.points[:, : len(self)].numpy().T
-
-    @property
-    def labels(self) -> NDArray[np.int8]:
-        """(n,) 1 success, 0 failure, in the order of `points`."""
-        return self.ring.labels[1, : len(self)].numpy().astype(np.int8)
-
-    @property
-    def spaces(self) -> NDArray[np.int64]:
-        """(n,) the space each point lives in, in the order of `points`."""
-        return self.ring.spaces[: len(self)].numpy()
-
-    @property
-    def parts(self) -> NDArray[np.int64]:
-        """(n,) the hash of each point's part, 0 for none, in the order of `points`."""
-        return self.ring.parts[: len(self)].numpy()
-
-    @property
-    def numbers(self) -> NDArray[np.int64]:
-        """(n,) the number of each point's label, 0 for none, in the order of `points`."""
-        return self._numbers[: len(self)]
-
-    def put(self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0) -> None:
-        """Add one point (d,), as `ReferenceRing.put`; number : of its label."""
-        self._numbers[int(self.ring.total) % self.capacity] = number
-        self.ring.put(point, label, space, part)
+    def keep(self, point: Tensor, label: float, space: int, part: int = 0, number: int = 0) -> None:
+        """Add one point (d,), as `put`; number : of its label."""
+        self.numbers[int(self.total) % self.capacity] = number
+        self.put(point, label, space, part)
+        self.known.add(part)
 
     def renumber(self, was: int, number: int) -> None:
         """Give the point of a label another number; one that has left needs none."""
-        self._numbers[self._numbers == was] = number
+        self.numbers[self.numbers == was] = number
 
     def add(
-        self,
-        points: ArrayLike,
-        labels: ArrayLike,
-        spaces: ArrayLike | None = None,
-        parts: ArrayLike | None = None,
-        numbers: ArrayLike | None = None,
-    ) -> None:
+        self, points: ArrayLike, labels: ArrayLike, spaces: ArrayLike | None = None,
+        parts: ArrayLike | None = None, numbers: ArrayLike | None = None,
+    ) -> None:  # fmt: skip
         """Add points (n, d) with labels (n,), 1 = success, 0 = failure.
 
         spaces : (n,) the space each lives in, 0 if None.  parts : (n,) int64 hashes of their parts; None: of no known part.
@@ -255,16 +224,16 @@ class RadiusIndex:
                 f"Expected points (n, {self.dim}) with n labels, n spaces and n parts, "
                 f"got {z.shape}, {y.shape}, {k.shape} and {own.shape}."
             )
-        ring, total = self.ring, int(self.ring.total)
-        keep = slice(max(0, len(z) - ring.capacity), None)  # of more than fit, the newest
-        slots = (total + np.arange(len(z))[keep]) % ring.capacity
-        ring.points[:, slots] = torch.from_numpy(z[keep].T)
-        ring.labels[1, slots] = torch.from_numpy(y[keep])
-        ring.spaces[slots] = torch.from_numpy(k[keep])
-        ring.parts[slots] = torch.from_numpy(own[keep])
-        self._numbers[slots] = 0 if numbers is None else np.asarray(numbers)[keep]
-        ring.total.fill_(total + len(z))
-        if own.any() or int(ring.repeats) > 0:
+        total = int(self.total)
+        keep = slice(max(0, len(z) - self.capacity), None)  # of more than fit, the newest
+        slots = (total + np.arange(len(z))[keep]) % self.capacity
+        self.points[:, slots] = torch.from_numpy(z[keep].T)
+        self.labels[1, slots] = torch.from_numpy(y[keep])
+        self.spaces[slots] = torch.from_numpy(k[keep])
+        self.parts[slots] = torch.from_numpy(own[keep])
+        self.numbers[slots] = 0 if numbers is None else np.asarray(numbers)[keep]
+        self.total.fill_(total + len(z))
+        if own.any() or int(self.repeats) > 0:
             self._gather_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
@@ -272,40 +241,38 @@ class RadiusIndex:
 
         A point that has left already needs nothing. Returns False, and changes nothing, where the point is another part's.
         """
-        ring = self.ring
-        held = np.flatnonzero(self.numbers == number)
+        held = np.flatnonzero(self.held("numbers") == number)
         if not len(held):
             return True
         slot, n = int(held[0]), len(self)
-        if int(ring.parts[slot]) != part:
+        if int(self.parts[slot]) != part:
             return False
         if label is not None:
-            ring.labels[1, slot] = float(label)
+            self.labels[1, slot] = float(label)
             return True
-        order = (int(ring.total) - n + torch.arange(n)) % ring.capacity  # oldest first
+        order = (int(self.total) - n + torch.arange(n)) % self.capacity  # oldest first
         order = order[order != slot]
-        for block in (ring.points, ring.labels, ring.spaces, ring.parts):
+        for block in (self.points, self.labels, self.spaces, self.parts, torch.from_numpy(self.numbers)):
             block[..., : n - 1] = block[..., order]
-        self._numbers[: n - 1] = self._numbers[order.numpy()]
-        ring.points[:, n - 1 :], ring.labels[1, n - 1 :] = 0.0, 1.0
-        ring.spaces[n - 1 :], ring.parts[n - 1 :], self._numbers[n - 1 :] = 0, 0, 0
-        ring.total.fill_(n - 1)
+            block[..., n - 1 :] = 0
+        self.labels[:, n - 1 :] = 1.0
+        self.total.fill_(n - 1)
         self._gather_parts()
         return True
 
     def weigh(self) -> None:
         """Estimate how far the labels of one part go together, for all counts from now on."""
-        if int(self.ring.repeats) > 0:
-            self.ring.agreement.fill_(label_agreement(self.points, self.labels, self.spaces, self.parts))
+        if int(self.repeats) > 0:
+            self.agreement.fill_(label_agreement(*map(self.held, ("points", "labels", "spaces", "parts"))))
 
     def _gather_parts(self) -> None:
         """Find for every slot the first one of its part, and how many are not that."""
-        ring, n = self.ring, len(self)
-        slots = np.arange(ring.capacity)
-        _, first, inverse = np.unique(self.parts, return_index=True, return_inverse=True)
-        slots[:n] = np.where(self.parts != 0, first[inverse], slots[:n])
-        ring.first.copy_(torch.from_numpy(slots))
-        ring.repeats.fill_(int((slots != np.arange(ring.capacity)).sum()))
+        n, parts, slots = len(self), self.held("parts"), np.arange(self.capacity)
+        _, first, inverse = np.unique(parts, return_index=True, return_inverse=True)
+        slots[:n] = np.where(parts != 0, first[inverse], slots[:n])
+        self.first.copy_(torch.from_numpy(slots))
+        self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
+        self.known = set(parts.tolist())
 
     def count(self, queries: ArrayLike, radius: float, fraction: float = 0.0) -> Counts:
         """(n_success, n_failure), each (n,): labels around each query (n, d), or (n, K, d) for K spaces.
@@ -315,31 +282,26 @@ class RadiusIndex:
         """
         z = torch.from_numpy(np.array(queries, dtype=np.float32))
         z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
-        found = [self.ring.count_near(self.ring.squared_distances(query), radius, fraction) for query in z]
+        found = [self.count_near(self.squared_distances(query), radius, fraction) for query in z]
         counts = np.array(found, dtype=np.int64).reshape(-1, 2)
         return counts[:, 0], counts[:, 1]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Plain arrays, copies: points (d, n), labels, spaces, parts and numbers (n,), and total, points ever added."""
-        own = {name: getattr(self, name).copy() for name in ("labels", "spaces", "parts", "numbers")}
-        whole = {name: getattr(self.ring, name).numpy().copy() for name in ("agreement", "total")}
-        return {"points": self.points.T.copy()} | own | whole
+        own = {name: self.held(name).copy() for name in ("labels", "spaces", "parts", "numbers")}
+        whole = {name: getattr(self, name).numpy().copy() for name in ("agreement", "total")}
+        return {"points": self.held("points").T.copy()} | own | whole
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
         """The index that `get_state` was taken from: the same points in the same places."""
         index = cls(len(state["points"]), capacity)
-        ring, n = index.ring, state["points"].shape[1]
-        held = {"points": ring.points, "labels": ring.labels[1], "spaces": ring.spaces, "parts": ring.parts}
-        for name, own in held.items():
-            own[..., :n] = torch.from_numpy(np.array(state[name]))
-        ring.agreement.fill_(float(state["agreement"]))
-        index._numbers[:n] = state["numbers"]
-        ring.total.fill_(int(state["total"]))
-        index._gather_parts()
+        index.add(state["points"].T, *(state[name] for name in ("labels", "spaces", "parts", "numbers")))
+        index.agreement.fill_(float(state["agreement"]))
+        index.total.fill_(int(state["total"]))
         return index
 
     def digest(self) -> str:
         """SHA-256 of what is held: points as (d, n) float32, labels as float32, spaces as int64, one after the other."""
-        arrays = self.points.T, self.labels.astype(np.float32), self.spaces
+        arrays = self.held("points").T, self.held("labels").astype(np.float32), self.held("spaces")
         return hashlib.sha256(b"".join(np.ascontiguousarray(each).tobytes() for each in arrays)).hexdigest()

@@ -8,16 +8,30 @@ asked (`forward`), told what became of a decision (`tell`) and restored (its buf
 
 *Local.* The paper's rule, of the ball around one trace; it learns nothing.
 
-*Pooled.* Levels of the local lower bound go down from LB in steps of half the tolerance. The members of a level are all
-traces whose lower bound reached it when they were decided, before their label was known. A level holds while its members'
-known outcomes say, at level alpha however often one looks, that their mean failure probability is at most the tolerance
-(`certificate.log_evidence`). Levels are asked in order, the strictest first, each only while the stricter ones hold: alpha
-is spent once (fixed-sequence testing: Maurer, Hothorn and Lehmacher, 1995). A part is accepted where its lower bound
-reaches the lowest level that holds. Rejections are the mirror image, on 1 - upper, and a guarantee as far as audits go.
+*Pooled.* A score sorts traces: it need only be fixed before the part's own label. Levels of it go down from LB in steps of
+half the tolerance. One of them is aimed at: the lowest of which the parts that reached it were good enough, by all that was
+told. *Members* are the parts that reached the level aimed at, accepted or checked. While a bettor's capital against "the
+members' mean failure probability is beyond the tolerance" is at least 1 / alpha, parts that reach the level are accepted.
+
+That spends alpha once, whatever the truth does, and whatever chose the levels. Let F be all that was told before a part, p
+its failure probability given F, x = 1 if it is bad and its outcome is asked for, and q the probability of that, given F. A
+member has the factor 1 + l (theta - x / q), of mean 1 + l (theta - p) given F; with a constant l, the product over members
+of factor / (1 + l (theta - p)) is a martingale M from 1, for who is a member is known from F. The logarithm is concave: at
+every n at which the running mean of the members' p is theta or more, the product of 1 + l (theta - p) is at most 1, so that
+capital <= M, and by Ville's inequality M ever reaches 1 / alpha with probability alpha at most. A mixture of several l is a
+mixture of such M. Constant l is what makes it the plain mean: an audit, of q below 1, bets l / q, a part that was checked
+only l, and who stays silent nothing. (Waudby-Smith and Ramdas, 2024, JRSS B 86(1); inverse probability weights in
+bets: Waudby-Smith et al., 2024, arXiv:2210.10768; thresholds by bets on audits: Xu et al., 2024, arXiv:2406.10490.)
+
+So under `stops="some"` a stop or a confirmation, which came unasked, is no evidence. What came before a level was aimed
+at does not help a level that came later. Rejections are the mirror image; where audits do not weigh, nobody looks at what
+is rejected: its members are those checked, and no claim is made of what was rejected. Beside it, the newest 50 told of a
+level may hold at most so many wrong ones, or it is not aimed at: a mean of all members is slow to notice drift.
 
 *Safe mode.* A claim on the mean of all members is slow to notice drift. So what is accepted is watched by a restarting
-test (an e-detector of the CUSUM kind: Shin, Ramdas and Rinaldo, 2023, arXiv:2203.03532), and so is the share of novel
-traces. At an alarm everything is verified, and what held must be shown anew, by members decided since.
+test, a CUSUM against twice the tolerance (`certificate.cusum`), and so is the share of novel traces. At an alarm everything
+is verified, and what held must be shown anew, by members decided since: by each side for itself. The safe mode lasts until
+the side that alarmed has done so, and after too many novel traces until these are few and either side has.
 """
 
 import math
@@ -30,9 +44,9 @@ import torch
 from torch import Tensor, nn
 
 from ..records import REASONS, Reason
-from .certificate import log_evidence
-from .intervals import INTERVALS, normal_quantile
-from .references import ReferenceRing
+from .certificate import cusum
+from .intervals import INTERVALS, SORTING, normal_quantile
+from .references import RadiusIndex
 
 CERTAIN, UNCERTAIN, SAFE = (REASONS.index(r) for r in (Reason.CERTAIN, Reason.UNCERTAIN, Reason.SAFE_MODE))
 SAFE_MODE = (  # why everything is verified, by position: the integers of exported files
@@ -42,10 +56,13 @@ SAFE_MODE = (  # why everything is verified, by position: the integers of export
     "too many traces were novel",
 )
 LOWEST = 0.3  # no level below: such a ball says little of a part
-BETS = [0.37, 0.72]  # best for failure rates of two thirds and of a third of the tolerance; few, since each costs evidence
+BET = 0.55  # of the largest; best for failure rates of nearly half of the tolerance
+NEWEST = 50  # told parts of a level that are tested by themselves
+RARE = 0.2  # probability of so many wrong ones among them at the tolerance itself, at most
 NOBODY = 2.0  # a level that no bound reaches
 FALSE_ALARMS = 100.0  # at the tolerance itself, one in 100 / alpha watched parts on average at most
-WATCH_BET = 0.5  # of the largest
+NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
+FEW_NOVEL = 25.0  # traces in a row that are not; one that is takes back as many as come with it at that share
 
 
 def action_of(lower: float, upper: float, accept_at: float, reject_at: float) -> int:
@@ -93,37 +110,54 @@ Bound = Callable[[int, int, float], tuple[float, float]]
 SCALAR_BOUNDS: dict[str, Bound] = {"wilson": wilson_bound, "binomial": binomial_bound}
 
 
-class Evidence(nn.Module):
-    """What a rule has seen: members of its levels, drift detectors, and the level that each side must reach.
+def most_wrong(tolerance: float) -> int:
+    """How many of `NEWEST` may be wrong: more are so with probability `RARE` at most, where each is so by the tolerance."""
+    tail, k = 1.0, -1
+    while tail > RARE:
+        k += 1
+        tail -= math.comb(NEWEST, k) * tolerance**k * (1.0 - tolerance) ** (NEWEST - k)
+    return k
 
-    levels : of evidence, the strictest first.
-    assumed : whether the first level holds until an alarm, as the paper's does; else each must be shown.
+
+class Evidence(nn.Module):
+    """What a rule has seen: members, what its levels are worth, drift detectors, and the level that each side must reach.
+
+    levels : of the score, the strictest first.
+    assumed : whether the first level holds until an alarm, as the paper's does; else all must be shown.
+    rate : probability with which the outcome of a certain decision is asked for; 1 where all are known.
 
     Side 0 accepts, side 1 rejects; novelty is watched besides, as 2. The score of an accept is the lower bound, of a reject
-    1 - upper.  open (2,) float64: the level that a part's score must reach, by side.  members (2, 2, L, 2) int64: by side,
-    ever and since the last alarm, of each level, parts of known outcome and the wrong ones among them.  watch (3,) float64:
-    log capital of the detectors.  mode () int64: position in `SAFE_MODE`.
+    1 - upper.  open (2,) float64: the level that a part's score must reach, by side.  aim (2,) int64: position of the
+    level aimed at.  told (2, 2, L + 1, 2, 2) int64: by side, ever and since the last alarm, of the members and then of each
+    level, checked and audited, parts and the wrong ones.  newest (2, L, NEWEST) int64: which of its newest were wrong.
+    watch (3,) float64: sums of the detectors.  mode () int64: position in `SAFE_MODE`.
     """
 
     open: Tensor
-    members: Tensor
+    aim: Tensor
+    told: Tensor
+    newest: Tensor
     watch: Tensor
     mode: Tensor
 
-    def __init__(self, alpha: float, tolerance: float, levels: list[float], assumed: bool) -> None:
+    def __init__(self, alpha: float, tolerance: float, levels: list[float], assumed: bool, rate: float = 1.0) -> None:
         super().__init__()
-        self.tolerance, self.levels, self.assumed = tolerance, levels, assumed
+        self.levels, self.assumed, self.rate = levels, assumed, rate
         self.enough = math.log(1.0 / alpha)
-        self.alarm_at = math.log(FALSE_ALARMS / alpha)
-        self.bets = BETS
-        self.nobody = NOBODY
-        # A detector bets on too many: steps of its log capital for a wrong part, and for a right one.
-        shares = [tolerance, tolerance, 0.2]  # the share of novel traces that a stream may have
-        self.worse = [math.log1p(WATCH_BET / share * (1.0 - share)) for share in shares]
-        self.better = math.log1p(-WATCH_BET)
-        self.register_buffer("members", torch.zeros(2, 2, len(levels), 2, dtype=torch.int64))
+        self.most, self.span, self.nobody = most_wrong(tolerance), NEWEST, NOBODY
+        # Steps of log capital: for a part that was checked, and for a wrong one besides; then for an audited one.
+        stake = BET / (1.0 - BET * tolerance)
+        pairs = [(math.log1p(each * tolerance), math.log1p(each * (tolerance - 1.0))) for each in (stake * rate, stake)]
+        self.steps = [step for good, wrong in pairs for step in (good, wrong - good)]
+        # Of a detector, what a wrong part adds, where a right one takes 1, and the sum that is an alarm.
+        detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (tolerance, tolerance, NOVEL_SHARE)]
+        self.worse, self.alarm_at = [float(step) for step, _ in detectors], [float(limit) for _, limit in detectors]
+        self.better, self.few, self.back = -1.0, FEW_NOVEL, 1.0 / NOVEL_SHARE - 1.0
+        self.register_buffer("told", torch.zeros(2, 2, len(levels) + 1, 2, 2, dtype=torch.int64))
+        self.register_buffer("newest", torch.zeros(2, len(levels), NEWEST, dtype=torch.int64))
         self.register_buffer("watch", torch.zeros(3, dtype=torch.float64))
         self.register_buffer("mode", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("aim", torch.zeros(2, dtype=torch.int64))
         self.register_buffer("open", torch.full((2,), levels[0] if assumed else NOBODY, dtype=torch.float64))
 
     def action(self, lower: float, upper: float) -> int:
@@ -136,66 +170,91 @@ class Evidence(nn.Module):
     def observe(self, silent: int, novel: bool) -> None:
         """Update the detectors: parts of unknown outcome did not fail as far as is known; they and this may be novel."""
         self.step(0, self.better, silent)
-        self.step(2, self.better, silent)
-        self.step(2, self.worse[2] if novel else self.better, 1)
+        mode = int(self.mode.item())
+        if mode == 0:
+            self.step(2, self.better, silent)
+            self.step(2, self.worse[2] if novel else self.better, 1)
+        elif mode == 3:  # the other way round
+            self.watch[2].fill_(max(float(self.watch[2].item()), 0.0) + (-self.back if novel else 1.0))
 
-    def tell(self, lower: float, upper: float, success: bool) -> None:
-        """Count a part among the members of every level that its scores reach, and ask the levels anew."""
-        self.count(0, lower, not success)
-        self.count(1, 1.0 - upper, success)
-        if int(self.mode.item()) != 0 and float(self.open.min().item()) < self.nobody:
+    def tell(self, lower: float, upper: float, success: bool, predicted: int, looked: float) -> None:
+        """Count a part among the members and in the levels that its scores reach, and ask them anew."""
+        self.count(0, lower, not success, predicted, looked)
+        self.count(1, 1.0 - upper, success, predicted, looked)
+        mode = int(self.mode.item())
+        shown = self.open.min() if mode == 3 else self.open[max(0, mode - 1)]
+        calm = mode != 3 or float(self.watch[2].item()) >= self.few
+        if mode != 0 and calm and float(shown.item()) < self.nobody:
             self.mode.zero_()
+            self.watch[2].zero_()
 
-    def count(self, side: int, score: float, wrong: bool) -> None:
-        """One more member of known outcome, of the levels that its score reaches."""
+    def count(self, side: int, score: float, wrong: bool, predicted: int, looked: float) -> None:
+        """One more part of known outcome, of the levels that its score reaches."""
         if score >= float(self.open[side].item()):
             self.step(side, self.worse[side] if wrong else self.better, 1)
-        above = 0
+        kind = 0
+        if self.rate < 1.0:
+            if looked == 0.0:  # it came unasked
+                return
+            kind = int(looked < 1.0)
+        reached = 0
         for level in self.levels:
-            above += int(level > score)
-        if above == len(self.levels):
+            reached += int(level <= score)
+        # Whatever was certain is a member, where its label came late, too.
+        member = reached > len(self.levels) - 1 - int(self.aim[side].item()) or predicted == side + 1
+        if reached == 0 and not member:
             return
-        reached = self.members[side, :, above:]
-        reached[:, :, 0].add_(1)
-        if wrong:
-            reached[:, :, 1].add_(1)
+        first = len(self.levels) - reached
+        n = self.told[side, 0, 1 + first :, :, 0].sum(1, keepdim=True)  # before it: it takes the place of the oldest
+        self.newest[side, first:].scatter_(1, n % self.span, int(wrong))
+        counts = self.told[side, :, :, kind]
+        for i in range(1 + int(wrong)):
+            counts[:, 1 + first :, i].add_(1)
+            if member:
+                counts[:, 0, i].add_(1)
         self.ask(side)
 
     def step(self, watched: int, step: float, times: int) -> None:
         """Equal steps of a detector, which restarts from 0 wherever it falls below; its alarm starts the safe mode."""
-        if times <= 0 or int(self.mode.item()) != 0:
+        if times <= 0:
             return
         before = float(self.watch[watched].item())
         capital = max(before + (times - 1) * step, 0.0) + step  # of equal steps down, none but the last can start from 0
         self.watch[watched].fill_(capital)
-        if capital >= self.alarm_at:
-            self.alarm(watched + 1)
+        if capital >= self.alarm_at[watched]:
+            mode = int(self.mode.item())  # a side that was not shown yet stays the reason
+            self.alarm(watched + 1 if mode == 0 or mode == 3 else min(mode, watched + 1))
 
     def alarm(self, mode: int) -> None:
         """Let nothing pass until what held is shown anew; mode : the position in `SAFE_MODE`."""
         self.watch.zero_()
-        self.members[:, 1].zero_()
+        self.told[:, 1].zero_()
+        self.aim.zero_()
         self.open.fill_(self.nobody)
         self.mode.fill_(mode)
 
     def ask(self, side: int) -> None:
-        """Open the lowest level that holds; an assumed one only closes by an alarm, and is shown by members since."""
-        ever: list[list[int]] = self.members[side, 0].tolist()
-        since: list[list[int]] = self.members[side, 1].tolist()
-        if self.assumed:
-            if float(self.open[side].item()) >= self.nobody and self.shown(since[0]):
+        """Aim at the lowest level that is good enough, and open it if the members show as much."""
+        since: list[list[int]] = self.told[side, 1].flatten(1).tolist()
+        ever: list[int] = self.told[side, 0, 0].flatten().tolist()
+        if self.assumed:  # only an alarm closes it
+            if float(self.open[side].item()) >= self.nobody and self.shown(since[1]):
                 self.open[side].fill_(self.levels[0])  # assigned, a scripted float goes through float32
             return
-        lowest = self.nobody
-        for i, level in enumerate(self.levels):
-            if not (self.shown(ever[i]) and (since[i] == ever[i] or self.shown(since[i]))):
-                break
-            lowest = level
-        self.open[side].fill_(lowest)
+        wrong: list[int] = self.newest[side].sum(1).tolist()
+        lowest = len(self.levels) - 1
+        while lowest >= 0 and not (wrong[lowest] <= self.most and self.shown(since[lowest + 1])):
+            lowest -= 1
+        self.aim[side].fill_(max(0, lowest))
+        held = lowest >= 0 and self.shown(ever) and (since[0] == ever or self.shown(since[0]))
+        self.open[side].fill_(self.levels[lowest] if held else self.nobody)
 
-    def shown(self, members: list[int]) -> bool:
-        """Whether a level's members say that their mean failure probability keeps the tolerance."""
-        return log_evidence(members[0], members[1], self.tolerance, 1.0, self.bets) >= self.enough
+    def shown(self, told: list[int]) -> bool:
+        """Whether parts, checked and audited, say that their mean failure probability keeps the tolerance."""
+        log = 0.0
+        for n, step in zip(told, self.steps):  # noqa: B905  strict is not TorchScript
+            log += n * step
+        return log >= self.enough
 
 
 class DecisionRule(nn.Module):
@@ -203,6 +262,7 @@ class DecisionRule(nn.Module):
 
     alpha, lower_bound, interval : as in `Policy`.  evidence : what opens and closes levels in place of LB; None: nothing.
     compiles : whether TorchScript can compile the class; one that says False answers in Python and is not exported.
+    sorts : whether its bound only sorts, so that any score would do.
 
     A rule that learns overrides `tell` and `action`, and keeps all that it learned in buffers of a fixed shape, which a
     store keeps with each version. A rule whose `tell` raises is not asked any more: every part is verified until the engine
@@ -210,6 +270,7 @@ class DecisionRule(nn.Module):
     """
 
     compiles = True
+    sorts = False
 
     def __init__(
         self, alpha: float, lower_bound: float, interval: str = "wilson", evidence: Evidence | None = None
@@ -219,9 +280,10 @@ class DecisionRule(nn.Module):
         self.accept_at = float(lower_bound)
         self.reject_at = 1.0 - float(lower_bound)
         self.interval = interval
-        self.z = float(normal_quantile(alpha))
+        own = SORTING if self.sorts else float(alpha)
+        self.z = float(normal_quantile(own))
         self.scriptable = self.compiles and interval in SCALAR_BOUNDS  # what an export needs
-        self.bound: Bound = SCALAR_BOUNDS.get(interval, TableBound(interval, float(alpha)))
+        self.bound: Bound = SCALAR_BOUNDS.get(interval, TableBound(interval, own))
         self.evidence = evidence
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
@@ -236,10 +298,14 @@ class DecisionRule(nn.Module):
         return action_of(lower, upper, self.accept_at, self.reject_at)
 
     @torch.jit.export
-    def tell(self, lower: float, upper: float, success: bool) -> None:
-        """What became of a part: the bound that it was decided by, before its label was known, and the label."""
+    def tell(self, lower: float, upper: float, success: bool, predicted: int = 0, looked: float = 1.0) -> None:
+        """What became of a part: the bound that it was decided by, before its label was known, and the label.
+
+        predicted : the action that the model alone would have taken.  looked : probability with which its outcome was asked
+        for, beforehand: 1 of what was checked, the audits' of an audit, 0 of a stop or a confirmation.
+        """
         if self.evidence is not None:
-            self.evidence.tell(lower, upper, success)
+            self.evidence.tell(lower, upper, success, predicted, looked)
 
     @torch.jit.export
     def observe(self, silent: int, novel: bool) -> None:
@@ -251,6 +317,11 @@ class DecisionRule(nn.Module):
     def safe_mode(self) -> int:
         """Why everything is verified at present: the position in `SAFE_MODE`, 0 where it is not."""
         return 0 if self.evidence is None else int(self.evidence.mode.item())
+
+    @torch.jit.unused
+    def anew(self) -> "DecisionRule":
+        """The same rule before it was told anything."""
+        return type(self)(self.alpha, self.accept_at, self.interval)
 
     @torch.jit.unused
     def begin_in(self, mode: int) -> None:
@@ -274,13 +345,24 @@ class WatchedRule(DecisionRule):
 
 
 class PooledRule(DecisionRule):
-    """Accept where the local lower bound reaches the lowest level that holds; reject likewise, on 1 - upper."""
+    """Accept what reaches the level aimed at while the members show that it may be; reject likewise.
 
-    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
+    rate : as in `Evidence`.
+    """
+
+    sorts = True
+
+    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson", rate: float = 1.0) -> None:
         tolerance = 1.0 - float(lower_bound)
         step = 0.5 * tolerance
         levels = [float(lower_bound) - i * step for i in range(int((lower_bound - LOWEST) / step + 1e-9) + 1)]
-        super().__init__(alpha, lower_bound, interval, Evidence(alpha, tolerance, levels, assumed=False))
+        super().__init__(alpha, lower_bound, interval, Evidence(alpha, tolerance, levels, assumed=False, rate=rate))
+        self.rate = rate
+
+    @torch.jit.unused
+    def anew(self) -> DecisionRule:
+        """The same rule before it was told anything."""
+        return type(self)(self.alpha, self.accept_at, self.interval, self.rate)
 
 
 class RadiusNeighbours(nn.Module):
@@ -289,14 +371,18 @@ class RadiusNeighbours(nn.Module):
     Two looks, one for each tail of the interval: the wide ball may accept; where it does not, the narrow one may reject.
     The counts and the bound that come back are those of the ball that decided, so the action follows from them alone.
 
-    radius, fraction, reject_fraction : as in `Neighbourhood`, 0 for None.
+    radius, fraction, reject_fraction : as in `check_neighbourhood`, 0 for None.
+    scored : whether the first axis is each space's probability of success. Where the rule needs but a score, their mean,
+        which knows of all labels but the part's own, stands for both ends of the interval; the counts are shown.
     """
 
     def __init__(
-        self, ring: ReferenceRing, rule: DecisionRule, radius: float, fraction: float = 0.0, reject_fraction: float = 0.0
-    ) -> None:
+        self, ring: RadiusIndex, rule: DecisionRule, radius: float, fraction: float = 0.0, reject_fraction: float = 0.0,
+        scored: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.ring: ReferenceRing = ring
+        self.scored = scored
+        self.ring: RadiusIndex = ring
         self.rule: DecisionRule = rule
         self.radius, self.fraction, self.reject_fraction = float(radius), float(fraction), float(reject_fraction)
         self.certain, self.uncertain, self.safe = CERTAIN, UNCERTAIN, SAFE
@@ -315,6 +401,9 @@ class RadiusNeighbours(nn.Module):
         """
         distances = self.ring.squared_distances(z, part)
         n_success, n_failure = self.ring.count_near(distances, self.radius, self.fraction)
+        if self.scored:
+            score = float(z[:, 0].mean().item())
+            return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
         if action == 0 and self.reject_fraction > 0.0:
             few_success, few_failure = self.ring.count_near(distances, self.radius, self.reject_fraction)

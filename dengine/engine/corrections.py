@@ -64,9 +64,7 @@ class Corrections:
         label = as_success(success)
         (known,) = self._to_correct([decision_id])
         if known.success is label:
-            return self._unchanged(
-                "correct", f"Decision {known.decision.id} counts as a {SAID[label]} already; nothing changed."
-            )
+            return self._unchanged("correct", f"Decision {known.decision.id} counts as a {SAID[label]} already")
         was = "forgotten" if known.success is None else f"a {SAID[known.success]}"
         text = f"decision {known.decision.id} counts as a {SAID[label]}, was {was}"
         data = {"decisions": {known.decision.id: {"was": known.success, "now": label}}}
@@ -83,14 +81,12 @@ class Corrections:
         if not decision_ids:
             raise ReportError("Expected the ids of decisions to forget, got none; name at least one.")
         known = self._to_correct(list(dict.fromkeys(decision_ids)))
-        ids = [each.decision.id for each in known if each.success is not None]
-        if not ids:
-            return self._unchanged(
-                "forget", f"{_listed([each.decision.id for each in known])} forgotten already; nothing changed."
-            )
-        text = f"{_listed(ids)} forgotten" + (f": {reason}" if reason else "")
-        was = {each.decision.id: {"was": each.success, "now": None} for each in known if each.success is not None}
-        return self._correct(Change("forget", text, {"decisions": was, "reason": reason}, author, tuple(ids), None))
+        was = {each.decision.id: each.success for each in known if each.success is not None}
+        if not was:
+            return self._unchanged("forget", f"{_listed([each.decision.id for each in known])} forgotten already")
+        text = f"{_listed(list(was))} forgotten" + (f": {reason}" if reason else "")
+        data = {"decisions": {id_: {"was": label, "now": None} for id_, label in was.items()}, "reason": reason}
+        return self._correct(Change("forget", text, data, author, tuple(was), None))
 
     def rollback(self, version: int, author: str = "") -> Changed:
         """Let an earlier version answer again, as a new version, so that the history goes on in one line.
@@ -104,7 +100,7 @@ class Corrections:
             raise SettingError(f"Expected the number of a version, got {version!r}; `store.retrains()` lists them.")
         self._make_ready()
         if version == self._versions.version and version > 0:
-            return self._unchanged("rollback", f"Version {version} answers already; nothing changed.")
+            return self._unchanged("rollback", f"Version {version} answers already")
         before, now = self._versions.version, self._versions.next_number
         text = f"version {version} answers again, as version {now} after {before}"
         event = Change("rollback", text, {"to": int(version), "was": before, "now": now}, author)
@@ -114,57 +110,43 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; every earlier one keeps the bounds that it was decided by.
 
-        Where anything but the audit rate changes, the rule starts anew, told of what is decided from now on: a tolerance
-        chosen after the data was seen is not one of those that alpha was spent on, and old bounds are of another scale.
+        Where anything but the audit rate changes, under "pooled" where that does, too, the rule starts anew, told of what
+        is decided from now on: a tolerance chosen after the data was seen is not one of those that alpha was spent on, and
+        old bounds are of another scale.
         `certificate` speaks of what is decided since this change; one who may choose among m policies' certificates errs
         with up to m alpha. A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that was
-        accepted before, and of which nothing was heard, stays unheard of.
-        Raises SettingError for what is no policy, and for anything but audit_rate and stops of a model that was handed in.
+        accepted before, and of which nothing was heard, stays unobserved.
+        In the shadow mode, `Policy(shadow=True)`, each part that the model is certain of is an audit:
+        `Decision.predicted` says what it would have done, and all is learned from as ever. It lasts over restarts.
+        Raises SettingError for what is no policy, and for anything but audit_rate, stops and shadow of a model that was
+        handed in.
         """
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
-        return self._go_on_under(policy, author)
-
-    def set_shadow(self, on: bool, author: str = "") -> Changed:
-        """Verify every part from the next decision on, or end that: the shadow mode, which lasts over restarts.
-
-        Each part that the model is certain of is then an audit: `Decision.predicted` says what it would have done, and all
-        is learned from as ever. The certificate begins anew where it begins and where it ends.
-        """
-        if not isinstance(on, bool):
-            raise SettingError(f"Expected True or False, whether to verify everything, got {on!r}.")
-        policy = self._settings.now.recipe.policy
-        if on == policy.shadow:
-            return self._unchanged("shadow", f"The shadow mode is {'on' if on else 'off'} already; nothing changed.")
-        return self._go_on_under(replace(policy, shadow=on), author)
-
-    def _go_on_under(self, policy: Policy, author: str) -> Changed:
-        old = self._settings.now.recipe.policy
-        new = {name: value for name, value in asdict(policy).items() if value != getattr(old, name)}
+        now, versions = self._settings.now, self._versions
+        was = asdict(now.recipe.policy)
+        new = {name: value for name, value in asdict(policy).items() if value != was[name]}
         if not new:
-            return self._unchanged("policy", "The policy is in force already; nothing changed.")
-        own = self._settings.now.model is not None  # a model that was handed in keeps its rule
-        idle = sorted(set(new) - {"audit_rate", "stops", "shadow"}) if own else []
+            return self._unchanged("policy", "The policy is in force already")
+        own = now.model is not None  # a model that was handed in keeps its rule
+        idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within"}) if own else []
         if idle:
             raise SettingError(
                 f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
                 "change only audit_rate and stops."
             )
         self._make_ready()
-        anew = not own and any(name in new for name in SCORING)
-        now = self._settings.now
-        since = 0 if self._versions.answering is None else self._versions.next_number
-        evidence = EvidenceWindow(since, SAFE_MODE.index(self._feedback.safe_mode)) if anew else now.evidence
-        recipe = replace(now.recipe, policy=policy)
-        settings = replace(now, recipe=recipe, policy_since=since, evidence=evidence)
-        was = {name: getattr(old, name) for name in new}
-        text = "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
-        kind = "policy"
+        # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
+        asked = policy.guarantee == "pooled" and policy.known_share != now.recipe.policy.known_share
+        anew = not own and (asked or any(name in new for name in SCORING))
+        since = 0 if versions.answering is None else versions.next_number
+        evidence = EvidenceWindow(since, SAFE_MODE.index(versions.newest.safe_mode)) if anew else now.evidence
+        settings = replace(now, recipe=replace(now.recipe, policy=policy), policy_since=since, evidence=evidence)
+        kind, text = "policy", "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
         if list(new) == ["shadow"]:
             kind, text = "shadow", SHADOW[policy.shadow]
-        data = {"old": asdict(old), "new": asdict(policy)}
-        event = Change(kind, text, data, author, settings=settings.to_store())
-        self._versions.set_policy(policy if anew else None, settings.evidence, event)
+        event = Change(kind, text, {"old": was, "new": asdict(policy)}, author, settings=settings.to_store())
+        versions.set_policy(policy if anew else None, evidence, event)
         self._settings.change(settings)
         self._feedback.begin_policy()
         return self._done(event, "the rule of the policy in force has none")
@@ -174,7 +156,8 @@ class Corrections:
         self._outbox.check()
         self._versions.collect(HUNG)
         self._feedback.store_all()
-        self._versions.count.complete()
+        if self._versions.fleet is not None:
+            self._versions.fleet.complete()
 
     def _to_correct(self, ids: Sequence[Any]) -> list[StoredDecision]:
         self._make_ready()
@@ -201,7 +184,7 @@ class Corrections:
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._versions.version)
 
     def _unchanged(self, kind: str, text: str) -> Changed:
-        return Changed(kind, _sentence(text), None, self._versions.version)
+        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._versions.version)
 
 
 def _sentence(text: str) -> str:

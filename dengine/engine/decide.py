@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import uuid
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..decision.rule import script
 from ..errors import TraceConflictError, TraceError, shortened
-from ..folds import audited, own_hash
+from ..folds import audited, own_hash, part_hash
 from ..model.base import NOTHING_KNOWN, EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import StoredDecision
@@ -28,17 +29,19 @@ class DecisionMaker:
     """Makes decisions on traces of one contract, with ids of its own.
 
     settings : of the audits' coin, a fixed function of the trace, and of the contract where there is one.
+    clock : of the store, in seconds.
     """
 
-    def __init__(self, settings: SettingsInForce) -> None:
-        self._settings = settings
+    def __init__(self, settings: SettingsInForce, clock: Callable[[], float]) -> None:
+        self._settings, self._clock = settings, clock
         if settings.now.trace is not None:
             self.agree_on(settings.now.trace)
         self._run, self._count = uuid.uuid4().hex[:12], count(1)
 
     def agree_on(self, trace: TraceSpec) -> None:
         """Set the contract that the gate checks."""
-        self._gate = script(TraceGate(trace))
+        gate = TraceGate(trace)
+        self._gate, self._limit = script(gate).forward, gate.limit  # once: a scripted module looks its methods up each time
 
     def first_contract(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
         """The contract that a first trace (C, T) sets; None for a bad one: it is verified, and the contract stays open."""
@@ -59,10 +62,14 @@ class DecisionMaker:
 
         unasked : why the part is verified whatever the model says; None: it is asked, where there is one.
         """
-        fault, content = self._gate(torch.from_numpy(x))
+        looked = None if model is None or unasked is not None else _look(x, part, model, self._limit)
+        fault, content, said = looked or (*self._gate(torch.from_numpy(x)), None)
         hash_ = own_hash(content, part)
         reason = REASONS[fault] if fault else unasked
-        said = _predict(x, hash_, model) if reason is None else replace(NOTHING_KNOWN, reason=reason)
+        if reason is not None:
+            said = replace(NOTHING_KNOWN, reason=reason)
+        elif said is None:
+            said = _predict(x, hash_, model)
         certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
         audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
         decision = Decision(
@@ -80,7 +87,7 @@ class DecisionMaker:
             propensity=rate if certain else 1.0,
             part=part,
         )
-        return StoredDecision(decision, x, hash_, bool(fault))
+        return StoredDecision(decision, x.copy(), hash_, fault != 0, self._clock())  # the caller may change his own
 
     def lost_accept(self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str) -> StoredDecision:
         """The decision behind a system stop whose own row was lost: an accept without a check, on no known evidence."""
@@ -88,6 +95,14 @@ class DecisionMaker:
         rate = self._settings.audited_share
         made = replace(item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate)
         return replace(item, decision=made)
+
+
+def _look(x: NDArray[np.float32], part: str | None, model: EngineModel, limit: float) -> tuple[int, int, Prediction] | None:
+    try:
+        looked = model.look(x, None if part is None else part_hash(part), limit)
+        return looked and (*looked[:2], _checked(looked[2]))
+    except Exception:  # `_predict` says why
+        return None
 
 
 def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
@@ -102,10 +117,9 @@ def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> P
 
 def _checked(prediction: Prediction) -> Prediction:
     """A prediction as every store can keep it; ValueError for counts or bounds that are none."""
-    for name in ("n_success", "n_failure"):
-        count = getattr(prediction, name)
-        if not isinstance(count, int) or not 0 <= count < 2**63:
-            raise ValueError(f"Expected {name} as a whole number from 0 to below 2**63, got {shortened(count)}.")
+    for n in (prediction.n_success, prediction.n_failure):
+        if not isinstance(n, int) or not 0 <= n < 2**63:
+            raise ValueError(f"Expected counts as whole numbers from 0 to below 2**63, got {shortened(n)}.")
     if not 0.0 <= prediction.lower <= prediction.upper <= 1.0:  # a NaN is refused too
         raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {prediction.lower} and {prediction.upper}.")
     return prediction

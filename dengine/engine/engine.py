@@ -7,18 +7,20 @@ for cycle in engine.run(cell, cycles=1503):
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]  # `signal` looks each handler up among enumerations: 10 us a decision
+import gc
 import logging
 import os
-import signal
 import threading
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from signal import SIGINT
 from types import FrameType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -27,9 +29,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import DengineError, ImportRefusedError, NotTakenError, StoreError, UnknownDecisionError
+from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.explain import Circumstances, Explanation, explain
-from ..history.status import history
+from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
 from ..records import (
@@ -43,9 +45,9 @@ from ..records import (
     as_id,
     as_outcome,
     as_success,
+    in_html,
     source_of,
 )
-from ..store.base import Store
 from ..store.opening import UNHURRIED, opening
 from ..store.outbox import CLOSE, Outbox
 from ..store.records import StoredDecision
@@ -53,32 +55,91 @@ from ..traces import as_agreed
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part, decided_before, unasked
 from .feedback import Feedback
-from .peers import Fleet, agreed, as_peers, peers_trace
-from .resume import resume
-from .settings import EngineSettings, SettingsInForce, chosen_recipe, classes_of, object_of, refuse_idle
+from .settings import (
+    EngineSettings,
+    SettingsInForce,
+    as_peers,
+    chosen_recipe,
+    classes_of,
+    peers_trace,
+    refuse_idle,
+)
 from .trainer import Clock, Limits, Retrainer, Window
 from .versions import ModelVersions
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..store.sql import SqlStore
+
+    StoreLike = str | os.PathLike[str] | SqlStore
+
 log = logging.getLogger("dengine")
-StoreLike = str | os.PathLike[str] | Store
+WARM_UP = 100  # cycles of a loop: what is there by then stays
 
 
 @contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold SIGINT back until the block ends: a label is stored and counted, or neither."""
-    before = signal.getsignal(signal.SIGINT)
-    # Python delivers signals to the main thread alone; an ignored signal interrupts nothing, nor does one that C handles.
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield
-        return
-    held: list[tuple[int, FrameType | None]] = []
-    signal.signal(signal.SIGINT, lambda number, frame: held.append((number, frame)))
+def frozen_objects() -> Iterator[None]:
+    """Python's collector leaves alone what is there now, until the block ends.
+
+    It goes through 280,000 objects of imported libraries in 150 ms, to find nothing: so not before the block either. Of the
+    process that owns a loop.
+    """
+    gc.freeze()
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-        if held:
-            before(*held[0])
+        gc.unfreeze()
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Python's collector waits until the block ends."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+class Alone:
+    """Refuses other threads, and holds SIGINT back until the block ends: a label is stored and counted, or neither."""
+
+    def __init__(self) -> None:
+        self._used = threading.RLock()
+        self._before: list[Any] = []  # handlers of SIGINT, of blocks within one another
+        self._held: list[tuple[int, FrameType | None]] = []
+
+    def __enter__(self) -> None:
+        if not self._used.acquire(blocking=False):
+            raise StoreError(
+                "Expected an engine that one thread uses, got a call while another thread is in one; use it in one thread."
+            )
+        try:
+            # Python delivers signals to the main thread alone. An ignored one interrupts nothing, nor one that C handles.
+            before = _signal.getsignal(SIGINT) if threading.current_thread() is threading.main_thread() else None
+            if callable(before):
+                _signal.signal(SIGINT, self._hold)
+        except BaseException:
+            self._used.release()
+            raise
+        self._before.append(before)
+
+    def _hold(self, number: int, frame: FrameType | None) -> None:
+        self._held.append((number, frame))
+
+    def __exit__(self, *exception: object) -> None:
+        before = self._before.pop()
+        try:
+            if callable(before):
+                _signal.signal(SIGINT, before)
+                held, self._held = self._held, []
+                if held:
+                    before(*held[0])
+        finally:
+            self._used.release()
 
 
 class DataEngine:
@@ -87,7 +148,7 @@ class DataEngine:
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
     policy : the user's two numbers.  trace : the traces' contract; None: the first sound trace sets it.
     radius, folds, retrain_every, budget : as in `Recipe`; None: the recipe decides.
-    store : None (memory), a URL or path (SQLite, PostgreSQL), or a `Store`. One that is not empty wants `DataEngine.open`.
+    store : None (memory), a file or URL (SQLite, PostgreSQL), an `SqlStore`. One that is not empty wants `DataEngine.open`.
     seed : of the reducer and of the audits' coin.
     recipe : a `Recipe`, a name or a TOML file, for all settings that are not given beside it; it names its own reducer.
     model : any `Model`, a rival, that decides by its own rule: of a policy only audit_rate and stops count then.
@@ -127,7 +188,9 @@ class DataEngine:
         with opening(store) as opened:
             if opened.settings():
                 raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
-            self._start(agreed(settings, opened), template, opened, executor, replaying, clock, on_safe_mode)
+            if settings.trace is None:
+                settings = replace(settings, trace=peers_trace(opened))
+            self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
                 self.store.save_settings(self._settings.now.to_store())
                 if opened.product is not None:
@@ -137,7 +200,7 @@ class DataEngine:
         self,
         settings: EngineSettings,
         template: EngineModel,
-        store: Store,
+        store: SqlStore,
         executor: Executor | None = None,
         replaying: bool = False,
         clock: Clock = time.perf_counter,
@@ -147,16 +210,14 @@ class DataEngine:
         torch.set_num_threads(1)
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
-        self._outbox = Outbox(store, owning=not reading, patient=replaying)
+        self._outbox = Outbox(store, settings.recipe.window, not reading, replaying)
         weakref.finalize(self, self._outbox.close)  # of a program that forgot to
-        self._used = threading.RLock()
-        self.seed, self.store, self.clock, self.resumed = settings.seed, store, clock, False
+        self._alone = Alone()
+        self.seed, self.store, self.clock, self.resumed, self._unseen = settings.seed, store, clock, False, True
         self._settings = SettingsInForce(settings, self._outbox)
         self._versions = ModelVersions(template, retrainer, self._outbox, clock, settings.evidence)
-        if store.product is not None:
-            self._versions.count = Fleet(store, self._versions)
         self._feedback = Feedback(self._outbox, self._versions, self._settings, on_safe_mode)
-        self._maker = DecisionMaker(self._settings)
+        self._maker = DecisionMaker(self._settings, store.clock)
         self._corrections = Corrections(self._outbox, self._settings, self._versions, self._feedback)
 
     @contextmanager
@@ -195,7 +256,7 @@ class DataEngine:
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
-            name = "the store" if isinstance(url, Store) else str(url)
+            name = str(url) if isinstance(url, str | os.PathLike) else "the store"
             settings = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
             engine._start(*settings.with_template(model), store, **options)
             with engine._closed_on_failure():
@@ -226,44 +287,31 @@ class DataEngine:
                 return cls(store=opened, **as_peers(settings | {"seed": seed}, opened, allowed))
             of_open = ("model", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in of_open if name in settings}
-            engine = cls.open(opened, reducer=object_of(**settings), allow_import=allowed, **options)
+            recipe, own = settings.get("recipe"), settings.get("reducer")
+            own = recipe.reducer if own is None and isinstance(recipe, Recipe) else own
+            engine = cls.open(opened, reducer=own, allow_import=allowed, **options)
             with engine._closed_on_failure():
                 engine._settings.now.must_agree_with(settings | {"seed": seed})
             return engine
-
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Uninterrupted; StoreError while another thread does something with the engine."""
-        if not self._used.acquire(blocking=False):
-            raise StoreError(
-                "Expected an engine that one thread uses, got a call while another thread is in one; use it in one thread."
-            )
-        try:
-            with uninterrupted():
-                yield
-        finally:
-            self._used.release()
 
     def decide(
         self,
         trace: ArrayLike,
         part: str | int | None = None,
         *,
-        wait: bool = False,
         decision_id: str | None = None,
         late: bool = False,
     ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
         part : the part's number, where one is known: a part that comes again has one vote, and none on itself.
-        wait : return only when the decision is in the store; by default it is there before any report on it returns.
         decision_id : of the caller's: the same id and trace have the same decision for ever, on the disk when this returns.
         late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
         for what is no id. Whatever else fails becomes VERIFY; an id that cannot be looked up too, and that is not recorded.
         """
         self._outbox.check()
-        with self._alone():
+        with self._alone:
             id_, number = None if decision_id is None else as_id(decision_id), as_part(part)
             if id_ is not None:
                 try:
@@ -281,8 +329,6 @@ class DataEngine:
             if id_ is not None and not self._outbox.secure() and known.decision.action is not Action.VERIFY:
                 known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
             self._feedback.decided(known)
-            if wait:
-                self._outbox.flush()
         return known.decision
 
     def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
@@ -329,9 +375,12 @@ class DataEngine:
         if self.trace is None and (spec := self._maker.first_contract(x, trace)) is not None:
             if self.agree_on(spec, inferred=True) != spec:  # a peer's trace came first
                 return as_agreed(trace, self.trace, False)
-            self._versions.template.look_ahead_safely(x[None])  # what will answer is compiled before there is much to do
         elif self._settings.waiting:
             self._settings.save()
+        if self._unseen and self.trace is not None:
+            self._unseen = False
+            if not self.version:  # what will answer is compiled before there is much to do
+                self._versions.template.look_ahead_safely(x[None])
         return x
 
     def report(
@@ -339,14 +388,15 @@ class DataEngine:
     ) -> RetrainReport | None:
         """Tell what became of a decision; the label survives a killed process once this returns.
 
-        success : what the verification said; False for a system stop after an accept, True for a part known to be fine.
+        success : what the verification said; False for a system stop after an accept, True for a part known to be fine. A
+            stop that comes after the part was confirmed, however late, takes that back: it counts as a correction.
         trace, part : only for a system stop whose decision was lost: it is then stored with this trace.
         Returns the retrain that this label set off, if any. Raises ReportError for an unknown id, a second report, a
         rejected part, or what is no label; StoreError where the label is not known to be taken: say the same again.
         """
         said, id_ = as_success(success), as_id(decision_id)  # refused before anything is written
         self._outbox.check()
-        with self._alone():
+        with self._alone:
             self._versions.collect()
             known = self._outbox.find(id_) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
@@ -366,7 +416,7 @@ class DataEngine:
     def retrain(self) -> RetrainReport:
         """Retrain now, in line; a candidate that fails its gate, or cannot be stored, is dropped and recorded."""
         self._outbox.check()
-        with self._alone():
+        with self._alone:
             return self._versions.retrain()
 
     def start_retrain(self) -> RetrainReport | None:
@@ -374,18 +424,23 @@ class DataEngine:
         return self._versions.start_retrain()
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
-        """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written."""
-        try:
+        """Drive a cell; iterate: a record a cycle, as it happens. What the cell raises propagates, after all is written.
+
+        Python's collector works between decisions, and after a hundred cycles only on what is newer: `gc.freeze`.
+        """
+        with ExitStack() as ending:
+            ending.callback(self.flush, UNHURRIED if self.store.wait is not None else None)
             for index in range(cycles):
+                if index == WARM_UP:
+                    ending.enter_context(frozen_objects())
                 yield self._cycle(cell, index)
-        finally:
-            self.flush(UNHURRIED if self.store.wait is not None else None)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         trace = cell.insert()
-        begin = self.clock()
-        decision = self.decide(trace, getattr(cell, "part", None))  # a cell may know its parts' numbers
-        seconds = self.clock() - begin
+        with uncollected():
+            begin = self.clock()
+            decision = self.decide(trace, getattr(cell, "part", None))  # a cell may know its parts' numbers
+            seconds = self.clock() - begin
         outcome, success, source = None, None, None
         if decision.action is Action.VERIFY:
             success = as_success(cell.verify(), f"decision {decision.id}, by verify()")
@@ -407,7 +462,7 @@ class DataEngine:
 
         brief : bring a version that an executor has trained a step further, a few milliseconds, and not to the end.
         """
-        with self._alone():
+        with self._alone:
             self._versions.collect(to_the_end=not brief)
             self._versions.work(self.recipe)
             return self._versions.take_news()
@@ -417,7 +472,7 @@ class DataEngine:
 
         StoreError where something is left that the journal does not take; close again when the disk is well.
         """
-        with self._alone():
+        with self._alone:
             if self._outbox.usable:
                 self._feedback.store_waiting()
                 self._versions.collect(CLOSE)
@@ -440,8 +495,8 @@ class DataEngine:
         return self._corrections.set_policy(policy, author)
 
     def set_shadow(self, on: bool, author: str = "") -> Changed:
-        """Verify every part from the next decision on, or end that; see `Corrections.set_shadow`."""
-        return self._corrections.set_shadow(on, author)
+        """Verify every part from the next decision on, or end that: `set_policy` with another `shadow`."""
+        return self.set_policy(replace(self.policy, shadow=on), author)
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """A decision with its trace, and with its label where it has one; None for an unknown id."""
@@ -501,17 +556,22 @@ class DataEngine:
     @property
     def safe_mode(self) -> str:
         """Why everything is verified, until fresh evidence keeps the tolerance again; "" where it is not."""
-        return self._feedback.safe_mode
+        return self._versions.newest.safe_mode
 
     @property
     def store_fault(self) -> str:
         """Why the store, or its journal, cannot be written at present; "" where both can."""
         return self._outbox.fault
 
+    @property
+    def store_lag(self) -> float:
+        """Age in seconds of the oldest record in the journal that the store has not taken; 0.0 where it has all."""
+        return self._outbox.lag
+
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return self.policy.certificate(self.store.outcomes(self._settings.now.policy_since))
+        return self.policy.certificate(self.store.outcomes(self._settings.now.policy_since, self.policy.label_within))
 
     @property
     def new_labels(self) -> int:
@@ -519,11 +579,36 @@ class DataEngine:
         return self._versions.new_labels
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """The decision as an exporter takes it. ExportError before the first retrain, and for a rival."""
+        """The decision as an exporter takes it. ExportError before the first retrain, for a rival, of a changed store."""
+        if self._outbox.doubt:
+            raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.doubt}")
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
         about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
         return replace(own, note=self._outbox.event, **about, **coin)
+
+    def status(self, last: int = NEWEST, watching: bool = False) -> Status:
+        """How it is doing, as a record; arguments and errors as in `history.status.status`."""
+        self.flush()
+        return self.as_it_runs(status(self.store, last, watching))
+
+    def as_it_runs(self, found: Status) -> Status:
+        """A status that was read from the store, with what only the running engine knows."""
+        live = ("version", "shadow", "safe_mode", "new_labels", "store_fault", "store_lag", "retraining")
+        return replace(found, **{name: getattr(self, name) for name in live})
+
+    def __repr__(self) -> str:
+        recipe, policy = self.recipe, self.policy
+        two = f"alpha {policy.alpha:g}, LB {100 * policy.lower_bound:g} %, {policy.guarantee}"
+        form = "no trace yet" if self.trace is None else f"traces {self.trace.channels} x {self.trace.samples}"
+        rest = ", safe mode" if self.safe_mode else ", shadow mode" if self.shadow else ""
+        return f"<DataEngine {recipe.name}: version {self.version}, {two}, {form}, {self.new_labels} new labels{rest}>"
+
+    _repr_html_ = in_html
+
+    def history_frame(self, last: int | None = None, **where: Any) -> pd.DataFrame:
+        """`history` as a DataFrame, a row a decision by its id, with its label and its time as a datetime."""
+        return as_frame(self.history(last, **where))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
         """The decisions so far, newest last, as they were recorded; arguments and errors as in `history.status.history`."""
@@ -532,31 +617,11 @@ class DataEngine:
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
         now = self._settings.now
-        under = Circumstances(now.recipe, now.trace, now.model, now.seed)
-        return explain(self.store, decision_id, neighbours, under, lambda: (self._versions.answering, self.version))
+        under = None if now.trace is None else Circumstances(now.recipe, now.trace, now.model, now.seed)
+        return explain(self.store, decision_id, neighbours, under)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def explain_stored(store: Store, decision_id: str, neighbours: int = 10, allow_import: bool = False) -> Explanation:
-    """`DataEngine.explain` of a store that no engine has open here; nothing in it changes. allow_import : as for `open`."""
-    return explain(store, decision_id, neighbours, present=lambda: _present(store, allow_import))
-
-
-def _present(store: Store, allow_import: bool) -> tuple[EngineModel | None, int]:
-    """The model that answers now, rebuilt, and its version; None where it needs an object that the store cannot name."""
-    try:
-        settings, template = EngineSettings.from_store(
-            store.settings(), "the store", allow_import=allow_import
-        ).with_template(None)
-        resumed = resume(store, template, Window(settings.recipe.window), settings.evidence)
-        return resumed.model, resumed.version
-    except ImportRefusedError:
-        raise
-    except DengineError as error:
-        log.info("the present model cannot be rebuilt from the store alone: %s", error)
-        return None, 0

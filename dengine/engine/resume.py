@@ -4,60 +4,21 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.base import EngineModel
-from ..store.base import Store
-from ..store.records import Correction, Evidence, ModelVersion, without_rule
+from ..store.records import Correction, Evidence, ModelVersion
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, Window
 
-
-@dataclass(frozen=True)
-class Resumed:
-    """Where an engine stood: the model that answered (None: no retrain yet), and the newest correction."""
-
-    model: EngineModel | None
-    version: int
-    new_labels: int
-    trained_on: TrainedOn | None
-    corrected_to: int
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 
-def resume(store: Store, template: EngineModel, window: Window, evidence: EvidenceWindow) -> Resumed:
-    """Fill the window and rebuild the answering model. Reference embeddings are read, not recomputed."""
-    version = store.last_version()  # before the labels: a peer may store both meanwhile
-    labelled = store.labelled(window.capacity)
-    window.refill(labelled)
-    # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
-    state = {} if version is None else version.state if version.version >= evidence.since else without_rule(version.state)
-    model = None if version is None else restored(store, template, state)
-    if version is None or model is None:
-        if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
-            template.look_ahead_safely(labelled.traces)
-        template.begin_safely_in(evidence.began_in)
-        _tell(template, store.evidence_since(0, evidence.since))
-        corrections = store.corrections()
-        return Resumed(None, 0, len(labelled.seq), None, corrections[-1].number if corrections else 0)
-    trained_on = TrainedOn.from_state(version.state)
-    model.prepare_safely(template)
-    model.look_ahead_safely(labelled.traces)
-    corrected_to = join_since(model, store, version, window)
-    told_to = int(version.state.get("told_to", version.last_seq))  # 0: a peer's, whose rule knows nothing of this cell
-    anew = not told_to or "untold" in version.state or version.version < evidence.since
-    if anew or corrected_to > corrected_at(version):
-        tell_all(model, store.evidence_since(0, evidence.since), evidence)
-    else:
-        _tell(model, store.evidence_since(told_to, evidence.since))
-    new_labels = int((labelled.seq > trained_on.counts_from).sum())
-    return Resumed(model, version.version, new_labels, trained_on, corrected_to)
-
-
-def restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
+def restored(store: SqlStore, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
     """The model of a version; None where it is refitted, and a trace that it was fitted on is damaged."""
     model = template.successor()
     # On the very traces that it was fitted on, with the labels that these had.
@@ -66,7 +27,7 @@ def restored(store: Store, template: EngineModel, state: Mapping[str, NDArray[An
     return model.set_state(state)
 
 
-def refit(model: EngineModel, store: Store, trained_on: TrainedOn) -> bool:
+def refit(model: EngineModel, store: SqlStore, trained_on: TrainedOn) -> bool:
     """Train a model on what another was trained on, with the labels of then; False where a trace of these is damaged."""
     first, last = int(trained_on.seq[0]), int(trained_on.seq[-1])
     data = store.labelled(first=first, last=last, corrected_to=trained_on.corrected_to)
@@ -90,7 +51,7 @@ def corrected_at(version: ModelVersion) -> int:
     return int(version.state.get("corrected_to", 0))
 
 
-def join_since(model: EngineModel, store: Store, version: ModelVersion, window: Window) -> int:
+def join_since(model: EngineModel, store: SqlStore, version: ModelVersion, window: Window) -> int:
     """Let a version's model learn what came since it was stored, in order; returns the newest correction's number."""
     corrected_to = corrected_at(version)
     as_of = corrected_to if model.keeps_references else None  # a rival cannot be corrected afterwards
@@ -98,8 +59,8 @@ def join_since(model: EngineModel, store: Store, version: ModelVersion, window: 
     since = store.labelled(window.capacity, first=known_to(version) + 1, last=window.newest_seq, corrected_to=as_of)
     corrections = deque(store.corrections(corrected_to))
     newest = corrections[-1].number if corrections else corrected_to
-    added = store.points_since(version.last_seq, version.version)
-    points = dict(zip(added.seq.tolist(), added.points, strict=True))
+    added = store.past_labels(version.last_seq, points=True)
+    points = {each.seq: each.point for each in added if each.model_version == version.version}
     for seq, trace, label, hash_ in zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True):
         while corrections and corrections[0].newest_seq < seq:
             change(model, store, corrections.popleft())
@@ -111,7 +72,7 @@ def join_since(model: EngineModel, store: Store, version: ModelVersion, window: 
     return newest
 
 
-def change(model: EngineModel, store: Store, correction: Correction) -> bool:
+def change(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     """Give a reference its corrected label, take it out, or let it join again; False where it is not what it should be."""
     if not model.keeps_references:
         return True
@@ -133,12 +94,13 @@ def tell_all(model: EngineModel, known: Evidence, evidence: EvidenceWindow) -> N
     """Reset a model's rule and replay its evidence."""
     model.forget()
     model.begin_safely_in(evidence.began_in)
-    _tell(model, known)
+    tell(model, known)
 
 
-def _tell(model: EngineModel, known: Evidence) -> None:
+def tell(model: EngineModel, known: Evidence) -> None:
+    """Tell a model's rule what became of parts, in the order of their labels."""
     if not model.remembers:
         return
-    columns = (known.lower, known.upper, known.success, known.novel, known.silent)
+    columns = (known.lower, known.upper, known.success, known.novel, known.silent, known.predicted, known.looked)
     for row in zip(*(column.tolist() for column in columns), strict=True):
         model.tell_safely(*row)

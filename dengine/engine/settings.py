@@ -6,7 +6,7 @@ import json
 import logging
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
 from ..decision.policy import Policy
@@ -16,6 +16,9 @@ from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT, Recipe, described
 from ..records import TraceSpec, is_whole, trace_in
 from ..store.outbox import Outbox
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 log = logging.getLogger("dengine")
 
@@ -61,7 +64,7 @@ class EngineSettings:
             raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
 
     def to_store(self) -> dict[str, str]:
-        """As `Store.save_settings` takes them."""
+        """As `SqlStore.save_settings` takes them."""
         known = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
         known |= {name: text for name in ("model", "described") if (text := getattr(self, name)) is not None}
         if self.trace is not None:
@@ -179,10 +182,22 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
         )
 
 
-def object_of(reducer: Any = None, recipe: Any = None, **others: Any) -> Any:
-    """The reducer among settings that is an object, if any: a store may not be able to bring it back."""
-    found = recipe.reducer if reducer is None and isinstance(recipe, Recipe) else reducer
-    return None if isinstance(found, str) else found
+def peers_trace(store: SqlStore) -> TraceSpec | None:
+    """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
+    return next(filter(None, map(trace_in, store.peers_settings().values())), None)
+
+
+def as_peers(asked: Mapping[str, Any], store: SqlStore, allow_import: bool | Collection[str]) -> dict[str, Any]:
+    """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
+    known = next(iter(store.peers_settings().values()), {})
+    filled = dict(asked)
+    if filled.get("seed") is None:
+        filled["seed"] = int(known.get("seed", 0))
+    chosen = any(filled.get(name) is not None for name in ("reducer", "recipe", "model"))
+    if "recipe" in known and not chosen and "described" not in known:  # an object must be handed in
+        filled["recipe"] = Recipe.from_toml(known["recipe"])
+        must_allow(filled["recipe"], "a peer in the store", allow_import)
+    return filled
 
 
 def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:

@@ -24,87 +24,67 @@ from ..store.records import Labelled
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
 SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
+LATE = "ended by the clock, before its last step"
 MARGIN = 1.2  # the tail grows a little with each retrain
 
 Clock = Callable[[], float]
 
 
 class Window:
-    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store."""
+    """The newest `capacity` labelled traces, in memory, blind to labels. Work on it does not grow with the store.
+
+    They lie in one block that is filled from its front and never overwritten, so that a snapshot is a view of it. A full
+    one is left to those who look at it, and what the window holds goes on in another, half as long again.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self._clear()
-
-    def _clear(self) -> None:
-        self.total = 0
-        self._traces: NDArray[np.float32] | None = None
-        self._labels = np.zeros(0, dtype=np.int8)
-        self._hashes = np.zeros(0, dtype=np.int64)
-        self._seq = np.zeros(0, dtype=np.int64)
-
-    def __len__(self) -> int:
-        return min(self.total, self.capacity)
+        self._block: list[NDArray[Any]] = []
+        self._first = self._end = 0  # what of it is held
+        nothing = np.zeros(0, np.int64)
+        self.refill(Labelled(nothing, np.zeros((0, 1, 1), np.float32), nothing.astype(np.int8), nothing))
 
     @property
     def newest_seq(self) -> int:
         """Sequence number of the newest label; 0 before the first."""
-        return int(self._seq[(self.total - 1) % self.capacity]) if self.total else 0
+        return int(self._block[0][self._end - 1]) if self._end else 0
 
     def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
-        """Take in one labelled trace (C, T); on a full window it takes the oldest one's place."""
-        self._grow(trace)
-        assert self._traces is not None  # for the type checker: _grow made it
-        if self.total == self.capacity:
-            self._traces = self._traces.copy()  # from now on places are taken again: who has a snapshot keeps the old ones
-        slot = self.total % self.capacity
-        self._traces[slot], self._labels[slot], self._hashes[slot], self._seq[slot] = trace, label, hash_, seq
-        self.total += 1
+        """Take in one labelled trace (C, T); on a full window the oldest one leaves."""
+        row = seq, trace, label, hash_
+        if self._end == len(self._block[0]):
+            held, n = [each[self._first :] for each in self._block], self._end - self._first
+            room = n + max(n // 2, 64)
+            shapes: list[tuple[int, ...]] = [(room,), (room, *trace.shape), (room,), (room,)]
+            self._block = [np.empty(shape, each.dtype) for shape, each in zip(shapes, held, strict=True)]
+            for new, each in zip(self._block, held if n else (), strict=False):
+                new[:n] = each
+            self._first, self._end = 0, n
+        for column, value in zip(self._block, row, strict=True):
+            column[self._end] = value
+        self._end += 1
+        self._first = max(self._first, self._end - self.capacity)
 
     def refill(self, labelled: Labelled) -> None:
         """Hold these, oldest first, in the place of all that was held."""
-        self._clear()
-        for row in zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True):
-            self.add(row[0], int(row[1]), int(row[2]), int(row[3]))
+        self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
+        self._end = len(labelled.seq)
+        self._first = max(0, self._end - self.capacity)
 
     def snapshot(self) -> Labelled:
-        """What is held, oldest first. Nobody writes to these arrays afterwards."""
-        order = self._order()
-        traces = np.zeros((0, 1, 1), dtype=np.float32) if self._traces is None else self._traces
-        # Until the window is full no place is written twice: only then they have to be copied.
-        traces = traces[: len(order)] if self.total <= self.capacity else traces[order]
-        return Labelled(self._seq[order], traces, self._labels[order], self._hashes[order])
+        """What is held, oldest first; it stays as it is, and is not to be written to."""
+        return Labelled(*(column[self._first : self._end] for column in self._block))
 
-    def newer(self, seq: int) -> NDArray[np.int64]:
+    def newer(self, seq: int) -> list[int]:
         """Sequence numbers of the labels after this one, in the order in which they came."""
-        held = self._seq[self._order()]
-        return held[held > seq]
+        held = self._block[0][self._first : self._end]
+        newer: list[int] = held[np.searchsorted(held, seq, "right") :].tolist()
+        return newer
 
     def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
         """Trace (C, T), label and hash of a label that is held."""
-        assert self._traces is not None  # the caller knows of the label; for the type checker
-        slot = int(np.flatnonzero(self._seq[: len(self)] == seq)[-1])
-        return self._traces[slot], int(self._labels[slot]), int(self._hashes[slot])
-
-    def _order(self) -> NDArray[np.int64]:
-        """The places of what is held, oldest first."""
-        n, first = len(self), self.total % self.capacity if self.total > self.capacity else 0
-        return (np.arange(n) + first) % self.capacity
-
-    def _grow(self, trace: NDArray[np.float32]) -> None:
-        # Doubled as needed: a full window of 10,000 x 1000 samples is 40 MB, and most cells start with none.
-        room = 0 if self._traces is None else len(self._traces)
-        if self.total < room or room == self.capacity:
-            return
-        size = min(self.capacity, max(64, 2 * room))
-        grown = np.zeros((size, *trace.shape), dtype=np.float32)
-        if self._traces is not None:
-            grown[:room] = self._traces
-        self._traces = grown
-        self._labels = np.concatenate([self._labels, np.zeros(size - room, dtype=np.int8)])
-        self._hashes, self._seq = (
-            np.concatenate([a, np.zeros(size - room, dtype=np.int64)]) for a in (self._hashes, self._seq)
-        )
+        i = int(np.searchsorted(self._block[0][: self._end], seq))
+        return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
 
 
 @dataclass(frozen=True)
@@ -178,11 +158,12 @@ class Retrainer:
         return self._measured(replace(trained, begin=begin))
 
     def start(self, current: EngineModel) -> bool:
-        """Train a successor of the current model beside the cell; False where the executor takes no more work."""
-        assert self.executor is not None  # the caller asked; for the type checker
+        """Train a successor of the current model beside the cell; False without an executor that takes work."""
+        if self.executor is None:
+            return False
         data = self.window.snapshot()
         try:
-            self.future = self.executor.submit(_train_beside, current.successor(), data, self.limits, self.clock)
+            self.future = self.executor.submit(train_candidate, current.successor(), data, self.limits, self.clock)
         except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
             log.error("the executor takes no more work, retrains are in line from now on: %s", error)
             self.executor = None
@@ -220,16 +201,12 @@ class Retrainer:
         return trained
 
 
-def _train_beside(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
-    torch.set_num_threads(1)  # per thread, and first thing in each
-    return train_candidate(successor, data, limits, clock)
-
-
 def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
     """Train a successor on the data; a plain function, so that any executor can run it.
 
     The gate reads no label: one on held-out loss would let fold k's labels choose encoder k.
     """
+    torch.set_num_threads(1)  # per thread, and first thing in each
     begin = clock()
     deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
     stop = StopRule(deadline, limits.max_steps, clock)
@@ -240,7 +217,8 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
         report = successor.train(data.traces, data.labels, data.hashes, stop, data.seq).report
         n_steps, defect = report.n_steps, successor.defect()
         model = None if defect else successor
-        reason = f"dropped: {defect}" if defect else "; ".join(filter(None, ("accepted", report.note)))
+        said = ("accepted", report.note, LATE if stop.late else "")
+        reason = f"dropped: {defect}" if defect else "; ".join(filter(None, said))
     except DengineError as error:
         model, reason = None, f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell: it is recorded

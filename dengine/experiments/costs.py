@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..decision.policy import Policy
-from ..errors import SettingError, percent
-from .grid import Folder, OnDone, Task, grid_tasks, play_tasks
+from ..errors import expect, percent
+from .grid import Folder, grid_tasks, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
 from .replay import Replay
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-ALPHAS = (0.5, 0.1, 0.05)
+ALPHAS = (0.2, 0.1, 0.05)
 LOWER_BOUNDS = (0.8, 0.9, 0.95, 0.98, 0.99)
 REPEATS = 10  # shuffles, half of them to choose by
 LEVEL = 0.05  # of the intervals
@@ -45,8 +45,8 @@ class PolicyCost:
     cost : mean cost a part.
     lower, upper : the cost with both shares of wrong decisions at the ends of their intervals, together 95 %.
     late : mean cost a part over the last third of each shuffle, once something was learned.
-    verified, accepted, rejected : shares of all parts.  bad : bad parts among the accepted.  good : good ones among the
-    rejected.
+    verified, certain : shares of all parts, checked or not.
+    bad : bad parts among the accepted.  good : good ones among the rejected.
     """
 
     policy: Policy
@@ -56,15 +56,9 @@ class PolicyCost:
     upper: float
     late: float
     verified: float
-    accepted: float
-    rejected: float
+    certain: float
     bad: ErrorRate
     good: ErrorRate
-
-    @property
-    def certain(self) -> float:
-        """Share of the parts that were decided without a check."""
-        return self.accepted + self.rejected
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +128,9 @@ class CostCurve:
         import pandas as pd
 
         frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")  # policy_alpha, bad_rate …
-        about = frame[["policy_alpha", "policy_lower_bound"]].rename(columns=lambda name: name.removeprefix("policy_"))
-        frame = about.join(frame[[name for name in frame if not name.startswith("policy_")]])
-        return frame.assign(chosen=[row.policy == self.policy for row in self.rows])
+        own = [name for name in frame if not name.startswith("policy_")]
+        two = {"policy_alpha": "alpha", "policy_lower_bound": "lower_bound"}
+        return frame[[*two, *own]].rename(columns=two).assign(chosen=[row.policy == self.policy for row in self.rows])
 
 
 def cost_curve(
@@ -153,7 +147,6 @@ def cost_curve(
     cycles: int | None = None,
     n_jobs: int = 1,
     keep: Folder | None = None,
-    on_done: OnDone = None,
 ) -> CostCurve:
     """Replay recordings under every alpha and lower bound, and say what a part cost.
 
@@ -161,21 +154,13 @@ def cost_curve(
     check, escape, false_reject : as in `Costs`, in one unit.
     recipe : anything `Recipe.load` takes; of its policy alpha and lower_bound are replaced, the rest is kept.
     repeats : shuffles of each policy, 2 or more: the first half of them chooses, the other reports.  seed : of the first.
-    cycles : parts of each shuffle; None: all.  n_jobs, keep, on_done : as in `run_grid`.
+    cycles : parts of each shuffle; None: all.  n_jobs, keep : as in `run_grid`.
     SettingError for a cost, a policy or a number of repeats that is none.
     """
     costs = Costs(check, escape, false_reject)
-    tasks = cost_tasks(recipe, alphas, lower_bounds, range(seed, seed + repeats), cycles)
-    return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done), costs)
-
-
-def cost_tasks(
-    recipe: Any, alphas: Sequence[float], lower_bounds: Sequence[float], seeds: range, cycles: int | None = None
-) -> list[Task]:
-    """The replays that a curve is made of. SettingError where they would be too few, before one is played."""
-    if len(seeds) < 2:
-        raise SettingError(f"Expected 2 or more repeats, got {len(seeds)}: one half chooses, the other one reports.")
-    return grid_tasks([recipe], alphas, lower_bounds, seeds=seeds, cycles=cycles)
+    expect(repeats >= 2, "2 or more repeats", repeats, "one half chooses, the other one reports")
+    tasks = grid_tasks([recipe], alphas, lower_bounds, seeds=range(seed, seed + repeats), cycles=cycles)
+    return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep), costs)
 
 
 def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
@@ -186,8 +171,7 @@ def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
     policies = list(dict.fromkeys(each.recipe.policy for each in replays))
     of = {(each.recipe.policy, each.seed): each for each in replays}
     seeds = [seed for seed in sorted({each.seed for each in replays}) if all((one, seed) in of for one in policies)]
-    if len(seeds) < 2:
-        raise SettingError(f"Expected 2 or more shuffles that every policy has played, got {len(seeds)}.")
+    expect(len(seeds) >= 2, "2 or more shuffles that every policy has played", len(seeds))
     half = len(seeds) // 2
     rows = [
         _row(policy, [of[policy, seed] for seed in seeds[:half]], [of[policy, seed] for seed in seeds[half:]], costs)
@@ -198,17 +182,11 @@ def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
 
 
 def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs) -> PolicyCost:
-    shares = {
-        name: float(np.mean([getattr(each, name) for each in reporting])) for name in ("verified", "accepted", "rejected")
-    }
+    accepted, rejected = (float(np.mean([getattr(r, side) for r in reporting])) for side in ("accepted", "rejected"))
     # Each at half the level: together they hold at LEVEL.
     bad, good = (pooled_error(reporting, side, LEVEL / 2) for side in ("accepted", "rejected"))
-    lower, upper = (
-        costs.check * shares["verified"]
-        + costs.escape * shares["accepted"] * getattr(bad, end)
-        + costs.false_reject * shares["rejected"] * getattr(good, end)
-        for end in ("lower", "upper")
-    )
+    ends = ((bad.lower, good.lower), (bad.upper, good.upper))
+    lower, upper = (costs.check - costs.saved(accepted + rejected, accepted * fp, rejected * fn) for fp, fn in ends)
     return PolicyCost(
         policy=policy,
         chosen_by=_expected_cost(choosing, costs),
@@ -216,9 +194,10 @@ def _row(policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay]
         lower=lower,
         upper=upper,
         late=float(np.mean([cost_a_part(each, costs, slice(2 * len(each) // 3, None)) for each in reporting])),
+        verified=1.0 - accepted - rejected,
+        certain=accepted + rejected,
         bad=bad,
         good=good,
-        **shares,
     )
 
 

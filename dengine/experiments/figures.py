@@ -1,5 +1,5 @@
 """Pictures as matplotlib figures, without pyplot, whose global state leaks into notebooks: of replays, grids and costs;
-of a run, a data set, one decision among its neighbours, and a store over all of its cycles.
+of a run, a data set, and one decision among its neighbours.
 
     save(curves({"conv": replays}), "out/curves.png")
 
@@ -8,7 +8,7 @@ Colours: Okabe and Ito (2008), distinct to all eyes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from itertools import cycle, product
 from pathlib import Path
@@ -21,11 +21,9 @@ from ..datasets import Dataset
 from ..errors import OutputError
 from ..files import write_output
 from ..history.explain import Bound, Explanation
-from ..history.status import Course
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import reducer_class
-from ..store.records import SAFE_MODE_ENDED
 from ..traces import as_traces
 from .costs import CostCurve
 from .replay import Replay
@@ -45,6 +43,8 @@ RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first those that mean nothing
 LIMIT: Look = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound, or a moment, that is given
 SMALL = 9  # points: legends and notes
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
+ERRORS = (("false_positive", "accepted", "bad", "-"), ("false_negative", "rejected", "good", "--"))
+GRID_LINES = ("certain, of all cycles", "precision, of accepted", "LB", "bad of accepted", "good of rejected", "100 - LB")
 KINDS = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 CLEAR = 0.1  # band widths below which leaving the band is not marked
 FEWEST = 20  # parts: a share of fewer jumps by more than five in a hundred with each, and is not drawn
@@ -108,14 +108,6 @@ def note(axes: Axes, text: str, colour: str = BLACK) -> None:
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour)
 
 
-def draw_verified(
-    axes: Axes, verified: NDArray[np.bool_], window: int, colour: str = VERIFIED, label: str = "verified"
-) -> None:
-    """Share of the parts that were checked, (n,), over the last `window` cycles."""
-    axes.plot(numbers(len(verified)), 100 * sliding_mean(verified, window), color=colour, label=label)
-    axes.set(ylim=(0, 104))
-
-
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
     """Write a figure as its suffix says; makes the folder. OutputError where a file is there, without `force`."""
     buffer = BytesIO()
@@ -139,7 +131,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     recipe fixes its radius. Units are equal on both axes, unless the first is a probability: then the second is for the
     eye, and the ball is cut off above and below.
     """
-    figure, recipe = blank(10.0, 5.4, title), replay.recipe
+    figure, recipe = blank(10.0, 6.2, title), replay.recipe
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
@@ -157,39 +149,27 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
         finish(axes, xlabel=first)
         axes.set_title(name, pad=24)
     left.set(ylabel=second)
-    if probability:
-        left.set(xlim=(-0.06, 1.06), ylim=_around(z[:, 1]))
-    else:
-        span = max(np.ptp(_around(z[:, i])) for i in (0, 1))
-        left.set(xlim=_around(z[:, 0], span), ylim=_around(z[:, 1], span))
-        for axes in (left, right):
-            axes.set_aspect("equal")
-    if known.any() and recipe.fraction is None:  # one that grows with the references has no radius of its own
-        cut = ", cut off above and below" if probability else ""
-        _draw_balls(figure, z[known][-1], recipe.radius, f"the ball around the newest part, radius {recipe.radius:g}{cut}")
+    if known.any():
+        low, high = z[known].min(axis=0), z[known].max(axis=0)
+        half = 0.56 * (high - low) + 1e-9
+        half = half if probability else np.full(2, half.max())
+        (x0, y0), (x1, y1) = (low + high) / 2 - half, (low + high) / 2 + half
+        left.set(xlim=(-0.06, 1.06) if probability else (x0, x1), ylim=(y0, y1))
+        if recipe.fraction is None:  # one that grows with the references has no radius of its own
+            cut = ", cut off above and below" if probability else ""
+            _draw_balls(figure, z[known][-1], recipe.radius, f"ball around the newest part, radius {recipe.radius:g}{cut}")
+    for axes in () if probability else (left, right):
+        axes.set_aspect("equal")
     return figure
 
 
 def _draw_balls(figure: Figure, centre: Floats, radius: float, label: str) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Circle
 
-    x, y = centre
     for axes in figure.axes:
-        axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
-        axes.plot([x], [y], "+", color=BLACK, markersize=9)
-    ring = Line2D([], [], color=BLACK, marker="o", markersize=11, fillstyle="none", linestyle="none", label=label)
-    figure.legend(handles=[ring], loc="outside lower center", frameon=False, fontsize=SMALL)
-
-
-def _around(values: Floats, span: float = 0.0) -> tuple[float, float]:
-    """Limits of an axis: the known values with a margin, or as wide as `span` where that is more."""
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return -1.0, 1.0
-    low, high = float(known.min()), float(known.max())
-    half = max(0.56 * (high - low), span / 2) or 1.0
-    return (low + high) / 2 - half, (low + high) / 2 + half
+        axes.add_patch(Circle((centre[0], centre[1]), radius, fill=False, edgecolor=BLACK, linewidth=1.4))
+        (mark,) = axes.plot(*centre, "+", color=BLACK, markersize=9, label=label)
+    figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
 
 
 def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> dict[str, Floats]:
@@ -228,19 +208,9 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
     all_replays = [r for replays in by_recipe.values() for r in replays]
     window, bounds = fitting(window, all_replays), sorted({r.recipe.policy.lower_bound for r in all_replays})
     for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
-        lead = f"{name}: " if len(by_recipe) > 1 else ""
-        lines = _draw_certain(top, replays, window, colour, colour, lead)
-        # The counts beside the names: where too few parts were decided alike for a curve, they still say what went wrong.
-        counts = [each.stretch() for each in replays]
-        for wrong, decided, kind, style in (
-            ("false_positive", "accepted", "bad", "-"),
-            ("false_negative", "rejected", "good", "--"),
-        ):
-            label = f"{lead}{sum(n[wrong] for n in counts)} {kind} of {sum(n[decided] for n in counts)} {decided}"
-            bottom.plot(numbers(len(lines[wrong])), lines[wrong], style, color=colour, label=label)
+        _draw_replays(top, bottom, replays, window, colour, f"{name}: " if len(by_recipe) > 1 else "")
     for bound in bounds:
-        top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
-        bottom.axhline(100 * (1 - bound), label=f"tolerance 100 - LB = {100 * (1 - bound):g} %", **LIMIT)
+        _draw_bounds(top, bottom, bound)
     finish(top, wide + 1, ylim=(0, 102), ylabel="share [%]")
     # Above the tolerance at least half as much again: whether the errors keep to it is what the panel is there for.
     highest = max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))
@@ -249,16 +219,54 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
     return figure
 
 
-def _draw_certain(
-    axes: Axes, replays: Sequence[Replay], window: int, colour: str, precision: str, lead: str = ""
-) -> dict[str, Floats]:
-    """The certain share with its spread, and the precision, in these colours; returns all of `window_curves`."""
-    lines = window_curves(replays, window, FEWEST)
+def _draw_replays(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str = "") -> None:
+    """Above the certain share with its spread, and the precision; below the errors, with their counts in the legend."""
+    lines, counts = window_curves(replays, window, FEWEST), [each.stretch() for each in replays]
     x = numbers(len(lines["certain"]))
-    axes.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
-    axes.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
-    axes.plot(x, lines["precision"], color=precision, linestyle="--", label=f"{lead}precision, of accepted")
-    return lines
+    top.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
+    top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
+    top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
+    # Where too few parts were decided alike for a curve, the counts still say what went wrong.
+    for wrong, decided, kind, style in ERRORS:
+        label = f"{lead}{sum(n[wrong] for n in counts)} {kind} of {sum(n[decided] for n in counts)} {decided}"
+        bottom.plot(x, lines[wrong], style, color=colour, label=label)
+
+
+def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
+    top.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
+    bottom.axhline(100 * (1 - bound), label=f"tolerance 100 - LB = {100 * (1 - bound):g} %", **LIMIT)
+
+
+def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
+    """The paper's figure of its grid: a row an alpha, from the largest; a column an LB; in each cell what `curves` draws.
+
+    replays : of one contender and interval, all equally long.
+    Source: the paper's figure "Results obtained with varying values of the parameters alpha and LB"; there the errors are
+    shares of all cycles.
+    """
+    cells: dict[tuple[float, float], list[Replay]] = {}
+    for r in replays:
+        cells.setdefault((r.recipe.policy.alpha, r.recipe.policy.lower_bound), []).append(r)
+    alphas, bounds = sorted({alpha for alpha, _ in cells}, reverse=True), sorted({bound for _, bound in cells})
+    figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas), title)
+    heights, window = [3, 1.6] * len(alphas), fitting(window, replays)
+    axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
+    for (i, alpha), (j, bound) in product(enumerate(alphas), enumerate(bounds)):
+        top, bottom = axes[2 * i : 2 * i + 2, j]
+        top.set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
+        if (alpha, bound) in cells:
+            _draw_replays(top, bottom, cells[alpha, bound], window, GREEN)
+            _draw_bounds(top, bottom, bound)
+    for i, row in enumerate(axes):
+        row[0].set(ylabel="wrong [%]" if i % 2 else "share [%]", ylim=(0, None) if i % 2 else (0, 102))
+        for each in row:
+            finish(each, legend=0)
+    for each in axes[-1]:
+        each.set_xlabel(f"cycle (end of a window of {window})")
+    drawn = next(pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines)
+    handles = [line for each in drawn for line in each.lines]
+    figure.legend(handles, GRID_LINES, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
+    return figure
 
 
 def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
@@ -266,8 +274,8 @@ def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     window, x, timed = fitting(window, [log]), numbers(len(log)), log.clock_s is not None
     figure = blank(9.0, 8.5 if timed else 6.0, title)
     axes = figure.subplots(3 if timed else 2, 1, sharex=True)
-    draw_verified(axes[0], log.verified, window)
-    finish(axes[0], legend=0, ylabel=f"verified, last {window} [%]")
+    axes[0].plot(x, 100 * sliding_mean(log.verified, window), color=VERIFIED)
+    finish(axes[0], legend=0, ylim=(0, 104), ylabel=f"verified, last {window} [%]")
     wrong = np.cumsum([log.false_positive, log.false_negative], axis=1)
     axes[1].step(x, wrong[0], "-", where="post", color=BAD, label="bad part accepted (FP)")
     axes[1].step(x, wrong[1], "--", where="post", color=GOOD, label="good part rejected (FN)")
@@ -286,46 +294,6 @@ def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
         note(axes[0], "no cycle was finished")
     axes[-1].set(xlabel="cycle")
     return figure
-
-
-def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
-    """The paper's figure of its grid: a row an alpha, from the largest; a column an LB, each cell in two parts.
-
-    Above: share of certain decisions and precision in a sliding window; below: the shares of all decisions in the window
-    that were false positives and false negatives. replays : of one contender and interval, all equally long.
-    Source: the paper's figure "Results obtained with varying values of the parameters alpha and LB".
-    """
-    cells: dict[tuple[float, float], list[Replay]] = {}
-    for r in replays:
-        cells.setdefault((r.recipe.policy.alpha, r.recipe.policy.lower_bound), []).append(r)
-    alphas, bounds = sorted({alpha for alpha, _ in cells}, reverse=True), sorted({bound for _, bound in cells})
-    figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas), title)
-    heights, window = [3, 1.6] * len(alphas), fitting(window, replays)
-    axes = figure.subplots(2 * len(alphas), len(bounds), sharex=True, sharey="row", height_ratios=heights, squeeze=False)
-    for (i, alpha), (j, bound) in product(enumerate(alphas), enumerate(bounds)):
-        axes[2 * i, j].set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
-        if (alpha, bound) in cells:
-            _draw_cell(axes[2 * i, j], axes[2 * i + 1, j], cells[alpha, bound], bound, window)
-    for each in axes.flat:
-        finish(each, legend=0)
-    for i, row in enumerate(axes):
-        row[0].set(ylabel="wrong [%]" if i % 2 else "share [%]", ylim=(0, None) if i % 2 else (0, 102))
-    for each in axes[-1]:
-        each.set_xlabel(f"cycle (end of a window of {window})")
-    drawn = next(pair for pair in zip(axes[0::2].flat, axes[1::2].flat, strict=True) if pair[0].lines)
-    handles = [line for each in drawn for line in each.lines]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=SMALL)
-    return figure
-
-
-def _draw_cell(top: Axes, bottom: Axes, replays: Sequence[Replay], bound: float, window: int) -> None:
-    _draw_certain(top, replays, window, GREEN, GOOD)
-    top.axhline(100 * bound, label="LB", **LIMIT)
-    for name, colour, style in (("false_positive", BAD, "-"), ("false_negative", GOOD, "-.")):
-        wrong = 100 * sliding_mean(np.mean([getattr(r, name) for r in replays], axis=0), window)
-        label = f"{name.replace('_', ' ')}s, of all cycles"
-        bottom.plot(numbers(len(wrong)), wrong, style, color=colour, linewidth=1.2, label=label)
-    bottom.axhline(100 * (1 - bound), label="100 - LB", **LIMIT)
 
 
 def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
@@ -372,22 +340,19 @@ def explained_picture(found: Explanation) -> Figure:
     for each in () if found.envelope is None else found.envelope.excesses:
         widest[each.channel] = max(widest[each.channel], each.widths)
     channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())  # those that leave the band farthest
-    heights = [1.5 + 2.3 * len(channels), 2.6] if found.neighbours or found.bound else [1.5 + 2.3 * len(channels)]
     version = f"version {made.model_version}" if made.model_version else "no model yet"
-    figure = blank(10.0, sum(heights))
     words = f"{made.id}: {made.action.value}, {made.reason.value} ({version}); label: {past.label}"
-    figure.suptitle(words, fontweight="bold")
-    rows = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
-    above = rows[0].subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
-    for i, (axes, channel) in enumerate(zip(above, channels, strict=True)):
+    figure = blank(10.0, 4.1 + 2.3 * len(channels), words)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1.5 + 2.3 * len(channels), 2.6))[:, 0]
+    panels = above.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
         _draw_trace(axes, found, channel)
         name = spec.columns[channel] if spec.columns else "trace" if spec.channels == 1 else f"channel {channel + 1}"
         finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.unit}]")
-    above[-1].set(xlabel="time [s]")
-    if len(rows) > 1:
-        left, right = rows[1].subplots(1, 2, width_ratios=(1.15, 1.0))
-        _draw_distances(left, found)
-        _draw_bound(right, found.bound)
+    panels[-1].set(xlabel="time [s]")
+    left, right = below.subplots(1, 2, width_ratios=(1.15, 1.0))
+    _draw_distances(left, found)
+    _draw_bound(right, found.bound)
     return figure
 
 
@@ -416,101 +381,32 @@ def _draw_distances(axes: Axes, found: Explanation) -> None:
         note(axes, "no neighbours", GREY)
         finish(axes, legend=0, xticks=[], yticks=[])
         return
-    spaces = sorted({each.space for each in near})
+    spaces, end = sorted({each.space for each in near}), max(each.distance for each in near)
     for success, name, colour, _, marker in KINDS:
-        some = [(each.distance, spaces.index(each.space)) for each in near if each.success is success]
-        if some:
-            x, y = zip(*some, strict=True)
-            axes.scatter(x, y, s=34, color=colour, marker=marker, alpha=0.8, label=name)
-    end = max(each.distance for each in near)
-    if found.radius <= 3.0 * end:
-        axes.axvline(found.radius, label=f"ball, radius {found.radius:.3g}", **LIMIT)
-        end = max(end, found.radius)
-    else:
-        axes.plot([], [], " ", label=f"all inside the ball, radius {found.radius:.3g}")
+        some = [each for each in near if each.success is success]
+        x, y = [each.distance for each in some], [spaces.index(each.space) for each in some]
+        axes.scatter(x, y, s=34, color=colour, marker=marker, alpha=0.8, label=name)
+    axes.axvline(found.radius, label=f"ball, radius {found.radius:.3g}", **LIMIT)
+    end = max(end, found.radius) if found.radius <= 3.0 * end else end  # else all are inside, and it is not in view
     axes.set(yticks=range(len(spaces)), yticklabels=[f"fold {space}" for space in spaces])
-    name = f"distance of the nearest references of version {found.neighbours_version} [scaled]"
+    name = f"distance of the nearest references of version {found.decision.decision.model_version} [scaled]"
     finish(axes, ylim=(-0.7, len(spaces) - 0.3), xlim=(0.0, 1.08 * max(end, 1e-9)), xlabel=name)
 
 
 def _draw_bound(axes: Axes, bound: Bound | None) -> None:
-    """The interval of the success rate, and what it was held against."""
     axes.set(yticks=[], xlim=(-0.02, 1.02), ylim=(-1.0, 1.0), xlabel="success rate in the ball")
     if bound is None:
         note(axes, "no bound was asked for", GREY)
         finish(axes, legend=0)
         return
-    n = bound.n_success + bound.n_failure
-    if n:
+    if n := bound.n_success + bound.n_failure:
         axes.plot([bound.n_success / n], [0.0], "o", color=BLACK, label=f"{bound.n_success} of {n}")
-    axes.plot([bound.lower, bound.upper], [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label="bound")
+    text = f"bound: {bound.lower:.3f} to {bound.upper:.3f}"
+    axes.plot([bound.lower, bound.upper], [0.0, 0.0], color=BLACK, linewidth=3.0, alpha=0.7, label=text)
     for at, colour, name in ((bound.accept_at, GOOD, "accept from"), (bound.reject_at, BAD, "reject up to")):
         if at is not None:
             axes.axvline(at, color=colour, linestyle=":", linewidth=1.5, label=f"{name} {at:.3g}")
-    text, middle = f"{bound.lower:.3f} to {bound.upper:.3f}", 0.5 * (bound.lower + bound.upper)
-    side, x = ("left", bound.lower) if middle < 0.2 else ("right", bound.upper) if middle > 0.8 else ("center", middle)
-    axes.annotate(text, (x, 0.0), xytext=(0, 9), textcoords="offset points", ha=side, fontsize=SMALL)
     finish(axes, legend=2)
-
-
-def status_picture(course: Course, title: str = "") -> Figure:
-    """Above, the verified and the novel share of each stretch; below, bad accepted parts so far and what is tolerated."""
-    figure = blank(10.0, 6.4, title)
-    top, bottom = figure.subplots(2, 1, sharex=True)
-    n, verified, novel, accepted, bad = (
-        np.array([getattr(each, name) for each in course.stretches], dtype=np.float64)
-        for name in ("n", "verified", "novel", "accepted", "bad")
-    )
-    ends = np.cumsum(n)
-    top.plot(ends - n / 2, 100 * verified / np.maximum(n, 1), color=VERIFIED, label="verified")
-    if novel.any():
-        top.plot(ends - n / 2, 100 * novel / np.maximum(n, 1), "--", color=PINK, label="novel")
-    x, accepted, bad = (np.concatenate([[0.0], each]) for each in (ends, np.cumsum(accepted), np.cumsum(bad)))
-    total, tolerated = f"{bad[-1]:.0f} bad of {accepted[-1]:,.0f}" if len(n) else "none", course.tolerance * accepted
-    bottom.plot(x, bad, color=BAD, label=f"known bad ({total} accepted)")
-    bottom.plot(x, tolerated, ":", color=BLACK, label=f"tolerated, {100 * course.tolerance:g} % of the accepted")
-    if len(n):
-        bottom.set(xlim=(0, ends[-1] * 1.01))
-        _mark_events(top, bottom, course, ends)
-    else:
-        note(top, "no decision yet")
-    finish(top, 4, ylim=(0, 104), ylabel="share of the parts [%]")
-    bottom.locator_params(axis="y", nbins=6, integer=True)
-    highest, every = max(1.0, 1.1 * tolerated[-1], 1.1 * bad[-1]), f", {n[0]:.0f} a point" if len(n) and n[0] > 1 else ""
-    finish(bottom, 4, ylim=(0, highest), ylabel="bad accepted parts so far", xlabel=f"cycle{every}")
-    return figure
-
-
-def _mark_events(top: Axes, bottom: Axes, course: Course, ends: Floats) -> None:
-    def cycles(times: list[float]) -> list[float]:
-        """At which cycle something happened, to within a stretch."""
-        return [float(at) for at in np.interp(times, [each.last for each in course.stretches], ends)]
-
-    for kept, marker, colour, name in ((True, "^", GREEN, "retrained"), (False, "x", BAD, "retrain dropped")):
-        if at := cycles([each.time for each in course.retrains if each.report.accepted is kept]):
-            look: Look = {"marker": marker, "color": colour, "label": f"{name} ({len(at)})"}
-            top.scatter(at, np.full(len(at), 2.5), s=26, zorder=3, clip_on=False, **look)
-    begun = [event.kind != SAFE_MODE_ENDED for event in course.modes]
-    safe = list(_safe_modes(begun, cycles([each.time for each in course.modes]), float(ends[-1])))
-    for axes in (top, bottom):
-        for i, (begin, end) in enumerate(safe):
-            axes.axvspan(begin, end, color=ORANGE, alpha=0.25, linewidth=0, label="safe mode" if i == 0 else None)
-        if course.last < ends[-1]:
-            label = f"the last {course.last:,}"
-            axes.axvspan(ends[-1] - course.last, ends[-1], color=SKY, alpha=0.15, linewidth=0, label=label, zorder=0)
-
-
-def _safe_modes(begun: Sequence[bool], cycles: Sequence[float], last: float) -> Iterator[tuple[float, float]]:
-    """From which cycle to which everything was verified; a safe mode that lasts ends with the newest cycle."""
-    since: float | None = None
-    for begins, at in zip(begun, cycles, strict=True):
-        if begins:
-            since = at if since is None else since
-        elif since is not None:
-            yield since, at
-            since = None
-    if since is not None:
-        yield since, last
 
 
 def data_picture(data: Dataset, title: str = "") -> Figure:
@@ -539,13 +435,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     share.plot(x[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}")
     share.axhline(100 * y.mean(), label="good, of all", **LIMIT)
     finish(share, ylim=(0, 104), ylabel="share [%]")
-    x, means = np.flatnonzero(shown) + 1, levels(X[shown, :1])[:, 0]
     for label, name, colour, _, _ in KINDS:
-        some = y[shown] == label
-        level.scatter(x[some], means[some], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
-    window = max(1, len(means) // 10)
-    if len(means) >= window:
-        middle = np.median(np.lib.stride_tricks.sliding_window_view(means, window), axis=1)
-        level.plot(x[window - 1 :], middle, color=BLACK, linewidth=1.2, label=f"median of the last {window}")
+        some = shown & (y == label)
+        level.scatter(x[some], levels(X[some, :1])[:, 0], s=8, color=colour, alpha=0.5, linewidths=0, label=name)
     finish(level, xlabel="recording, in the order in which they were made", ylabel=f"mean {names[0]}{unit}")
     return figure

@@ -10,28 +10,25 @@ seed, dengine's own source, and the libraries that compute. Nothing is unpickled
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
 import sys
-import zipfile
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib.metadata import distributions
 from inspect import getsourcefile, isfunction
+from io import BytesIO
+from itertools import product
 from pathlib import Path
 from pickle import PicklingError
 from typing import TYPE_CHECKING, Any, NamedTuple
-from uuid import uuid4
 
 import numpy as np
 
 from ..datasets import Dataset, load_dataset
-from ..engine.settings import flat
-from ..errors import SettingError
-from ..recipe import described
+from ..errors import DataError, SettingError, expect
+from ..files import read_archive, reading, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
 from .replay import Contender, Replay, replay
@@ -42,12 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Folder = str | os.PathLike[str]
-OnDone = Callable[[Replay], None] | None
-TOLD_APART = ("interval", "alpha", "lower_bound", "guarantee", "stops")  # of a policy: columns of their own in every table
-LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon", "mapie", "river")
-DAMAGED = (  # what reading a damaged file ends in, by where the damage is
-    OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError
-)  # fmt: skip
+LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon")
 
 
 @dataclass(frozen=True)
@@ -65,12 +57,11 @@ class KeptReplays:
     """A folder of finished replays of one data set; made if need be."""
 
     def __init__(self, folder: Folder, data: Dataset) -> None:
+        from joblib import hash as digest
+
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        digest = hashlib.sha256(f"{data.name} {data.X.shape} {data.rate_hz}".encode())
-        for array in (data.X, data.y, data.part):
-            digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-        self._of_data = digest.hexdigest()
+        self._digest, self._of_data = digest, digest((data.name, data.X, data.y, data.part, data.rate_hz))
 
     def path(self, task: Task) -> Path:
         """Where the replay of a task is kept: a hash of all that its decisions depend on, a reducer's own files among it.
@@ -78,39 +69,38 @@ class KeptReplays:
         SettingError for a reducer that cannot be told apart from others.
         """
         who, own = task.contender, task.contender.recipe.reducer
-        by_name = isinstance(own, str)
-        parts = [reducer_class(own)] if by_name else _parts_of(own)
-        handed_in = [] if by_name else [described(own), _digest_of_reducer(own)]
-        how = [task.seed, task.cycles, task.shuffle, task.confirm, who.rival, sorted(who.params.items())]
-        said = [self._of_data, _digest_of_source(), *map(_source_of, parts), *handed_in, who.recipe.to_toml(), str(how)]
-        return self.folder / f"{hashlib.sha256(' | '.join(said).encode()).hexdigest()[:32]}.npz"
+        parts = [reducer_class(own)] if isinstance(own, str) else _parts_of(own)
+        how = (task.seed, task.cycles, task.shuffle, task.confirm, who.rival, dict(who.params), who.recipe.to_toml(), own)
+        try:  # a transformer with all that it holds: arrays and functions too, which its description only names
+            said = self._digest((self._of_data, _digest_of_source(), [_source_of(part) for part in parts], how))
+        except (PicklingError, TypeError, AttributeError) as error:
+            raise SettingError(
+                f"Expected a reducer that can be told apart from others, to keep its replays; {who.name} holds what has no "
+                f"name in a module, as a lambda ({error}); define it in a module, or leave keep out."
+            ) from error
+        return self.folder / f"{said}.npz"
 
     def get(self, task: Task) -> Replay | None:
         """The replay, under the contender's present name; None where it is not there, or damaged."""
         path = self.path(task)
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
-            about = json.loads(str(arrays.pop("about")))
-            retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))
-            named = about | {"name": task.contender.name, "recipe": task.contender.recipe}
-            return Replay(**arrays, **named, retrains=retrains)
-        except DAMAGED:
+            with reading(path, "a kept replay"):
+                arrays: dict[str, Any] = read_archive(path)[0]
+                about = json.loads(str(arrays.pop("about")))
+                retrains = tuple(RetrainReport(**each) for each in about.pop("retrains"))
+                return Replay(**arrays, **about, name=task.contender.name, recipe=task.contender.recipe, retrains=retrains)
+        except DataError:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
         """Keep a finished replay: the whole file or none, whatever happens meanwhile."""
-        values = {each.name: getattr(replay, each.name) for each in fields(replay)}
+        values = {each.name: getattr(replay, each.name) for each in fields(replay) if each.name not in ("name", "recipe")}
         arrays: dict[str, Any] = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
-        about = {name: value for name, value in values.items() if name not in arrays and name != "recipe"}
+        about = {name: value for name, value in values.items() if name not in arrays}
         about["retrains"] = [asdict(each) for each in replay.retrains]
-        partial = self.folder / f".{uuid4().hex}.partial"
-        try:
-            with partial.open("xb") as file:
-                np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
-            partial.replace(self.path(task))
-        finally:
-            partial.unlink(missing_ok=True)
+        buffer = BytesIO()
+        np.savez_compressed(buffer, about=np.array(json.dumps(about)), **arrays)
+        write_output(self.path(task), buffer.getvalue(), force=True)
 
 
 @cache
@@ -138,45 +128,13 @@ def _parts_of(reducer: Any) -> list[Any]:
     return list(dict.fromkeys([*kinds, *(each for each in held if isfunction(each))]))
 
 
-def _digest_of_reducer(reducer: Any) -> str:
-    """Of all that a transformer holds: arrays and functions too, which its description only names."""
-    from joblib import hash as digest
-
-    try:
-        return str(digest(reducer))
-    except (PicklingError, TypeError, AttributeError) as error:
-        raise SettingError(
-            f"Expected a reducer that can be told apart from others, to keep its replays; {described(reducer)} holds what "
-            f"has no name in a module, as a lambda ({error}); define it in a module, or leave keep out."
-        ) from error
-
-
 def contenders(asked: Sequence[Any]) -> list[Contender]:
-    """Each as it was asked for; equal names are followed by the settings in which they differ, but those in `TOLD_APART`.
-
-    SettingError where two are equal; of transformers also where their settings read alike.
-    """
+    """Each as `Contender.load` takes it. SettingError for two of one name and policy, which no table could tell apart."""
     loaded = [Contender.load(one) for one in ([asked] if isinstance(asked, str) else asked)]
-    return [_told_apart(one, [other for other in loaded if other.name == one.name and other is not one]) for one in loaded]
-
-
-def _told_apart(one: Contender, others: Sequence[Contender]) -> Contender:
-    """Named by the settings in which it differs from others of its name."""
-    own, theirs = _flat(one), [_flat(other) for other in others]
-    if (own, one.recipe.policy) in zip(theirs, (other.recipe.policy for other in others), strict=True):
-        raise SettingError(
-            f"Expected each to be asked for once, got {one.name} twice with the same settings; tell them apart by "
-            "Contender(name, recipe)."
-        )
-    differing = [key for key in own if any(other.get(key) != own[key] for other in theirs)]
-    return replace(one, name=" ".join([one.name, *(f"{key}={own[key]}" for key in differing)]))
-
-
-def _flat(one: Contender) -> dict[str, Any]:
-    """Every setting by its name, without those that have columns of their own; a transformer as it reads."""
-    plain = {key: value for key, value in flat(one.recipe).items() if key not in (*TOLD_APART, "params")}
-    plain["reducer"] = " ".join(str(plain["reducer"]).split())
-    return {**plain, **one.recipe.params, **one.params}
+    known = [(one.name, one.recipe.policy) for one in loaded]
+    twice = next((name for name, policy in known if known.count((name, policy)) > 1), None)
+    expect(twice is None, "a name of its own for each", twice, "tell them apart by Contender(name, recipe)")
+    return loaded
 
 
 class Played(NamedTuple):
@@ -227,23 +185,17 @@ def run_grid(
     repeats: int = 30,
     n_jobs: int = -1,
     *,
-    guarantees: Sequence[str | None] = (None,),
-    confirms: Sequence[bool] = (False,),
-    first_seed: int = 0,
     cycles: int | None = None,
     keep: Folder | None = None,
-    on_done: OnDone = None,
 ) -> pd.DataFrame:
-    """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds.
+    """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds from 0 on.
 
-    recipes : a name, or a list of what `replay` takes, rivals too.
-    guarantees : "local", "pooled", or None for the recipe's own.  keep : folder by which an interrupted grid goes on.
-    confirms : whether accepted good parts are confirmed; False is the paper's feedback, stops alone.
+    recipes : a name, or a list of what `replay` takes, rivals too.  keep : folder by which an interrupted grid goes on.
+    Only stops are known of accepted parts, as in the paper.
     Source: the paper's experiments, 30 shuffled repeats of a 3 x 3 grid. Timings are honest only with n_jobs=1.
     """
-    seeds = range(first_seed, first_seed + repeats)
-    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, seeds, guarantees, confirms, cycles)
-    return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep, on_done=on_done))
+    tasks = grid_tasks(recipes, alphas, lower_bounds, intervals, range(repeats), cycles=cycles)
+    return frame_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep))
 
 
 def grid_tasks(
@@ -261,21 +213,13 @@ def grid_tasks(
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")
     tasks = []
-    for who, *asked, confirm in itertools.product(
-        contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms
-    ):
+    for who, *asked, confirm in product(contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms):
         changes = {name: value for name, value in zip(names, asked, strict=True) if value is not None}
         tasks += [Task(who.with_policy(**changes), seed, cycles, shuffle, confirm) for seed in seeds]
     return tasks
 
 
-def play_tasks(
-    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None, on_done: OnDone = None
-) -> list[Replay]:
-    """Each task's replay, in the tasks' order. on_done : called with each as it ends. The rest as in `iterate_replays`."""
-    found: dict[int, Replay] = {}
-    for i, one, _ in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep):
-        found[i] = one
-        if on_done is not None:
-            on_done(one)
+def play_tasks(dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None) -> list[Replay]:
+    """Each task's replay, in the tasks' order; the rest as in `iterate_replays`."""
+    found = {each.position: each.replay for each in iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)}
     return [found[i] for i in range(len(tasks))]

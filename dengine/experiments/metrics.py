@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..decision.intervals import wilson_interval
-from ..errors import SettingError, shortened
+from ..errors import expect
 from ..records import is_number
 
 SIDES = {"accepted": "false_positive", "rejected": "false_negative"}  # and which of them are wrong
@@ -47,8 +47,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
     replays : of one data set, each a `Replay`.  side : "accepted" or "rejected"; SettingError for another.
     """
-    if side not in SIDES:
-        raise SettingError(f"Expected side {' or '.join(SIDES)}, got {side!r}.")
+    expect(side in SIDES, f"side {' or '.join(SIDES)}", side)
     size = 1 + max((int(r.index.max()) for r in replays if len(r.index)), default=0)
     decided, wrong = (  # (size,) of each trace
         np.sum([np.zeros(size), *(np.bincount(r.index[getattr(r, name)], minlength=size) for r in replays)], axis=0)
@@ -80,10 +79,8 @@ class Costs:
     def __post_init__(self) -> None:
         for each in fields(self):
             value = getattr(self, each.name)
-            if not (is_number(value) and 0.0 <= value < math.inf):
-                raise SettingError(f"Expected a finite cost of 0 or more as {each.name}, got {shortened(value)}.")
-        if not self.check > 0.0:
-            raise SettingError("Expected a check that costs something, got 0: then verify everything.")
+            expect(is_number(value) and 0.0 <= value < math.inf, f"a finite cost of 0 or more as {each.name}", value)
+        expect(self.check > 0.0, "a check that costs something", 0, "where it is free, verify everything")
 
     @property
     def worst_accept(self) -> float:

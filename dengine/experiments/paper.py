@@ -2,7 +2,7 @@
 
     frame = run_grid("insertion", ["conv"], **GRID, repeats=30)
     print(paper_table(frame, "conv", "wilson"))
-    for finding in findings(frame): print(finding.sentence)
+    for line in findings(frame): print(line)
 
 Source: Duan, Krüger, Heredia, Iversen and Hagelskjær, section "Experiments", tables "Wilson Score" and "Binomial Interval
 score": mean false positives / mean certain predictions of 30 shuffles of 1503 insertions.
@@ -11,8 +11,6 @@ score": mean false positives / mean certain predictions of 30 shuffles of 1503 i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from .rivals import RIVALS
@@ -59,77 +57,40 @@ def paper_table(frame: pd.DataFrame, recipe: str, interval: str) -> str:
     return "\n".join(lines)
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One of the paper's findings in one cell of the grid, or over it, and whether it holds here.
-
-    claim : the paper's.  who : recipe and interval.  cell : alpha and LB, or "" for the grid.  measured : in words.
-    """
-
-    claim: str
-    who: str
-    cell: str
-    measured: str
-    holds: bool
-
-    @property
-    def sentence(self) -> str:
-        """All of it as one line."""
-        where = ", ".join(part for part in (self.who, self.cell) if part)
-        return f"{'holds' if self.holds else 'does NOT hold'}: {self.claim}; {where}: {self.measured}"
-
-
-def findings(frame: pd.DataFrame) -> list[Finding]:
-    """Which of the paper's findings the replays of a grid bear out, cell by cell.
+def findings(frame: pd.DataFrame) -> list[str]:
+    """Which of the paper's findings the replays of a grid bear out: a line a finding, recipe and interval.
 
     Those that they say nothing of are left out: of rivals, which decide by rules of their own, what the intervals do.
     frame : as `run_grid` gives it, of one feedback and one guarantee.
     """
-    found: list[Finding] = []
+    lines: list[str] = []
+
+    def say(holds: bool, claim: str, measured: str) -> None:
+        lines.append(f"{'holds' if holds else 'does NOT hold'}: {claim}: {measured}")
+
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
         who, ours = f"{recipe}, {interval}", str(recipe).split(" ")[0] not in RIVALS
         means = rows.groupby(["alpha", "lower_bound"], sort=False)[["certain", "false_positive"]].mean()
-        found += _answers(means["certain"], who, str(interval)) if ours else []
-        for (alpha, bound), (certain, wrong) in zip(means.index, means.to_numpy(), strict=True):
-            said = f"{100 * wrong / certain:.1f} % of {certain:.1f} certain" if certain else "nothing was certain"
-            cell, claim = f"alpha {alpha:g}, LB {100 * bound:g} %", "the mean share of false positives stays below 1 - LB"
-            found.append(Finding(claim, who, cell, said, bool(wrong < (1.0 - bound) * certain or not certain)))
-        found += _delays(rows, who) if ours and interval == "wilson" else []
+        certain, n = means["certain"], len(means)
+        if ours and n > 1 and interval in INTERVALS and certain.any():
+            answers = bool(certain.max() - certain.min() > ANSWERS * certain.mean())
+            said = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
+            measured = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells"
+            say(answers == (interval == "wilson"), f"{said} to alpha and LB; {who}", measured)
+        shares = (means["false_positive"] / certain).fillna(0.0)
+        kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
+        worst = f"in {kept} of {n} cells, at most {100 * shares.max():.1f} % of the certain"
+        say(kept == n, f"the mean share of false positives stays below 1 - LB; {who}", worst)
+        for bound, column in rows.groupby("lower_bound", sort=False) if ours and interval == "wilson" else ():
+            first = column.groupby("alpha")["first_certain"].mean().dropna().sort_index(ascending=False)
+            if len(first) >= 2:
+                later = bool(first.is_monotonic_increasing and first.iloc[0] < first.iloc[-1])
+                measured = ", ".join(f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items())
+                say(later, f"lower alpha delays the first certain prediction; {who}, LB {100 * bound:g} %", measured)
     for name, rows in frame.groupby("recipe", sort=False):
-        worst = float(rows["retrain_max_s"].max())
-        if not math.isnan(worst):
-            said = f"median {rows['retrain_p50_s'].median():.3f} s, worst {worst:.3f} s"
-            claim = f"a retrain of {name} takes less than {BUDGET_S:g} s"
-            found.append(Finding(claim, str(name), "", said, worst < BUDGET_S))
-    return found
-
-
-def _answers(certain: pd.Series[float], who: str, interval: str) -> Iterator[Finding]:
-    if len(certain) > 1 and interval in INTERVALS and certain.any():
-        spread = float((certain.max() - certain.min()) / certain.mean())
-        said = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells, {100 * spread:.0f} % of the mean"
-        claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
-        yield Finding(f"{claim} to alpha and LB", who, "", said, (spread > ANSWERS) == (interval == "wilson"))
-
-
-def _delays(rows: pd.DataFrame, who: str) -> Iterator[Finding]:
-    for bound, column in rows.groupby("lower_bound", sort=False):
-        first = column.groupby("alpha")["first_certain"].mean().dropna().sort_index(ascending=False)
-        if len(first) >= 2:
-            said = ", ".join(f"cycle {cycle:.0f} at {alpha:g}" for alpha, cycle in first.items())
-            later = bool(first.is_monotonic_increasing and first.iloc[0] < first.iloc[-1])
-            yield Finding("lower alpha delays the first certain prediction", who, f"LB {100 * bound:g} %", said, later)
-
-
-def finding_lines(found: Sequence[Finding]) -> list[str]:
-    """A line a claim and recipe: what was measured, or in how many cells it holds and where it does not."""
-    lines = []
-    for claim, who in dict.fromkeys((each.claim, each.who) for each in found):
-        some = [each for each in found if (each.claim, each.who) == (claim, who)]
-        against = [f"{each.cell}: {each.measured}" for each in some if not each.holds]
-        many = f"holds in {len(some) - len(against)} of {len(some)} cells: {claim}; {who}"
-        many += f"; not at {'; '.join(against)}" if against else ""
-        lines.append(some[0].sentence if len(some) == 1 else many)
+        if not math.isnan(slowest := float(rows["retrain_max_s"].max())):
+            measured = f"median {rows['retrain_p50_s'].median():.3f} s, worst {slowest:.3f} s"
+            say(slowest < BUDGET_S, f"a retrain of {name} takes less than {BUDGET_S:g} s", measured)
     return lines
 
 
@@ -142,5 +103,5 @@ def grid_lines(frame: pd.DataFrame) -> list[str]:
         lines += [f"## Guarantee {guarantee}, {known}", ""]
         for recipe, interval in rows[["recipe", "interval"]].drop_duplicates().itertuples(index=False):
             lines += [f"**{recipe}, {interval}**: {told}", "", paper_table(rows, recipe, interval), ""]
-        lines += [*(f"- {finding.sentence}" for finding in findings(rows)), ""]
+        lines += [*(f"- {line}" for line in findings(rows)), ""]
     return lines

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,10 @@ from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
 from ..engine.engine import DataEngine
-from ..errors import SettingError
+from ..errors import expect
 from ..recipe import RECIPES, Recipe
-from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
-from .metrics import Costs
+from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, in_html
+from .metrics import VERIFY_SECONDS, Costs
 from .rivals import RIVALS, make_rival
 
 if TYPE_CHECKING:
@@ -122,7 +122,15 @@ class Replay:
     def __repr__(self) -> str:
         counts, where = self.stretch(), f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
         told = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
+        told += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}" if self.dropped else ""
         return f"<Replay of {self.name or 'a run'}{where}: {len(self)} cycles, {told}>"
+
+    _repr_html_ = in_html
+
+    @property
+    def dropped(self) -> list[str]:
+        """Why retrains were dropped, each; a reducer that fails at every one leaves a model that is sure of nothing."""
+        return [each.reason for each in self.retrains if not each.accepted]
 
     @property
     def verified(self) -> Bools:
@@ -159,11 +167,6 @@ class Replay:
         """(n,) a good part was passed on, as far as the truth is known."""
         return np.asarray(~self.rejected & (self.truth == 1.0))
 
-    @property
-    def embedded(self) -> bool:
-        """Whether any trace was embedded; rivals embed none."""
-        return bool(np.isfinite(self.position).any())
-
     def to_frame(self) -> pd.DataFrame:
         """A row a cycle, numbered from 1, and a column each field of (n,); the position's are embedding_1, embedding_2 …"""
         import pandas as pd
@@ -193,11 +196,16 @@ class Replay:
         about = {"first_cycle": begin + 1, "last_cycle": end, "verified_share": share}
         return about | counts | {"parts_per_hour": rate}
 
-    def summary(self) -> dict[str, Any]:
-        """One row of a table: counts over the whole stream; NaN where there is nothing to take a share or a time of."""
+    def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
+        """One row of a table: counts over the whole stream; NaN where there is nothing to take a share or a time of.
+
+        check_seconds : that a verification takes in the cell, for what was saved.  dropped : why the last retrain that was
+        dropped was; "" where none was.
+        """
         counts, policy, nan = self.stretch(), self.recipe.policy, float("nan")
         accepted, rejected, *wrong = (counts[name] for name in COUNTED[1:5])
         certain, retrain_s = accepted + rejected, np.array([each.seconds for each in self.retrains])
+        costs, dropped = Costs(check_seconds), self.dropped
 
         def quantile(values: Floats, q: float) -> float:
             return float(np.quantile(values, q)) if len(values) else nan
@@ -215,59 +223,54 @@ class Replay:
             "npv": 1.0 - wrong[1] / rejected if rejected else nan,
             "accuracy": 1.0 - sum(wrong) / certain if certain else nan,
             "retrains": len(self.retrains),
+            "retrains_dropped": len(dropped),
+            "dropped": dropped[-1] if dropped else "",
             "retrain_p50_s": quantile(retrain_s, 0.5),
             "retrain_max_s": quantile(retrain_s, 1.0),
             "decide_p50_us": 1e6 * quantile(self.decide_seconds, 0.5),
             "decide_p99_us": 1e6 * quantile(self.decide_seconds, 0.99),
-            "saved_s": Costs().saved(certain),
-            "net_s": Costs().saved(certain, *wrong),
+            "saved_s": costs.saved(certain),
+            "net_s": costs.saved(certain, *wrong),
             "seconds": self.seconds,
         }
 
 
-class RunRecorder:
-    """Gathers a run while it happens, so that one that is broken off can still be shown.
+class Seen(NamedTuple):
+    """A finished cycle, and what its cell told on the side. truth : NaN where it tells none.  clock : seconds, or None."""
 
-    `truth` and `clock` are read off a cell that has them.
-    """
+    cycle: Cycle
+    truth: float
+    clock: float | None
 
-    def __init__(self, cell: Cell) -> None:
-        self.cell = cell
-        self._recipe = Recipe()
-        self._seen: list[tuple[Cycle, float, float | None]] = []  # and what the cell told on the side: truth, clock
 
-    def follow(self, engine: DataEngine, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> None:
-        """Let the engine drive the cell, and gather every cycle. on_cycle : called after each."""
-        self._recipe = engine.recipe
-        for cycle in engine.run(self.cell, cycles):
-            known = getattr(self.cell, "truth", cycle.success)
-            truth = float("nan") if known is None else float(known)
-            self._seen.append((cycle, truth, getattr(self.cell, "clock", None)))
-            if on_cycle is not None:
-                on_cycle(cycle)
+def follow(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Seen]:
+    """Let the engine drive a cell, of which `truth` and `clock` are read where it has them: each cycle as it ends."""
+    for cycle in engine.run(cell, cycles):
+        known = getattr(cell, "truth", cycle.success)
+        yield Seen(cycle, float("nan") if known is None else float(known), getattr(cell, "clock", None))
 
-    def log(self) -> Replay:
-        """What was gathered so far."""
-        cycles = [cycle for cycle, _, _ in self._seen]
-        decisions = [cycle.decision for cycle in cycles]
-        has_clock = getattr(self.cell, "clock", None) is not None
 
-        known: dict[str, Any] = {
-            name: np.array([getattr(each, name) for each in decisions], dtype=kind) for name, kind in EVIDENCE.items()
-        }
-        return Replay(
-            truth=np.array([truth for _, truth, _ in self._seen], dtype=np.float64),
-            position=_positions(decisions),
-            decide_seconds=np.array([each.decide_seconds for each in cycles], dtype=np.float64),
-            stopped=np.array([each.outcome is Outcome.STOPPED for each in cycles], dtype=np.bool_),
-            version=np.array([each.model_version for each in decisions], dtype=np.int64),
-            safe_mode=np.array([each.safe_mode != "" for each in cycles], dtype=np.bool_),
-            clock_s=np.array([clock for _, _, clock in self._seen], dtype=np.float64) if has_clock else None,
-            retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
-            recipe=self._recipe,
-            name=self._recipe.name,
-            **known,
-        )
+def gather(seen: Sequence[Seen], recipe: Recipe) -> Replay:
+    """The run of these cycles, which may be one that was broken off."""
+    cycles = [each.cycle for each in seen]
+    decisions = [cycle.decision for cycle in cycles]
+    clocks = [each.clock for each in seen if each.clock is not None]
+    known: dict[str, Any] = {
+        name: np.array([getattr(each, name) for each in decisions], dtype=kind) for name, kind in EVIDENCE.items()
+    }
+    return Replay(
+        truth=np.array([each.truth for each in seen], dtype=np.float64),
+        position=_positions(decisions),
+        decide_seconds=np.array([each.decide_seconds for each in cycles], dtype=np.float64),
+        stopped=np.array([each.outcome is Outcome.STOPPED for each in cycles], dtype=np.bool_),
+        version=np.array([each.model_version for each in decisions], dtype=np.int64),
+        safe_mode=np.array([each.safe_mode != "" for each in cycles], dtype=np.bool_),
+        clock_s=np.array(clocks, dtype=np.float64) if clocks else None,
+        retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
+        recipe=recipe,
+        name=recipe.name,
+        **known,
+    )
 
 
 def _positions(decisions: list[Decision]) -> Floats:
@@ -279,10 +282,13 @@ def _positions(decisions: list[Decision]) -> Floats:
 
 
 def watch(engine: DataEngine, cell: Cell, cycles: int, on_cycle: Callable[[Cycle], None] | None = None) -> Replay:
-    """Drive a cell and keep what figures and tables need; `RunRecorder` is for a run that may be broken off."""
-    recorder = RunRecorder(cell)
-    recorder.follow(engine, cycles, on_cycle)
-    return recorder.log()
+    """Drive a cell and keep what figures and tables need; on_cycle : called after each."""
+    seen = []
+    for each in follow(engine, cell, cycles):
+        seen.append(each)
+        if on_cycle is not None:
+            on_cycle(each.cycle)
+    return gather(seen, engine.recipe)
 
 
 def replay(
@@ -308,8 +314,7 @@ def replay(
     """
     data, who = load_dataset(dataset), None if isinstance(recipe, DataEngine) else Contender.load(recipe)
     n = len(data) if cycles is None else cycles
-    if not 1 <= n <= len(data):
-        raise SettingError(f"Expected 1 to {len(data)} cycles from {data.name}, got {n}.")
+    expect(1 <= n <= len(data), f"1 to {len(data)} cycles from {data.name}", n)
     order = (np.random.default_rng(seed).permutation(len(data)) if shuffle else np.arange(len(data)))[:n]
     engine: DataEngine = recipe if who is None else who.engine(seed)
     begin = time.perf_counter()

@@ -36,16 +36,16 @@ ENOUGH = 200  # accepted parts; with 30, each better than LB, the realised rate 
 LEGEND = (
     "Means a replay ± the standard deviation over the replays; shares are of the parts of all replays. FP: bad parts "
     "accepted, FN: good ones rejected; NPV: of the rejected the share that was bad. retrain: median and worst; decide: "
-    f"median and 99th percentile. saved: {VERIFY_SECONDS:g} s a check left out; net: less {STOP_SECONDS:g} s an FP and "
+    f"median and 99th percentile. saved: --check-seconds a check left out; net: less {STOP_SECONDS:g} s an FP and "
     f"{CYCLE_SECONDS:g} s an FN."
 )
 
 
-def frame_of(replays: Sequence[Replay]) -> pd.DataFrame:
+def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -> pd.DataFrame:
     """A row a replay, as in `Replay.summary`."""
     import pandas as pd
 
-    return pd.DataFrame([replay.summary() for replay in replays])
+    return pd.DataFrame([replay.summary(check_seconds) for replay in replays])
 
 
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
@@ -57,6 +57,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
         three parts as much as one that accepted 300.  COUNTS, saved_s, net_s : means a replay; `total_*` are the sums,
         `certain_sd` and `false_positive_sd` the standard deviations over the replays (NaN of one).
     error_lower, error_upper : 95 % interval of the share of bad ones among the accepted parts; NaN without replays.
+    promise_kept : whether the pooled precision is at least LB; None where too few parts were accepted to say.
     retrain_p50_s, decide_p50_us : median over replays.  retrain_max_s, decide_p99_us : the worst replay's.
     """
     rows = []
@@ -72,60 +73,60 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, 
         error = pooled_error(own)
         ends = (error.lower, error.upper) if error.decided else (math.nan, math.nan)
         row |= {"retrains_dropped": sum(not each.accepted for one in own for each in one.retrains)}
-        rows.append(row | {"error_lower": ends[0], "error_upper": ends[1], "promise_kept": promise_kept(row)})
+        kept = bool(row["precision"] >= row["lower_bound"]) if total["accepted"] >= ENOUGH else None
+        rows.append(row | {"error_lower": ends[0], "error_upper": ends[1], "promise_kept": kept})
     return rows
-
-
-def promise_kept(row: Mapping[str, Any]) -> bool | None:
-    """Whether the pooled precision is at least LB; None where too few parts were accepted to say."""
-    if row["total_accepted"] < ENOUGH:
-        return None
-    return bool(row["precision"] >= row["lower_bound"])
 
 
 def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """The promise of each row in words, with those of its settings in which the rows differ."""
     telling = [name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1]
-    return [promise_line(row, telling) for row in rows]
+    lines = []
+    for row in rows:
+        said = {"interval": row["interval"], "alpha": f"alpha {row['alpha']:g}"}
+        said["confirm"] = "good ones confirmed" if row["confirm"] else "stops alone"
+        who = f"{row['recipe']} ({', '.join([row['guarantee'], *(said[name] for name in telling)])})"
+        if not row["total_accepted"]:
+            lines.append(f"{who}: no part was accepted.")
+            continue
+        few = f"fewer than {ENOUGH} accepted parts, too few to say"
+        verdict = {True: "kept", False: "broken", None: few}[row["promise_kept"]]
+        bad = f"; bad: {100 * row['error_lower']:.1f} to {percent(row['error_upper'])} at 95 %"
+        good = f"{percent(row['precision'])} of {row['total_accepted']} accepted parts were good"
+        good += "" if math.isnan(row["error_lower"]) else bad
+        lines.append(f"{who}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}.")
+    return lines
 
 
-def promise_line(row: Mapping[str, Any], telling: Sequence[str] = ()) -> str:
-    """The promise of one row in words. telling : settings that are named beside the guarantee."""
-    said = {"interval": row["interval"], "alpha": f"alpha {row['alpha']:g}"}
-    said["confirm"] = "good ones confirmed" if row["confirm"] else "stops alone"
-    who = f"{row['recipe']} ({', '.join([row['guarantee'], *(said[name] for name in telling)])})"
-    if not row["total_accepted"]:
-        return f"{who}: no part was accepted."
-    few = f"fewer than {ENOUGH} accepted parts, too few to say"
-    verdict = {True: "kept", False: "broken", None: few}[promise_kept(row)]
-    bad = f"; bad: {100 * row['error_lower']:.1f} to {percent(row['error_upper'])} at 95 %"
-    good = f"{percent(row['precision'])} of {row['total_accepted']} accepted parts were good"
-    good += "" if math.isnan(row["error_lower"]) else bad
-    return f"{who}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}."
-
-
-def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays") -> Table:
+def pooled_table(rows: Sequence[Mapping[str, Any]], title: str = "Replays", legend: str = LEGEND) -> Table:
     """The pooled rows for a screen, each with its guarantee, and what is known of stops."""
+    shown, several = [], len({row["interval"] for row in rows}) > 1
+    for row in rows:
+        known = "confirmed" if row["confirm"] else row["stops"]
+        name = f"{row['recipe']}\n{row['guarantee']}, {known}" + (f"\n{row['interval']}" if several else "")
+        shown.append({"recipe\nguarantee": name} | {title: show(row) for title, show in CELLS.items()})
+    return figures(title, shown, legend)
+
+
+def figures(title: str, rows: Sequence[Mapping[str, str]], caption: str, total: bool = False) -> Table:
+    """A table of numbers, to the right, under the rows' names. total : whether a line sets the last row apart."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    known = ["confirmed" if row["confirm"] else str(row["stops"]) for row in rows]
     look: dict[str, Any] = {"box": SIMPLE_HEAD, "title_justify": "left", "caption_justify": "left"}
     look |= {"pad_edge": False, "show_edge": False, "collapse_padding": True}
-    table = Table(title=f"\n{title}\n", caption=f"\n{LEGEND}\n", **look)
-    # The one that gives way: 80 columns are enough for every number.
-    table.add_column("recipe\nguarantee", overflow="fold")
-    for name in CELLS:
-        table.add_column(name, justify="right", no_wrap=True)
-    several = len({row["interval"] for row in rows}) > 1
-    for row, stops in zip(rows, known, strict=True):
-        name = f"{row['recipe']}\n{row['guarantee']}, {stops}" + (f"\n{row['interval']}" if several else "")
-        table.add_row(name, *(show(row) for show in CELLS.values()))
+    table = Table(title=f"\n{title}\n", caption=f"\n{caption}\n", **look)
+    for i, name in enumerate(rows[0]):  # the first gives way: 80 columns are enough for every number
+        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0, overflow="fold")
+    for i, row in enumerate(rows):
+        if total and i == len(rows) - 1:
+            table.add_section()
+        table.add_row(*row.values())
     return table
 
 
-def _number(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
+def _whole(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.0f}"
 
 
 def _with_sd(row: Mapping[str, Any], name: str) -> str:
@@ -139,8 +140,8 @@ CELLS: dict[str, Any] = {
     "accept\nFP": lambda r: f"{r['accepted']:.1f}\n{r['false_positive']:.2f}",
     "reject\nFN": lambda r: f"{r['rejected']:.1f}\n{r['false_negative']:.2f}",
     "precision\nNPV": lambda r: f"{percent(r['precision'])}\n{percent(r['npv'])}",
-    "retrain\nms": lambda r: f"{_number(1e3 * r['retrain_p50_s'], 0)}\n{_number(1e3 * r['retrain_max_s'], 0)}",
-    "decide\nµs": lambda r: f"{_number(r['decide_p50_us'], 0)}\n{_number(r['decide_p99_us'], 0)}",
+    "retrain\nms": lambda r: f"{_whole(1e3 * r['retrain_p50_s'])}\n{_whole(1e3 * r['retrain_max_s'])}",
+    "decide\nµs": lambda r: f"{_whole(r['decide_p50_us'])}\n{_whole(r['decide_p99_us'])}",
     "saved\nnet, s": lambda r: f"{r['saved_s']:.0f}\n{r['net_s']:.0f}",
 }
 

@@ -21,8 +21,6 @@ import re
 import secrets
 import time
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -32,14 +30,13 @@ import torch
 from .. import __version__
 from ..decision.policy import RULES
 from ..decision.rule import SAFE_MODE, SCALAR_BOUNDS, DecisionRule
-from ..errors import ExportError, OutputError, expect
-from ..files import UNREADABLE, check_output, write_output
+from ..errors import ExportError
+from ..files import UNREADABLE, check_output, read_key, write_output
 from ..model.base import Exportable
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
 
 PREFIX = "hmac-sha256:"
-SHORTEST_KEY = 16  # bytes
 SCHEMA = 2
 METADATA = "dengine.json"
 SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -55,68 +52,55 @@ def make_key(path: KeyFile) -> Path:
     """
     target = Path(path)
     try:
-        descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(os.open(target, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="ascii") as file:
+            file.write(secrets.token_hex(32) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
     except FileExistsError as error:
         raise ExportError(f"{target} is there already, and files may be signed with it; name a new one.") from error
     except OSError as error:
         said = f"Cannot write {target}: {error.strerror}; choose a folder that exists and is writable."
         raise ExportError(said) from error
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(secrets.token_hex(32) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
     return target
 
 
 def signature(content: bytes, key: KeyFile) -> str:
     """What a signature's line begins with, by the secret in a key's file; ExportError for what is too short to be one."""
+    return PREFIX + hmac.new(read_key(key, ExportError), content, hashlib.sha256).hexdigest()
+
+
+def beside(path: str | os.PathLike[str], suffix: str) -> Path:
+    """Where a file's checksum (sha256, as `sha256sum --check` reads it) or its signature (sig) lies."""
+    return Path(f"{os.fspath(path)}.{suffix}")
+
+
+def prepared(
+    engine_or_model: Any, trace: TraceSpec | None, path: str | os.PathLike[str], force: bool
+) -> tuple[Exportable, DecisionModule]:
+    """What an exporter starts from, and its decision as one eager module.
+
+    ExportError for a rival, before the first training, and where a part of the decision does not compile; OutputError where
+    `path` must not be written: before the work of an export.
+    """
+    _check_outputs(path, force)
     try:
-        secret = Path(key).read_bytes().rstrip(b"\r\n")
-    except OSError as error:
-        said = f"The key's file {key} cannot be read: {error.strerror}; dengine export --make-key writes one."
-        raise ExportError(said) from error
-    wanted = f"a key of {SHORTEST_KEY} bytes or more in {key}"
-    expect(len(secret) >= SHORTEST_KEY, wanted, len(secret), "use dengine export --make-key", ExportError)
-    return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
-
-
-def beside(path: Path, suffix: str) -> Path:
-    """Where a checksum (sha256, as `sha256sum --check` reads it) or a signature (sig) lies."""
-    return path.with_name(f"{path.name}.{suffix}")
-
-
-def sum_file(path: Path) -> Path:
-    """Where the checksum lies."""
-    return beside(path, "sha256")
-
-
-def source_of(engine_or_model: Any, trace: TraceSpec | None) -> Exportable:
-    """What an exporter starts from; ExportError for a rival, and before the first training."""
-    try:
-        exported = engine_or_model.exported
+        source: Exportable = engine_or_model.exported(trace)
     except AttributeError as error:
-        raise ExportError(
-            f"Expected a DataEngine or a ModelPrediction to export, got {type(engine_or_model).__name__}; "
-            "a rival method stays in Python."
-        ) from error
-    source: Exportable = exported(trace)
-    return source
-
-
-def decision_module(source: Exportable) -> DecisionModule:
-    """The decision of a fitted model as one eager module; ExportError where a part of it does not compile."""
+        got = type(engine_or_model).__name__
+        wanted = "Expected a DataEngine or a ModelPrediction to export"
+        raise ExportError(f"{wanted}, got {got}; a rival method stays in Python.") from error
     model = source.model
     if not model.rule.scriptable:
-        raise ExportError(
-            f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not compile to TorchScript; "
-            f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
-        )
+        rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"
+        do = f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does"
+        raise ExportError(f"{rule} does not compile to TorchScript; {do}.")
     if model.untold:
         raise ExportError("The rule has missed what became of a part; open the engine's store again, then export.")
     if model.spaces.module() is None:
         raise ExportError(f"{model.name} cannot be scripted: it has no module; use conv, pca or rocket instead.")
     size = model.n_spaces, model.index.dim
-    return DecisionModule(source.trace, model.predictor, *size, source.audit_rate, source.seed, source.stops_all)
+    decision = DecisionModule(source.trace, model.predictor, *size, source.audit_rate, source.seed, source.stops_all)
+    return source, decision
 
 
 def describe(source: Exportable) -> dict[str, Any]:
@@ -161,37 +145,26 @@ def write_export(
 ) -> Path:
     """Write a file, its checksum, and with a key its signature; note it in the store that the engine remembers in.
 
-    ExportError where they must not or cannot be written. A file, its sum and its signature are renames of their own:
+    OutputError where they must not or cannot be written. A file, its sum and its signature are renames of their own:
     where a kill comes between, the file is refused as damaged until it is exported again.
     """
     target, digest = Path(path), hashlib.sha256(content).hexdigest()
-    written = [(target, content), (sum_file(target), f"{digest}  {target.name}\n".encode())]
+    written = {target: content, beside(target, "sha256"): f"{digest}  {target.name}\n".encode()}
     if key is not None:
-        written.append((beside(target, "sig"), f"{signature(content, key)}  {target.name}\n".encode()))
-    check_target(target, force)
+        written[beside(target, "sig")] = f"{signature(content, key)}  {target.name}\n".encode()
+    _check_outputs(target, force)
     if source is not None and source.note is not None:
         source.note("export", f"{digest} {target.name}, version {source.model_version}")
-    with _as_export_error():
-        for each, what in written:
-            write_output(each, what, force)
-        if key is None and force:
-            beside(target, "sig").unlink(missing_ok=True)  # of the file that was replaced
+    for each, what in written.items():
+        write_output(each, what, force)
+    if key is None and force:
+        beside(target, "sig").unlink(missing_ok=True)  # of the file that was replaced
     return target
 
 
-def check_target(path: str | os.PathLike[str], force: bool) -> None:
-    """ExportError where a file, its sum or its signature must not be written: before the work of an export."""
-    with _as_export_error():
-        for each in (Path(path), sum_file(Path(path)), beside(Path(path), "sig")):
-            check_output(each, force)
-
-
-@contextmanager
-def _as_export_error() -> Iterator[None]:
-    try:
-        yield
-    except OutputError as error:
-        raise ExportError(str(error)) from error
+def _check_outputs(path: str | os.PathLike[str], force: bool) -> None:
+    for each in (Path(path), beside(path, "sha256"), beside(path, "sig")):
+        check_output(each, force)
 
 
 def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
@@ -205,9 +178,9 @@ def checked_bytes(path: Path, key: KeyFile | None = None) -> bytes:
     libtorch itself does not notice flipped bits.
     """
     _read(path, most=0)  # of the two it is the file itself that is named where both are missing
-    expected = _first_word(_read(sum_file(path), SUM_BYTES))
+    expected = _first_word(_read(beside(path, "sha256"), SUM_BYTES))
     if not SHA256.fullmatch(expected):
-        raise ExportError(f"{sum_file(path)} holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
+        raise ExportError(f"{path}.sha256 holds no SHA-256 sum of {path.name}; copy it again together with {path.name}.")
     content = _read(path)
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
@@ -252,8 +225,7 @@ def checked_schema(metadata: Any, path: Path) -> dict[str, Any]:
     """A description of the present schema; ExportError for another."""
     known = metadata if isinstance(metadata, dict) else {}
     if known.get("schema") != SCHEMA:
-        raise ExportError(
-            f"{path} has schema {known.get('schema')}, written by dengine {known.get('dengine', 'of an unknown version')}; "
-            f"this one reads schema {SCHEMA}: export it anew, or load it with the dengine that wrote it."
-        )
+        wrote = f"schema {known.get('schema')}, written by dengine {known.get('dengine', 'of an unknown version')}"
+        do = "export it anew, or load it with the dengine that wrote it"
+        raise ExportError(f"{path} has {wrote}; this one reads schema {SCHEMA}: {do}.")
     return known

@@ -3,20 +3,25 @@
     journal = read_journal("cell.csv", TraceSpec(1000))
     report = import_journal("engine.db", "cell.csv")
 
-A journal begins with `# dengine 3 SUM`, of the export that it belongs to. A line is `part,ID,LABEL,PART,ACTION,PREDICTED,
+A journal begins with `# dengine 4 SUM`, of the export that it belongs to. A line is `part,ID,LABEL,PART,ACTION,PREDICTED,
 REASON,LOWER,UPPER,N_SUCCESS,N_FAILURE,SAMPLE,...,CRC` or `label,ID,LABEL,CRC`; several channels stand one after the other.
-A last line without its end was being written when the program was killed: it is left out, and `cut` says so. Anything else
-that does not fit is a DataError that names the line.
+CRC is the CRC-32 of all lines so far, each without its own: where it does not fit, a line was changed, or is missing,
+doubled or moved. That line and what follows are set aside, and `aside` says so. FILE.head beside it has the number of its
+lines and the last CRC: of a line that is not held `aside` tells too; a missing head is logged. A last line without its end
+was being written when the program was killed: it is left out, and `cut` says so. Anything else that does not fit is a
+DataError that names the line.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -29,12 +34,15 @@ from ..errors import DataError, StoreError
 from ..folds import own_hash
 from ..recipe import Recipe
 from ..records import REASONS, Action, Decision, Reason, TraceSpec, source_of, trace_in
-from ..store.base import Store
 from ..store.opening import opening
-from ..store.records import NewLabel
+from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_trace
 
-FORM = 3
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
+
+log = logging.getLogger("dengine")
+FORM = 4
 LABELS = {"1": True, "0": False}
 LARGEST_COUNT = 2**62
 EXPORTED = "export"  # the kind of the events that record a model's sum
@@ -55,15 +63,18 @@ class JournalLine:
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """Lines in the order in which they became known; whether the last part was accepted and nothing came after it.
+    """Lines in the order in which they became known.
 
+    waits : the last part, where it was accepted and nothing came after it.
     sum : the SHA-256 of the export that it belongs to.  cut : bytes of a last line that was cut while it was written.
+    aside : what was set aside, in a sentence; "" where nothing was.
     """
 
     lines: list[JournalLine]
-    waits: bool
+    waits: JournalLine | None
     sum: str
     cut: int
+    aside: str = ""
 
 
 def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
@@ -74,16 +85,25 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
     *whole, tail = Path(path).read_bytes().split(b"\n")
     head = whole[0].decode("utf-8", errors="replace").split() if whole else []
     if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
-        raise DataError(
-            f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; import it with the "
-            "dengine whose program wrote it."
-        )
+        do = "import it with the dengine whose program wrote it"
+        raise DataError(f"Expected a journal that begins with '# dengine {FORM} SUM', {path} does not; {do}.")
     lines: list[JournalLine] = []
     parts: dict[str, JournalLine] = {}  # by id, as known by now
     last: list[JournalLine] = []  # the part that was decided on last, while nothing was heard of it
+    aside, crc = "", zlib.crc32(whole[0])
+    crcs = [crc]
     for number, raw in enumerate(whole[1:], start=2):
         where = f"line {number} of {path}"
-        kind, *words = _words(raw, where)
+        said, _, sum_ = raw.rpartition(b",")
+        crc = zlib.crc32(said, crc)
+        if f"{crc:08x}".encode() != sum_:
+            aside = (
+                f"The checksum of {where} does not follow from the lines before it: it was changed, or one is missing, "
+                f"doubled or moved. It and what follows were set aside, {len(whole) - number + 1} lines."
+            )
+            break
+        crcs.append(crc)
+        kind, *words = _words(said, where)
         if kind == "part":
             line = _part(words, spec, where)
             again = line.decision.id in parts
@@ -96,18 +116,27 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
             last = last if line.late else []
         parts[line.decision.id] = line
         lines += [line] if line.label is not None else []
-    waits = any(line.decision.action is Action.ACCEPT for line in last)
+    waits = next((line for line in last if line.decision.action is Action.ACCEPT), None)
     lines = [line for line in [*lines, *last] if line.label is not None or line.decision.action is Action.ACCEPT]
     if not lines:
-        raise DataError(f"{path} holds no labels yet.")
-    return Journal(lines, waits, head[3], len(tail))
+        raise DataError(aside or f"{path} holds no labels yet.")
+    aside = aside or _missing_at_end(path, crcs)
+    return Journal(lines, waits, head[3], len(tail), aside)
 
 
-def _words(raw: bytes, where: str) -> list[str]:
-    """A line's words, its checksum tried and taken off."""
-    said, _, crc = raw.rpartition(b",")
-    if f"{zlib.crc32(said):08x}".encode() != crc:
-        raise DataError(f"The checksum of {where} does not fit it: it is damaged; import the lines before it alone.")
+def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
+    """Of lines that a journal's head knows and the journal does not hold, in a sentence; "" where it holds them."""
+    head, end = Path(f"{os.fspath(path)}.head"), "lines may have been removed at its end, or lost with the power."
+    try:
+        number, crc = head.read_text(encoding="ascii").split()
+        held = int(crc, 16) in crcs[int(number) - 1 :][:1]
+    except (OSError, ValueError):
+        log.warning("%s, which knows how long the journal is, is missing or cannot be read: %s", head, end)
+        return ""
+    return "" if held else f"{path} does not hold line {number}, which its head knows: {end}"
+
+
+def _words(said: bytes, where: str) -> list[str]:
     try:
         words = said.decode("utf-8").split(",")
     except UnicodeDecodeError as error:
@@ -117,7 +146,6 @@ def _words(raw: bytes, where: str) -> list[str]:
 
 
 def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
-    """An earlier part with its label."""
     held = len(words) == 2 and words[0] in parts and words[1] in LABELS
     must(held, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
     known = parts[words[0]]
@@ -156,38 +184,36 @@ def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]
 
 
 def import_journal(
-    store: str | os.PathLike[str] | Store,
+    store: str | os.PathLike[str] | SqlStore,
     path: str | os.PathLike[str],
     on_traces: Callable[[int], None] | None = None,
     any_model: bool = False,
 ) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
-    Rule and certificate count the parts as the engine's own. The report counts labels.
+    Rule and certificate count the parts as the engine's own. The report counts labels. Of a journal that lacks a line, what
+    stands before is taken: `ImportReport.aside`.
     any_model : take a journal of a model that the store has not noted as exported from it.
-    Raises DataError, before anything is stored, for a damaged journal, or one of another store's model; StoreError while an
-    engine runs on the cell.
+    Raises DataError, before anything is stored, for a line that cannot be read, and a journal of another store's model;
+    StoreError while an engine runs on the cell.
     """
     with opening(store, must_exist=True) as opened:
         opened.own()  # an engine that runs would never learn of these labels
         known = opened.settings()
         spec = trace_in(known)
         if spec is None or "recipe" not in known:
-            raise StoreError(
-                f"Expected the store that the cell's model was exported from, {store} knows no trace contract."
-            )
+            raise StoreError(f"Expected the store that the model was exported from, {store} knows no trace contract.")
         policy = Recipe.from_toml(known["recipe"]).policy
         journal = read_journal(path, spec)
         exports = {event.text.split()[0] for event in opened.events() if event.kind == EXPORTED}
         if exports and journal.sum not in exports and not any_model:
-            raise DataError(
-                f"Expected a journal of a model that was exported from this store, {path} belongs to {journal.sum[:12]}…, "
-                "which is none of its exports; name the store that it came from, or say --any-model if it is right."
-            )
+            of = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"
+            do = "name the store that it came from, or say --any-model if it is right"
+            raise DataError(f"Expected a journal of a model that was exported from this store, {of}; {do}.")
         lines = _with_known_outcomes(journal, policy.stops)
         report = _import_lines(opened, lines, spec, policy, on_traces)
     opened.close()
-    return replace(report, cut=journal.cut)
+    return replace(report, cut=journal.cut, aside=journal.aside)
 
 
 def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
@@ -198,17 +224,17 @@ def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
     if stops == "some":
         return journal.lines
     late = {line.decision.id: line.label for line in journal.lines if line.late}
-    waits = next((line for line in reversed(journal.lines) if line.label is None), None) if journal.waits else None
     return [
         replace(line, label=True) if line.label is None else line
         for line in journal.lines
         # A late label has a line of its own: it brings the stop, and the first line the confirmation.
-        if line is not waits and not (line.decision.action is Action.ACCEPT and late.get(line.decision.id) == line.late)
+        if line is not journal.waits
+        and not (line.decision.action is Action.ACCEPT and late.get(line.decision.id) == line.late)
     ]
 
 
 def _import_lines(
-    store: Store, lines: list[JournalLine], spec: TraceSpec, policy: Policy, on_traces: Callable[[int], None] | None
+    store: SqlStore, lines: list[JournalLine], spec: TraceSpec, policy: Policy, on_traces: Callable[[int], None] | None
 ) -> ImportReport:
     gate, counts = TraceGate(spec), Counter[str]()
     looks = [gate(torch.from_numpy(line.trace)) for line in lines]
@@ -224,23 +250,25 @@ def _import_lines(
                 propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
                 reason = REASONS[fault] if fault else decision.reason
                 new = replace(decision, reason=reason, propensity=propensity)
-                store.put_decision(new, line.trace, own_hash(hash_, decision.part), bool(fault))
+                known = StoredDecision(new, line.trace, own_hash(hash_, decision.part), bool(fault), store.clock())
+                store.take([known])
             elif held.source is not None:  # a forgotten one has a label too
                 if label is not None:
                     counts["known" if label == held.success else "contradicted"] += 1
                 continue
+            else:
+                known = held
             if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
                 silent += (label is None) - (held is not None)
             if label is not None:
                 source = source_of(decision.id, decision.action, decision.audit, label)
-                labels.append(NewLabel(decision.id, label, source, 0, None, 0 if fault else silent))
+                of = decision.id, label, source, 0, None, 0 if fault else silent
+                labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
                 silent = silent if fault else 0
                 counts["quarantined" if fault else "imported"] += 1
-        if labels:
-            store.put_labels(labels)
+        store.take(labels)
         if on_traces is not None:
             on_traces(min(CHUNK, len(lines) - start))
     store.flush()
-    return ImportReport(
-        counts["imported"], counts["quarantined"], counts["known"], True, contradicted=counts["contradicted"]
-    )
+    taken = counts["imported"], counts["quarantined"], counts["known"]
+    return ImportReport(*taken, resumed=True, contradicted=counts["contradicted"])

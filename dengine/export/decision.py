@@ -36,11 +36,10 @@ class DecisionModule(nn.Module):
         audit_rate: float, seed: int, stops_all: bool = False,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.gate = TraceGate(spec)
-        self.predictor = predictor
+        self.predictor, self.limit = predictor, TraceGate(spec).limit
         self.channels, self.samples, self.fit = spec.channels, spec.samples, FITS.index(spec.fit)
         self.n_spaces, self.dim = n_spaces, dim
-        self.audit_below, self.salt = int(audit_rate * 2**COIN_BITS), audit_salt(seed)
+        self.audit_below, self.salt, self.audit_rate = int(audit_rate * 2**COIN_BITS), audit_salt(seed), float(audit_rate)
         self.mix, self.shift, self.mask = MIX, 63 - COIN_BITS, 2**COIN_BITS - 1
         self.stops_all = stops_all
         self.audit_reason, self.novel_reason, self.nobody = AUDIT, NOVEL, NOBODY
@@ -57,7 +56,7 @@ class DecisionModule(nn.Module):
         """
         x = self.as_trace(trace)
         self.settle()
-        fault, content = self.gate(x)
+        fault, content = self.predictor.gate.check(x, self.limit)
         one, alone = self.look(x, part, fault, content)
         action, reason, lower, upper, _, _, z = one
         self.wait(action if fault == 0 else self.nobody, alone, part, content, reason, lower, upper, z)
@@ -88,14 +87,15 @@ class DecisionModule(nn.Module):
         A trace that is not the one decided last is looked at first: its bound must be one from before its label was known.
         """
         x = self.as_trace(trace)
-        fault, content = self.gate(x)
+        fault, content = self.predictor.gate.check(x, self.limit)
         if fault == 0:
             own = part if part != 0 else content
             if self.waits != self.nobody and self.own == own and self.content == content:
                 self.take(success)
             else:  # what waits goes on waiting
-                z = self.look(x, part, fault, content)[0]
-                self.count(z[2], z[3], z[1] == self.novel_reason, z[6], own, success)
+                z, alone = self.look(x, part, fault, content)
+                looked = self.looked(z[0], alone)
+                self.count(z[2], z[3], z[1] == self.novel_reason, z[6], own, success, alone, looked)
         return self.predictor.n_references()
 
     @torch.jit.export
@@ -125,9 +125,10 @@ class DecisionModule(nn.Module):
         """In the place of `decide`: a decision that was made before, as a journal has it, waits for its label again."""
         x = self.as_trace(trace)
         self.settle()
-        fault, content = self.gate(x)
+        fault, content = self.predictor.gate.check(x, self.limit)
         waits = action if fault == 0 else self.nobody
-        self.wait(waits, action, part, content, reason, lower, upper, self.predictor.embed(x))
+        alone = action if reason != self.audit_reason else self.predictor.neighbours.rule.action(lower, upper)
+        self.wait(waits, alone, part, content, reason, lower, upper, self.predictor.embed(x))
 
     @torch.jit.export
     def predicted(self) -> int:
@@ -146,12 +147,21 @@ class DecisionModule(nn.Module):
 
     def take(self, success: bool) -> None:
         """What became of the part that was decided last."""
-        self.count(self.lower, self.upper, self.novel, self.place, self.own, success)
+        looked = self.looked(self.waits, self.alone)
+        self.count(self.lower, self.upper, self.novel, self.place, self.own, success, self.alone, looked)
         self.waits = self.nobody
 
-    def count(self, lower: float, upper: float, novel: bool, z: Tensor, own: int, success: bool) -> None:
+    def looked(self, action: int, alone: int) -> float:
+        """`Decision.looked`."""
+        if alone == 0:
+            return 1.0
+        return self.audit_rate if action == 0 else 0.0
+
+    def count(
+        self, lower: float, upper: float, novel: bool, z: Tensor, own: int, success: bool, alone: int, looked: float
+    ) -> None:
         """Tell the rule of a part, and make it a reference."""
-        self.predictor.tell(lower, upper, success, self.silent, novel)
+        self.predictor.tell(lower, upper, success, self.silent, novel, alone, looked)
         space = self.toss(own) % self.n_spaces
         self.predictor.add(z[space], 1.0 if success else 0.0, space, own)
         self.silent = 0

@@ -32,17 +32,7 @@ from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, NOT_FINITE, SATURATED, as_trace, as_traces
-from .bundle import (
-    METADATA,
-    KeyFile,
-    check_target,
-    checked_bytes,
-    checked_schema,
-    decision_module,
-    describe,
-    source_of,
-    write_export,
-)
+from .bundle import METADATA, KeyFile, checked_bytes, checked_schema, describe, prepared, write_export
 from .decision import FIELDS
 from .torchscript import TOLERANCE, ExportedDecision, golden_trace
 
@@ -66,13 +56,11 @@ def export_onnx(
 
     key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
     Raises ExportError where the engine audits, its rule learns, a part came again, nothing was trained yet, the reducer or
-    the interval has no module, a package is missing, onnxruntime does not decide as the model does, or `path` cannot be
-    written. force : as of `export_torchscript`.
+    the interval has no module, a package is missing, or onnxruntime does not decide as the model does; OutputError where
+    `path` cannot be written. force : as of `export_torchscript`.
     """
-    check_target(path, force)
     onnx = _package("onnx")
-    source = source_of(engine_or_model, trace)
-    decision_module(source)  # the same refusals as for TorchScript
+    source, _ = prepared(engine_or_model, trace, path, force)
     _refuse_what_changes(source)
     metadata = describe(source) | {"format": "onnx", "learns": False}
     program = _to_onnx(Twin(source).eval(), source.trace)
@@ -102,20 +90,14 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> On
 
 
 def _refuse_what_changes(source: Exportable) -> None:
-    rule, repeats = type(source.model.rule), int(source.model.index.ring.repeats)
-    if source.audit_rate > 0.0:
-        raise ExportError(
-            "ONNX carries no audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0."
-        )
-    if rule is not DecisionRule:  # one of the user's own as well: the twin knows the paper's alone
-        raise ExportError(
-            f"ONNX carries no {rule.__name__}, a rule that learns; export torchscript, or set guarantee = 'local' and "
-            "stops = 'some'."
-        )
-    if repeats:
-        raise ExportError(
-            f"ONNX carries no votes: {repeats} of the references are of parts that were there already; export torchscript."
-        )
+    rule, repeats = type(source.model.rule), int(source.model.index.repeats)
+    # One of the user's own as well: the twin knows the paper's alone.
+    learns = f"{rule.__name__}, a rule that learns; export torchscript, or set guarantee = 'local' and stops = 'some'"
+    audits = "audits, its integers are not the content hash's; export torchscript, or set audit_rate = 0"
+    votes = f"votes: {repeats} of the references are of parts that were there already; export torchscript"
+    for what, held in ((audits, source.audit_rate > 0.0), (learns, rule is not DecisionRule), (votes, repeats > 0)):
+        if held:
+            raise ExportError(f"ONNX carries no {what}.")
 
 
 class OnnxModel:
@@ -159,9 +141,9 @@ class Twin(nn.Module):
         self.register_buffer("scale", torch.from_numpy(model.scale)[:, None])
         # A reference of space k stands far away in every other space: one subtraction, no gathering.
         places = np.full((model.n_spaces, index.dim, len(index)), FAR, dtype=np.float32)
-        places[index.spaces, :, np.arange(len(index))] = index.points
+        places[index.held("spaces"), :, np.arange(len(index))] = index.held("points")
         self.register_buffer("places", torch.from_numpy(places))
-        self.register_buffer("success", torch.from_numpy(index.labels.astype(np.int64)))
+        self.register_buffer("success", torch.from_numpy(index.held("labels").astype(np.int64)))
         self.n_references = len(index)
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
@@ -200,7 +182,7 @@ class Twin(nn.Module):
         return tuple(torch.where(rejects, few, many) for few, many in zip(narrow, wide, strict=True))
 
     def look(self, distances: Tensor, fraction: float) -> tuple[Tensor, ...]:
-        """action, lower, upper, n_success, n_failure of one ball, as of `ReferenceRing.count_near`."""
+        """action, lower, upper, n_success, n_failure of one ball, as of `RadiusIndex.count_near`."""
         if fraction == 0.0:
             inside = distances <= self.radius * self.radius
         else:

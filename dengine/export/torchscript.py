@@ -32,17 +32,7 @@ from ..errors import ExportError
 from ..folds import part_hash
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
 from ..traces import as_trace, as_traces
-from .bundle import (
-    METADATA,
-    KeyFile,
-    check_target,
-    checked_bytes,
-    decision_module,
-    describe,
-    metadata_of,
-    source_of,
-    write_export,
-)
+from .bundle import METADATA, KeyFile, checked_bytes, describe, metadata_of, prepared, write_export
 from .decision import METHODS
 
 WARM_UP = 3
@@ -55,9 +45,7 @@ def export_sources(folder: str | os.PathLike[str]) -> Path:
     try:
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
             raise ExportError(f"Expected a new or an empty folder for the sources, {target} holds something; name another.")
-        shutil.copytree(
-            Path(__file__).parent / "cpp", target, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__")
-        )
+        shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
     except OSError as error:
         raise ExportError(f"Cannot write {target}: {error}; choose a folder that is writable.") from error
@@ -78,13 +66,12 @@ def export_torchscript(
     trace : the trace contract, for a `ModelPrediction` whose traces have another rate or limit than `TraceSpec`'s.
     key : a key's file (`make_key`); the signature comes beside the file, as `path`.sig.
     force : replace the file that is there; never a database, a folder or a link.
-    Raises ExportError where nothing was trained yet, the reducer, the interval or the rule cannot be scripted, or `path`
-    cannot be written: what was there is then as it was.
+    Raises ExportError where nothing was trained yet, or the reducer, the interval or the rule cannot be scripted;
+    OutputError where `path` cannot be written: what was there is then as it was.
     """
-    check_target(path, force)
-    source = source_of(engine_or_model, trace)
+    source, module = prepared(engine_or_model, trace, path, force)
     try:
-        frozen = torch.jit.freeze(script(decision_module(source).eval()), preserved_attrs=list(METHODS))
+        frozen = torch.jit.freeze(script(module.eval()), preserved_attrs=list(METHODS))
     except RuntimeError as error:
         raise ExportError(f"The decision does not compile to TorchScript: {str(error).splitlines()[0]}") from error
     x = golden_trace(source.trace)

@@ -3,8 +3,8 @@
     for sentence in explain(store, "0123456789ab-412").said: ...
 
 What was recorded (counts, bound, action, reason) is shown as it is. Neighbours, the novelty score and the levels of a
-guarantee are found again, without a reducer, by the version that answered where the store keeps it: `Explanation.notes`
-says by which. A store keeps each version's references, each trace's place, and the time of each label.
+guarantee are found again, without a reducer, by the version that answered, where the store keeps it. A store keeps each
+version's references, each trace's place, and the time of each label.
 """
 
 from __future__ import annotations
@@ -13,25 +13,27 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..decision.intervals import INTERVALS
+from ..decision.intervals import INTERVALS, Bounds, level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex, math_ceil
 from ..decision.rule import NOBODY, DecisionRule
-from ..errors import ReportError, StoreError
+from ..errors import StoreError, UnknownDecisionError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
-from ..model.base import Embedding, EngineModel
+from ..model.base import Embedding
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, Source, TraceSpec, plain, trace_in
-from ..store.base import Store
+from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
 from ..store.views import PastLabel
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 STRIDE = 100_000  # labels after a version at most that are read: a cell that never retrains again
 Levels = tuple[float, float]  # accepted where lower >= the first, rejected where 1 - upper >= the second
@@ -41,25 +43,19 @@ Levels = tuple[float, float]  # accepted where lower >= the first, rejected wher
 class Answering:
     """A version as it stood at a moment.
 
-    version : its number.  index : its references.  known : the labels behind them, oldest first.
+    index : its references.  behind : the label of each, in the order of its places; None where it is not known.
     levels : that a bound had to reach, None where that is not kept.  last_seq : the newest label that it could know.
     novelty : of the trace that it found novel, None for any other.
     """
 
-    version: int
     index: RadiusIndex
-    known: list[PastLabel]
+    behind: list[PastLabel | None]
     levels: Levels | None
     last_seq: int
     novelty: Novelty | None
 
-    def labels_of_references(self) -> list[PastLabel | None]:
-        """The label behind each reference, in the order of `index.points`; None where it is not known any more."""
-        by_number = {label.seq: label for label in self.known}
-        return [by_number.get(number) for number in self.index.numbers.tolist()]
 
-
-def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision | None) -> Answering | None:
+def as_it_stood(store: SqlStore, version: int, recipe: Recipe, then: StoredDecision | None) -> Answering | None:
     """A version as it stood when a decision was made, or as it stands now; None where the store does not keep it."""
     try:
         stored = store.load_version(version)
@@ -74,10 +70,11 @@ def as_it_stood(store: Store, version: int, recipe: Recipe, then: StoredDecision
     if then is not None:
         later = [label for label in later if _known_at(label, then, recipe.policy.stops == "all")]
     before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
-    known = [label for label in (*before, *later) if not label.quarantined]
-    last = max((label.seq for label in known), default=stored.last_seq)
+    known = {label.seq: label for label in (*before, *later) if not label.quarantined}
+    last = max(known, default=stored.last_seq)
     index = _index(stored, [label for label in later if label.model_version == version], recipe)
-    return Answering(version, index, known, _levels(stored, later, recipe.policy), last, _novelty(stored, then))
+    behind = [known.get(number) for number in index.held("numbers").tolist()]
+    return Answering(index, behind, _levels(stored, later, recipe.policy), last, _novelty(stored, then))
 
 
 def _known_at(label: PastLabel, then: StoredDecision, stops_all: bool) -> bool:
@@ -92,7 +89,7 @@ def _index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> Radi
     for label in added:
         if label.point is not None:
             fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
-            index.put(torch.from_numpy(label.point), float(label.success), fold, label.content_hash, label.seq)
+            index.keep(torch.from_numpy(label.point), float(label.success), fold, label.content_hash, label.seq)
     return index
 
 
@@ -123,11 +120,11 @@ def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Decisi
     for label in told:
         if not label.quarantined:
             rule.observe(label.silent, label.novel)
-            rule.tell(label.lower, label.upper, label.success)
+            rule.tell(label.lower, label.upper, label.success, label.predicted, label.looked)
     return rule
 
 
-def rule_now(store: Store, policy: Policy) -> DecisionRule | None:
+def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """The rule as it stands now; None before the first version, and where it is not kept."""
     stored = store.last_version()
     if stored is None or "untold" in stored.state:  # it missed something: an engine that is opened tells it all anew
@@ -150,15 +147,13 @@ SUCCESSES = 1000  # newest labelled traces that it is made of
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """A piece of one channel that lies outside on one side: samples `first` to `last`, both outside.
+    """A piece of one channel that lies outside on one side.
 
-    from_s, to_s : their times in seconds.  above : whether it lies above the band.
+    from_s, to_s : times in seconds of its first and its last sample.  above : whether it lies above the band.
     widths : the largest distance from the band, in widths that the band has there.
     """
 
     channel: int
-    first: int
-    last: int
     from_s: float
     to_s: float
     above: bool
@@ -172,8 +167,7 @@ class Envelope:
     n : successes.  low, median, high : (C, T), the band's edges and its middle, in the trace's unit.
     outside : share of the trace's samples that lie outside.  usual : below which that share lies for 95 % of the successes.
     not_finite : samples of the trace that are NaN or infinite, and lie nowhere.
-    excesses : where it leaves the band, in order of channel and time.
-    largest : the excess that goes farthest, in widths of the band; None where there is none.
+    excesses : where it leaves the band, the farthest first.
     """
 
     n: int
@@ -184,7 +178,6 @@ class Envelope:
     usual: float
     not_finite: int
     excesses: tuple[Excess, ...]
-    largest: Excess | None
 
 
 def envelope_of(successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float) -> Envelope | None:
@@ -198,7 +191,6 @@ def envelope_of(successes: NDArray[np.float32], trace: NDArray[np.float32], rate
     width = np.maximum(width, NARROWEST * np.median(width, axis=1, keepdims=True) + 1e-9)
     x = np.where(finite, trace, low).astype(np.float64)
     beyond = np.where(x > high, (x - high) / width, np.where(x < low, (x - low) / width, 0.0))  # (C, T) in widths
-    excesses = tuple(_excesses(beyond, rate_hz))
     return Envelope(
         n=len(successes),
         low=low,
@@ -207,8 +199,7 @@ def envelope_of(successes: NDArray[np.float32], trace: NDArray[np.float32], rate
         outside=float((beyond != 0.0).sum() / max(1, finite.sum())),
         usual=float(np.quantile(((successes < low) | (successes > high)).mean(axis=(1, 2)), 0.95)),
         not_finite=int((~finite).sum()),
-        excesses=excesses,
-        largest=max(excesses, key=lambda each: each.widths, default=None),
+        excesses=tuple(sorted(_excesses(beyond, rate_hz), key=lambda each: -each.widths)),
     )
 
 
@@ -219,12 +210,11 @@ def _excesses(beyond: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
         for first, end in pairwise(edges.tolist()):
             if side[first]:
                 widest = float(np.abs(row[first:end]).max())
-                yield Excess(channel, first, end - 1, first / rate_hz, (end - 1) / rate_hz, bool(side[first] > 0), widest)
+                yield Excess(channel, first / rate_hz, (end - 1) / rate_hz, bool(side[first] > 0), widest)
 
 
 # The evidence of one decision
 
-NEIGHBOURS = 10  # nearest references that are shown
 MOST = 20_000  # more labels in a ball than that are not thought of
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
@@ -245,54 +235,41 @@ class Novelty:
 class Bound:
     """A bound, and what it was held against.
 
-    interval, alpha : by which it was made.  n_success, n_failure, lower, upper : as recorded.
-    ball : which references were counted, in words.
+    n_success, n_failure, lower, upper : as recorded.
     accept_at, reject_at : accepted where lower >= accept_at, rejected where upper <= reject_at; None where nothing was
         let pass on that side, or where it is not known.
     level : what set these two, in words.
     successes_needed, failures_needed : more labels of this kind, and none of the other, that would have been accepted, or
         rejected; 0 where it was; None where no number would do.
-    repeats : whether the recorded bound is what the settings give for the recorded counts.
     """
 
-    interval: str
-    alpha: float
     n_success: int
     n_failure: int
     lower: float
     upper: float
-    ball: str
     accept_at: float | None
     reject_at: float | None
     level: str
     successes_needed: int | None
     failures_needed: int | None
-    repeats: bool
 
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What a decision is explained by: an engine's settings, and what is known of that moment.
+    """What a decision is explained by: its engine's settings, and what is known of that moment.
 
-    spec : the traces' contract, None before the first.  model : what a model that was handed in is called.
-    levels : that held, None where that is not kept.  safe_mode : why everything was verified, "" where it was not.
+    spec : the traces' contract.  model : what a model that was handed in is called.
+    levels : that a bound had to reach, None where that is not kept.  novelty : as in `Explanation`.
+    safe_mode : why everything was verified, "" where it was not.
     """
 
-    recipe: Recipe = field(default_factory=Recipe)
-    spec: TraceSpec | None = None
+    recipe: Recipe
+    spec: TraceSpec
     model: str | None = None
     seed: int = 0
     levels: Levels | None = None
     novelty: Novelty | None = None
     safe_mode: str = ""
-
-    @classmethod
-    def of(cls, store: Store) -> Self:
-        """The settings that a store keeps; StoreError for one that no engine has used."""
-        known = store.settings()
-        if "recipe" not in known:
-            raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
-        return cls(Recipe.from_toml(known["recipe"]), trace_in(known), known.get("model"), int(known.get("seed", "0")))
 
     @property
     def rival(self) -> str:
@@ -304,24 +281,9 @@ def bound_of(made: Decision, found: Circumstances) -> Bound | None:
     """How a decision's bound came out; None where none was asked for: of bad and novel traces, and before any model."""
     if made.reason not in BOUNDED or _was_lost(made):
         return None
-    policy = found.recipe.policy
     accept_at, reject_at, level = _thresholds(found)
-    again = INTERVALS[policy.interval](made.n_success, made.n_failure, policy.alpha)
-    return Bound(
-        interval=policy.interval,
-        alpha=policy.alpha,
-        n_success=made.n_success,
-        n_failure=made.n_failure,
-        lower=made.lower,
-        upper=made.upper,
-        ball=_reach(made, found),
-        accept_at=accept_at,
-        reject_at=reject_at,
-        level=level,
-        successes_needed=None if accept_at is None else _needed(policy, made, accept_at, 1),
-        failures_needed=None if reject_at is None else _needed(policy, made, reject_at, 0),
-        repeats=found.model is not None or bool(np.allclose(again, (made.lower, made.upper), atol=1e-6)),
-    )
+    needed = [_needed(found.recipe.policy, made, at, success) for at, success in ((accept_at, 1), (reject_at, 0))]
+    return Bound(made.n_success, made.n_failure, made.lower, made.upper, accept_at, reject_at, level, *needed)
 
 
 def _was_lost(made: Decision) -> bool:
@@ -352,16 +314,28 @@ def _reach(made: Decision, found: Circumstances) -> str:
     return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
 
 
-def _needed(policy: Policy, made: Decision, threshold: float, success: int) -> int | None:
+def is_score(policy: Policy, made: Decision) -> bool:
+    """Whether a decision was sorted by its heads' score, and not by an interval."""
+    return policy.guarantee == "pooled" and made.lower == made.upper
+
+
+def _bound(policy: Policy, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
+    return INTERVALS[policy.interval](n_success, n_failure, level_of(policy.alpha, policy.guarantee))
+
+
+def _needed(policy: Policy, made: Decision, threshold: float | None, success: int) -> int | None:
+    if threshold is None:
+        return None
     more = np.arange(MOST + 1)
+    if is_score(policy, made):  # no count changes it
+        return 0 if (made.lower >= threshold if success else made.upper <= threshold) else None
     counts = made.n_success + success * more, made.n_failure + (1 - success) * more
-    lower, upper = INTERVALS[policy.interval](*counts, policy.alpha)
+    lower, upper = _bound(policy, *counts)
     enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
     return int(enough[0]) if len(enough) else None
 
 
 def _verdict(past: StoredDecision, bound: Bound | None, found: Circumstances) -> Iterator[str]:
-    """The sentences: what was done and why, how the bound came out, and what became of the part."""
     made = past.decision
     lost = ": the row was made from a stop whose decision was lost; on what evidence is not known."
     yield DID[made.action].capitalize() + (lost if _was_lost(made) else WHY[made.reason](made, past.trace, found))
@@ -382,16 +356,12 @@ def _audit(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> 
 
 def _saturated(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
     spec = found.spec
-    if spec is None or spec.limit is None:
-        return ": the trace touched the sensor's range."
-    touching = np.argwhere(np.abs(trace) >= spec.limit)
+    touching = np.argwhere(np.abs(trace) >= spec.limit) if spec.limit is not None else np.zeros((0, 2))
     if not len(touching):
-        return f": the trace touched the sensor's range, which is now {spec.limit:g} {spec.unit}."
+        return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
-    return (
-        f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, first after "
-        f"{sample / spec.rate_hz:.3f} s (channel {channel + 1})."
-    )
+    first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
+    return f": {len(touching)} samples touch the sensor's range of {spec.limit:g} {spec.unit}, {first}."
 
 
 def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
@@ -405,9 +375,7 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was.",
     Reason.AUDIT: _audit,
     Reason.NOT_FINITE: _not_finite,
-    Reason.CONSTANT: lambda made, trace, found: (
-        f": every sample is {trace.flat[0]:g} {found.spec.unit if found.spec else ''}: a dead sensor."
-    ),
+    Reason.CONSTANT: lambda made, trace, found: f": every sample is {trace.flat[0]:g} {found.spec.unit}: a dead sensor.",
     Reason.SATURATED: _saturated,
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error, which the log of that time tells.",
     Reason.NOVEL: lambda made, trace, found: (
@@ -420,9 +388,7 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.NO_STORE: lambda *_: (
         ": the cell's disk did not take it then, or could not say whether its id was new, so the model was not asked."
     ),
-    Reason.LATE: lambda *_: (
-        ": whoever asked could wait no longer for the answer, and verified, so the model was not asked."
-    ),
+    Reason.LATE: lambda *_: ": whoever asked could wait no longer, and verified, so the model was not asked.",
 }
 
 
@@ -431,42 +397,40 @@ def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iter
     if found.rival:
         yield f"{found.rival} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
         return
-    counted = f"{made.n_success} of {n} labels {bound.ball} are successes" if n else f"No label {bound.ball}"
-    name = bound.interval.replace("_", "-").capitalize()
-    yield f"{counted}; {name} at alpha {bound.alpha:g} bounds the success rate by {reach}."
+    ball, policy = _reach(made, found), found.recipe.policy
+    counted = f"{made.n_success} of {n} labels {ball} are successes" if n else f"No label {ball}"
+    name = policy.interval.replace("_", "-").capitalize()
+    if is_score(policy, made):
+        yield f"{counted}; the heads give it {made.lower:.3f}, the mean of what each says of its success."
+    else:
+        yield f"{counted}; {name} at alpha {level_of(policy.alpha, policy.guarantee):g} bounds the success rate by {reach}."
     if bound.accept_at is None and bound.reject_at is None:
         why = found.safe_mode or ("" if found.levels is None else "no level of evidence held yet")
         yield f"Nothing could pass, whatever the bound: {why}." if why else f"What it had to reach: {bound.level}."
         return
-    if made.predicted is not Action.REJECT:
-        yield _side("accept", f"lower must be at least {{:.4g}} ({bound.level}); it is {made.lower:.3f}", bound)
-    if made.predicted is not Action.ACCEPT:
-        yield _side("reject", f"upper must be at most {{:.4g}} ({bound.level}); it is {made.upper:.3f}", bound)
+    good, bad = (MOST + 1 if n is None else n for n in (bound.successes_needed, bound.failures_needed))
+    # Of what is uncertain the nearer of the two is told.
+    if made.predicted is Action.ACCEPT or (made.predicted is Action.VERIFY and good <= bad):
+        must = f"lower must be at least {{:.4g}} ({bound.level}); it is {made.lower:.3f}"
+        yield _side("accept", must, bound.accept_at, bound.successes_needed, ("success", "successes", "failure"))
+    else:
+        must = f"upper must be at most {{:.4g}} ({bound.level}); it is {made.upper:.3f}"
+        yield _side("reject", must, bound.reject_at, bound.failures_needed, ("failure", "failures", "success"))
 
 
-def _side(action: str, must: str, bound: Bound) -> str:
-    """What one action would have needed."""
-    ways = {
-        "accept": (bound.accept_at, bound.successes_needed, "success", "successes", "failure"),
-        "reject": (bound.reject_at, bound.failures_needed, "failure", "failures", "success"),
-    }
-    threshold, needed, one, many, other = ways[action]
+def _side(action: str, must: str, threshold: float | None, needed: int | None, kinds: tuple[str, str, str]) -> str:
+    """What one action would have needed; kinds : one label of it, many, and one of the other."""
     if threshold is None:
         return f"To {action}: no level held, so nothing could be {action}ed."
+    one, many, other = kinds
     more = "no number of labels" if needed is None else f"{needed} more {one if needed == 1 else many} and no {other}"
     return f"To {action}, {must.format(threshold)}" + (", enough." if needed == 0 else f": {more} would do.")
 
 
 @dataclass(frozen=True)
 class Ball:
-    """What lies around a trace, in the space of a version: `own` if that is the one that answered.
+    """What lies around a trace: (n,) distances to the references, infinite to those of its own part; a ball's votes."""
 
-    distances : (n,) to each reference, in the order of `index.points`; infinite to those of its own part.
-    radius : of the ball.  n_success, n_failure : its votes.
-    """
-
-    answering: Answering
-    own: bool
     distances: NDArray[np.float64]
     radius: float
     n_success: int
@@ -492,16 +456,16 @@ class Neighbour:
     trace: NDArray[np.float32] | None = field(metadata={"apart": True})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Explanation:
     """A decision and its evidence.
 
     decision : as it was recorded.  trace : (C, T), as `spec` says.  label : what became of it is in `decision`.
-    said : why, in sentences.  notes : what was found again, and by which version.
+    said : why, in sentences.  notes : what was found again.
     bound : how the bound came out, and what others it would have needed; None where no bound was asked for.
     novelty : how unlike all references a novel trace is; None for any other, and where that is not known any more.
-    neighbours : the nearest references, nearest first; radius : of the ball, None where none was drawn.
-    neighbours_version : the version that these are references of; None without neighbours.
+    neighbours : the nearest references of the version that answered, nearest first; none where it is not kept.
+    radius : of the ball, None where none was drawn.
     envelope : the band of the known successes; None while there are too few.
     """
 
@@ -513,123 +477,110 @@ class Explanation:
     bound: Bound | None
     novelty: Novelty | None
     neighbours: tuple[Neighbour, ...]
-    neighbours_version: int | None
     radius: float | None
     envelope: Envelope | None
 
-    def record(self) -> dict[str, Any]:
-        """All but the arrays, as plain values for a machine."""
-        said: dict[str, Any] = plain(self)
-        return said
+    def __repr__(self) -> str:
+        made = self.decision.decision
+        return f"<Explanation of {made.id}: {made.action.value}, {made.reason.value}, {len(self.neighbours)} neighbours>"
+
+    _repr_html_ = in_html
 
 
-Present = Callable[[], tuple[EngineModel | None, int]]
+def explain(store: SqlStore, decision_id: str, neighbours: int = 10, under: Circumstances | None = None) -> Explanation:
+    """Explain one decision, by what its store keeps.
 
-
-def explain(
-    store: Store,
-    decision_id: str,
-    neighbours: int = NEIGHBOURS,
-    settings: Circumstances | None = None,
-    present: Present = lambda: (None, 0),
-) -> Explanation:
-    """Explain one decision.
-
-    neighbours : how many of the nearest references to show.  settings : of the engine; None: as the store keeps them.
-    present : gives the model that answers now, or None, and its version; asked where the one that answered is not kept.
+    neighbours : how many of the nearest references to show.  under : the engine's settings; None: as the store has them.
     Raises ReportError for an id that the store does not hold, StoreError for a store that no engine has used.
     """
-    settings = settings or Circumstances.of(store)
     past = store.get_decision(decision_id)
+    under = _settings(store, past) if under is None else under
     if past is None:
-        raise ReportError(
-            f"Expected the id of a decision of cell {store.cell_id!r}, got {decision_id!r}, which its store does not hold; "
-            "`dengine history STORE` lists the ids, newest last."
-        )
-    made, trace, recipe = past.decision, past.trace, settings.recipe
-    spec = settings.spec or TraceSpec(samples=trace.shape[1], channels=trace.shape[0])
+        got = f"{decision_id!r}, which its store does not hold; `dengine history STORE` lists the ids, newest last"
+        raise UnknownDecisionError(f"Expected the id of a decision of cell {store.cell_id!r}, got {got}.")
+    made, trace, recipe = past.decision, past.trace, under.recipe
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
-    around = _around(store, past, answering, recipe, present)
-    found = replace(settings, spec=spec, safe_mode=_safe_mode(store, past))
+    found = replace(under, safe_mode=_safe_mode(store, past))
     if answering is not None:
         found = replace(found, levels=answering.levels, novelty=answering.novelty)
-    bound = bound_of(made, found)
+    around, bound = _around(past, answering, recipe), bound_of(made, found)
     return Explanation(
         decision=past,
         trace=trace,
-        spec=spec,
+        spec=found.spec,
         said=tuple(_verdict(past, bound, found)),
-        notes=tuple(_notes(past, around, bound)),
+        notes=tuple(_notes(past, around, bound, found)),
         bound=bound,
         novelty=found.novelty,
-        neighbours=() if around is None else tuple(_nearest(store, around, neighbours)),
-        neighbours_version=None if around is None else around.answering.version,
+        neighbours=tuple(_nearest(store, around, answering, neighbours)),
         radius=None if around is None else around.radius,
-        envelope=_envelope(store, past, answering, spec),
+        envelope=_envelope(store, past, answering, found.spec),
     )
 
 
-def _safe_mode(store: Store, past: StoredDecision) -> str:
+def _settings(store: SqlStore, past: StoredDecision | None) -> Circumstances:
+    known = store.settings()
+    if "recipe" not in known:
+        raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
+    channels, samples = (1, 1) if past is None else past.trace.shape
+    spec = trace_in(known) or TraceSpec(samples=samples, channels=channels)
+    return Circumstances(Recipe.from_toml(known["recipe"]), spec, known.get("model"), int(known.get("seed", "0")))
+
+
+def _safe_mode(store: SqlStore, past: StoredDecision) -> str:
     if past.decision.reason is not Reason.SAFE_MODE:
         return ""
     began = (each.text for each in reversed(store.events()) if each.kind == SAFE_MODE_BEGAN and each.time <= past.time)
     return next(began, "")
 
 
-def _around(
-    store: Store, past: StoredDecision, answering: Answering | None, recipe: Recipe, present: Present
-) -> Ball | None:
-    """The ball that decided, or the one of the version that answers now; None where nothing embeds the trace."""
-    z, own = past.decision.embedding, True
-    if past.quarantined or past.decision.reason is Reason.MODEL_ERROR:
+def _around(past: StoredDecision, answering: Answering | None, recipe: Recipe) -> Ball | None:
+    """The ball that decided; None where nothing placed the trace, or the version is not kept."""
+    made = past.decision
+    if answering is None or made.embedding is None:
         return None
-    if answering is None or z is None:
-        own, (model, version) = False, present()
-        answering = None if model is None else as_it_stood(store, version, recipe, None)
-        if model is None or model.untold or answering is None:
-            return None
-        z = model.predict_one(past.trace, past.content_hash).embedding
-        if z is None:
-            return None
-    made, fractions = past.decision, [recipe.fraction or 0.0]
+    fractions = [recipe.fraction or 0.0]
     if made.predicted is Action.REJECT and recipe.reject_fraction:
         fractions.insert(0, recipe.reject_fraction)  # rejections may be judged by a narrow ball
-    balls = [_ball(answering, own, z, past.content_hash, recipe.radius, fraction) for fraction in fractions]
+    index, part = answering.index, past.content_hash
+    balls = [_ball(index, made.embedding, part, recipe.radius, fraction) for fraction in fractions]
     recorded = (made.n_success, made.n_failure)
     return next((ball for ball in balls if (ball.n_success, ball.n_failure) == recorded), balls[-1])
 
 
-def _ball(answering: Answering, own: bool, z: Embedding, part: int, radius: float, fraction: float) -> Ball:
+def _ball(index: RadiusIndex, z: Embedding, part: int, radius: float, fraction: float) -> Ball:
     """What lies around a trace (K, d) of a part with this hash; radius, fraction : as the rule is asked, 0 for None."""
-    ring = answering.index.ring
-    squared = ring.squared_distances(torch.tensor(z, dtype=torch.float32), part)
-    n_success, n_failure = ring.count_near(squared, radius, fraction)
+    squared = index.squared_distances(torch.tensor(z, dtype=torch.float32), part)
+    n_success, n_failure = index.count_near(squared, radius, fraction)
     distances = np.sqrt(squared.double().numpy())
     if fraction > 0.0 and len(distances):
         radius = float(np.sort(distances)[min(len(distances), math_ceil(fraction * len(distances))) - 1])
-    return Ball(answering, own, distances, radius, n_success, n_failure)
+    return Ball(distances, radius, n_success, n_failure)
 
 
-def _nearest(store: Store, ball: Ball, most: int) -> Iterator[Neighbour]:
-    index, behind = ball.answering.index, ball.answering.labels_of_references()
+def _nearest(store: SqlStore, ball: Ball | None, answering: Answering | None, most: int) -> Iterator[Neighbour]:
+    if ball is None or answering is None:
+        return
+    index = answering.index
     for slot in np.argsort(ball.distances, kind="stable")[:most]:
         if not np.isfinite(ball.distances[slot]):
             return
-        label = behind[slot]
-        stored = None if label is None else store.get_decision(label.decision_id)
+        label = answering.behind[slot]
+        id_, source = (None, None) if label is None else (label.decision_id, label.source)
+        stored = None if id_ is None else store.get_decision(id_)
         yield Neighbour(
-            decision_id=None if label is None else label.decision_id,
+            decision_id=id_,
             part=None if stored is None else stored.decision.part,
-            success=bool(index.labels[slot]),
-            source=None if label is None else label.source,
+            success=bool(index.held("labels")[slot]),
+            source=source,
             distance=float(ball.distances[slot]),
-            space=int(index.spaces[slot]),
+            space=int(index.held("spaces")[slot]),
             inside=bool(ball.distances[slot] <= ball.radius),
             trace=None if stored is None else stored.trace,
         )
 
 
-def _envelope(store: Store, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
+def _envelope(store: SqlStore, past: StoredDecision, answering: Answering | None, spec: TraceSpec) -> Envelope | None:
     """The band of the successes that were known then; where those were too few, of those known now."""
     for upto in (None if answering is None else answering.last_seq, None):
         labelled = store.labelled(SUCCESSES, last=upto)
@@ -639,22 +590,22 @@ def _envelope(store: Store, past: StoredDecision, answering: Answering | None, s
     return None
 
 
-def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None) -> Iterator[str]:
-    version = past.decision.model_version
+def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None, found: Circumstances) -> Iterator[str]:
+    made, policy = past.decision, found.recipe.policy
     if past.quarantined:
         yield "The trace is quarantined: it was not embedded, is never trained on, and has no neighbours."
     elif around is None:
-        yield "Nothing that embeds this trace is kept, so no neighbours are shown."
-    elif around.own:
-        recorded, again = (past.decision.n_success, past.decision.n_failure), (around.n_success, around.n_failure)
-        yield f"Neighbours: the references of version {version}, which answered, as they stood then."
-        if past.decision.reason is not Reason.NOVEL and again != recorded:
+        gone = f"version {made.model_version}, which answered, is not kept any more"
+        yield f"No neighbours are shown: {'nothing placed the trace' if made.embedding is None else gone}."
+    else:
+        recorded, again = (made.n_success, made.n_failure), (around.n_success, around.n_failure)
+        yield f"Neighbours: the references of version {made.model_version}, which answered, as they stood then."
+        if made.reason is not Reason.NOVEL and again != recorded:
             yield (
                 f"Counted again, the ball holds {again[0]} successes and {again[1]} failures; recorded were {recorded[0]} "
                 f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."
             )
-    else:
-        why = "no version answered then" if version == 0 else f"version {version}, which answered, is not kept any more"
-        yield f"Neighbours: by version {around.answering.version}, the present one; {why}."
-    if bound is not None and not bound.repeats:
-        yield "By the store's present settings these counts give another bound; the recorded one is shown."
+    if bound is not None and found.model is None and not is_score(policy, made):
+        given = _bound(policy, made.n_success, made.n_failure)
+        if not np.allclose(given, (made.lower, made.upper), atol=1e-6):
+            yield "By the store's present settings these counts give another bound; the recorded one is shown."

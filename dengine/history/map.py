@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..recipe import Recipe
 from ..records import Action
 from ..reducers import reducer_class
-from ..store.base import Store
 from ..store.views import HistoryFilter
 from .explain import as_it_stood
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 KNOWN, NEWEST = 250, 10  # parts of a map: the newest known ones, and the newest of all
 NAMED = 1000  # newest decisions whose parts' numbers are looked up
@@ -49,7 +52,7 @@ class PartMap:
     probability: bool
 
 
-def part_map(store: Store, recipe: Recipe, version: int) -> PartMap:
+def part_map(store: SqlStore, recipe: Recipe, version: int) -> PartMap:
     """Read the map of a version."""
     recent = [past.decision for past in store.decisions(HistoryFilter(), NAMED)]
     newest = list(_newest(store, [made.id for made in recent[-NEWEST:] if made.model_version == version]))
@@ -60,20 +63,20 @@ def part_map(store: Store, recipe: Recipe, version: int) -> PartMap:
     return PartMap(version, (*known, *newest), radius, bool(getattr(kind, "own_unit", False)))
 
 
-def _newest(store: Store, ids: list[str]) -> Iterator[Mark]:
+def _newest(store: SqlStore, ids: list[str]) -> Iterator[Mark]:
     for past in filter(None, map(store.get_decision, ids)):
         made = past.decision
         if made.embedding is not None:
             yield Mark(made.id, made.part, *_plane(np.mean(made.embedding, axis=0)), past.success, made.action)
 
 
-def _known(store: Store, recipe: Recipe, version: int, parts: dict[str, str | None]) -> list[Mark]:
+def _known(store: SqlStore, recipe: Recipe, version: int, parts: dict[str, str | None]) -> list[Mark]:
     """The newest parts behind a version's references, oldest first."""
     answering = as_it_stood(store, version, recipe, None)
     if answering is None:
         return []
-    points, labels = np.asarray(answering.index.points), np.asarray(answering.index.labels)
-    behind = [(label.seq, slot, label.decision_id) for slot, label in enumerate(answering.labels_of_references()) if label]
+    points, labels = answering.index.held("points"), answering.index.held("labels")
+    behind = [(label.seq, slot, label.decision_id) for slot, label in enumerate(answering.behind) if label]
     newest = sorted(behind)[-KNOWN:]
     return [Mark(id_, parts.get(id_), *_plane(points[slot]), bool(labels[slot]), None) for _, slot, id_ in newest]
 

@@ -7,29 +7,30 @@ for past in history(store, last=50, action="accept", label="bad"): ...
 
 from __future__ import annotations
 
-import heapq
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Any, TypeVar
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from itertools import islice
+from typing import TYPE_CHECKING, Any
 
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import SettingError, StoreError
+from ..errors import ReportConflictError, StoreError, UnknownDecisionError, expect, shortened
 from ..recipe import Recipe
-from ..records import Action, Reason, TraceSpec, trace_in
-from ..store.base import Store
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Key, Outcomes, StoredDecision, StoredVersion
-from ..store.views import LABELS, HistoryFilter, Stretch, Tally
+from ..records import Action, Decision, Reason, TraceSpec, trace_in
+from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
+from ..store.views import HistoryFilter, Stretch, Tally
 
-PAGE = 500  # decisions read at a time
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ..store.sql import SqlStore
+
+PAGE, MOST = 500, 10**9  # decisions read at a time, and that can be asked for
 NEWEST = 500  # decisions that are looked at apart
-RECENT = 200  # labels that the share of novel traces is told of
+FAILING = 3  # retrains, none of them accepted: the first may come before there are enough labels
 EVENTS = 5  # newest ones that a status shows
-
-Name = TypeVar("Name", bound=StrEnum)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,6 @@ class Span:
     first, last : times of the oldest and the newest; None where there is none.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : went on without a check.  stops : of the accepted, those known to be bad.
-    rejected_good : audited parts that the model would have rejected, and were good.
     bad_accepts : parts that it let pass or would have, by the policy's alpha.
     would_accept, would_reject : by audits alone, in the shadow mode every part; at 95 %, whatever the policy's alpha.
     unlabelled : verified, of which no result was reported.
@@ -78,8 +78,6 @@ class Span:
     accepted: int
     rejected: int
     stops: int
-    audited_rejects: int
-    rejected_good: int
     would_accept: Judged
     would_reject: Judged
     bad_accepts: Judged
@@ -110,9 +108,9 @@ class Status:
     newest, ever : the newest `last` decisions, and all.
     unreported : accepted parts whose fate was never reported; of verified ones `ever.unlabelled` tells.
     sources : labels by their source.  corrected, forgotten : labels that were put right.
-    recent, recent_novel : parts that the newest labels tell of, and those of them that were novel.
     events : the newest, oldest first.  watch : None where nothing is watched, or it was not asked for.
-    store_fault, retraining : of a running engine, which alone knows.
+    store_fault, retraining : of a running engine, which alone knows, as of
+    store_lag : the age in seconds of the oldest record that the store has not taken from the journal.
     """
 
     cell: str
@@ -136,21 +134,19 @@ class Status:
     sources: dict[str, int]
     corrected: int
     forgotten: int
-    last_label_time: float | None
-    recent: int
-    recent_novel: int
     certificate: Certificate
     retrains: tuple[StoredVersion, ...]
     events: tuple[Event, ...]
-    write_failures: int
     watch: Watch | None
     store_fault: str = ""
     retraining: bool = False
+    store_lag: float = 0.0
 
     @property
     def alarm(self) -> str:
         """What somebody should look at, the worst first; "" where there is nothing."""
         accepts, errors = self.newest.bad_accepts, self.newest.errors
+        failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
@@ -158,12 +154,14 @@ class Status:
                 accepts.verdict == "broken",
                 f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows.",
             ),
+            (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (errors, f"The model failed on {errors} of the newest decisions."),
+            (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),
         )
         return next((text for wrong, text in alarms if wrong), "")
 
 
-def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
+def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """How the engine of a store is doing; last : the newest so many decisions are looked at apart.
 
     watching : read how far the safe mode's detectors are, too, which takes the newest version's arrays.
@@ -175,9 +173,7 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
     recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.versions(own=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
-    # Labels are numbered from 1, or over a whole product.
-    recent = store.evidence_since(counts["labels"] - RECENT if store.product is None else 0)
-    outcomes, silent = every.outcomes, recent.silent[-RECENT:]
+    outcomes = every.outcomes
     return Status(
         cell=store.cell_id,
         product=counts.get("product"),
@@ -194,9 +190,7 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
         newest=_span(store.tally(last), retrains, policy),
         ever=_span(every, retrains, policy),
         unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
-        recent=len(silent) + int(silent.sum()),
-        recent_novel=int(recent.novel[-RECENT:].sum()),
-        certificate=policy.certificate(store.outcomes(int(settings.get("policy_since", 0)))),
+        certificate=policy.certificate(store.outcomes(int(settings.get("policy_since", 0)), policy.label_within)),
         retrains=tuple(retrains),
         events=tuple(events[-EVENTS:]),
         watch=watch(store, recipe) if watching else None,
@@ -205,16 +199,13 @@ def status(store: Store, last: int = NEWEST, watching: bool = False) -> Status:
 
 
 MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
-COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten", "last_label_time", "write_failures")
+COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    outcomes, first, n = tally.outcomes, tally.first, tally.count()
+    outcomes, first, n, reasons = tally.outcomes, tally.first, tally.count(), tally.by("reason")
     here = [each.report for each in retrains if first is not None and each.time >= first]
-    reasons: Counter[Reason] = Counter()
-    for kind in tally.kinds:
-        reasons[kind.reason] += kind.n
-    verified = tally.count(lambda kind: kind.action is Action.VERIFY)
+    verified = tally.by("action")[Action.VERIFY]
     return Span(
         decisions=n,
         first=first,
@@ -224,12 +215,10 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         novel=reasons[Reason.NOVEL],
         safe_mode=reasons[Reason.SAFE_MODE],
         errors=reasons[Reason.MODEL_ERROR],
-        quarantined=tally.count(lambda kind: kind.quarantined),
+        quarantined=tally.by("quarantined")[True],
         accepted=outcomes.accepted,
         rejected=outcomes.rejected,
         stops=outcomes.stops,
-        audited_rejects=outcomes.audited_rejects,
-        rejected_good=outcomes.audited_rejects_good,
         would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
         would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
         bad_accepts=bad_accepts(outcomes, policy),
@@ -261,7 +250,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
     return _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
 
 
-def watch(store: Store, recipe: Recipe) -> Watch | None:
+def watch(store: SqlStore, recipe: Recipe) -> Watch | None:
     """What the rule that answers knows of drift; None where it watches nothing, or that is not kept."""
     from .explain import rule_now  # torch
 
@@ -270,8 +259,9 @@ def watch(store: Store, recipe: Recipe) -> Watch | None:
     rule = rule_now(store, recipe.policy)
     if rule is None or rule.evidence is None:
         return None
-    accepts, rejects, novelty = (max(0.0, capital / rule.evidence.alarm_at) for capital in rule.evidence.watch.tolist())
-    return Watch(accepts, rejects, novelty)
+    limits, mode = rule.evidence.alarm_at, rule.safe_mode()
+    sums = [0.0 if mode == 3 else each for each in rule.evidence.watch.tolist()]
+    return Watch(*(max(0.0, each / limit) for each, limit in zip(sums, limits, strict=True)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,72 +282,70 @@ STRETCHES = 120  # of a picture
 FEWEST = 20  # decisions of a stretch: a share of fewer jumps
 
 
-def course(store: Store, recipe: Recipe, last: int) -> Course:
+def course(store: SqlStore, recipe: Recipe, last: int) -> Course:
     """Read what a picture is drawn from."""
     modes = [event for event in store.events() if event.kind in MODES]
     n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
     return Course(store.stretches(n), store.versions(own=True), modes, 1.0 - recipe.policy.lower_bound, last)
 
 
-def history(
-    store: Store,
-    last: int | None = None,
-    action: Action | str | None = None,
-    reason: Reason | str | None = None,
-    label: str | None = None,
-    since: float | None = None,
-    until: float | None = None,
-    predicted: Action | str | None = None,
-) -> Iterator[StoredDecision]:
+def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
     """The decisions of a store, newest last, one after the other as they are read.
 
-    last : the newest so many of those that are meant; None: all.
-    action, reason : an `Action` and a `Reason`, or their values.  label : good, bad or none.
-    predicted : an `Action` or its value: what the model alone would have done, as in an audit or in the shadow mode.
-    since, until : times in seconds since 1970; the first included, the last not.
+    last : the newest so many of those that are meant; None: all.  where : which are meant, as `HistoryFilter` takes it.
     Raises SettingError for a value that is none of these.
     """
-    if last is not None and last < 1:
-        raise SettingError(f"Expected last to be 1 or more, got {last!r}; leave it out for all decisions.")
-    if label is not None and label not in LABELS:
-        raise SettingError(f"Expected label to be one of {', '.join(LABELS)}, got {label!r}.")
-    where = HistoryFilter(_named(Action, action), _named(Reason, reason), label, since, until, _named(Action, predicted))
-    return _forward(store, where) if last is None else _newest(store, where, last)
+    whole = last is None or 1 <= last < MOST
+    expect(whole, f"last to be 1 or more, below {MOST:,}", last, "leave it out for all decisions")
+    meant = HistoryFilter(**where)
+    if last is None:
+        return paged(store, meant, newest=False)
+    return iter([*islice(paged(store, meant, min(PAGE, last)), last)][::-1])
 
 
-def _named(kind: type[Name], value: Name | str | None) -> Name | None:
-    try:
-        return None if value is None else kind(value)
-    except ValueError:
-        known = ", ".join(kind)
-        raise SettingError(f"Expected {kind.__name__.lower()} to be one of {known}, got {value!r}.") from None
+def paged(
+    store: SqlStore, where: HistoryFilter, page: int = PAGE, beyond: str | None = None, newest: bool = True
+) -> Iterator[StoredDecision]:
+    """The decisions that are meant, newest (or oldest) first, so many read at a time; beyond : the one of this id."""
+    while found := store.decisions(where, page, beyond, newest):
+        found = found[::-1] if newest else found
+        yield from found
+        beyond = found[-1].decision.id
 
 
-def _forward(store: Store, where: HistoryFilter) -> Iterator[StoredDecision]:
-    beyond: Key | None = None
-    while page := store.decisions(where, PAGE, beyond, newest=False):
-        yield from page
-        beyond = page[-1].key
+def of_part(store: SqlStore, part: str) -> str:
+    """The id of the one decision of a part that a label can be of; of a part that is unknown, it may be the id itself.
+
+    UnknownDecisionError where there is none, ReportConflictError where there are several.
+    """
+    found = [each for each in store.decisions(HistoryFilter(part=part), 20) if each.decision.action is not Action.REJECT]
+    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
+    if not found:
+        got = f"{shortened(part)}, which is unknown"
+        raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
+    if len(found) > 1:
+        ids = ", ".join(each.decision.id for each in reversed(found))
+        raise ReportConflictError(
+            f"Expected one decision of that part to report on, there are {len(found)}; name its id: {ids}."
+        )
+    return found[0].decision.id
 
 
-def _newest(store: Store, where: HistoryFilter, last: int) -> Iterator[StoredDecision]:
-    found: deque[StoredDecision] = deque()
-    beyond: Key | None = None
-    while len(found) < last and (page := store.decisions(where, min(PAGE, last - len(found)), beyond)):
-        found.extendleft(reversed(page))
-        beyond = page[0].key
-    return iter(found)
+def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
+    """A row a decision, by its id: what was decided, when, as a datetime in UTC, on what evidence, and the label."""
+    import pandas as pd
+
+    found = list(decisions)
+    names = [each.name for each in fields(Decision) if each.name != "embedding"]
+    rows = pd.DataFrame([[getattr(each.decision, name) for name in names] for each in found], columns=names)
+    rows.insert(1, "time", pd.to_datetime([each.time for each in found], unit="s", utc=True))
+    return rows.assign(label=[each.label if each.success is not None else None for each in found]).set_index("id")
 
 
-def beside(store: Store, since: float | None = None, until: float | None = None) -> dict[str, list[StoredVersion | Event]]:
+def beside(
+    store: SqlStore, since: float | None = None, until: float | None = None
+) -> dict[str, list[StoredVersion | Event]]:
     """What happened beside the decisions, retrains and events, oldest first, between two times in seconds; None: any."""
     first, end = since or float("-inf"), float("inf") if until is None else until
     past: dict[str, list[Any]] = {"retrains": store.versions(own=True), "events": store.events()}
     return {name: [each for each in happened if first <= each.time < end] for name, happened in past.items()}
-
-
-def interleaved(
-    decisions: list[StoredDecision], others: Mapping[str, list[StoredVersion | Event]]
-) -> Iterator[StoredDecision | StoredVersion | Event]:
-    """All of it in the order in which it happened; what has the same time keeps that order too."""
-    return heapq.merge(*others.values(), decisions, key=lambda each: each.time)

@@ -9,7 +9,7 @@ import copy
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
@@ -94,12 +94,19 @@ class EngineModel(ABC):
     ) -> Self:
         """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
 
-    def look_ahead(self, X: NDArray[np.float32]) -> None:  # noqa: B027  # a default: nothing to begin with
-        """Begin with a training on traces (n, C, T) as far as no label is read; see `Reducer.look_ahead`."""
+    def look_ahead(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
+        """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.look_ahead`."""
 
     @abstractmethod
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
+
+    def look(self, x: NDArray[np.float32], part: int | None, limit: float) -> tuple[int, int, Prediction] | None:
+        """`TraceGate` and `predict_one` in one call: fault, content hash, prediction. None: it takes one after the other.
+
+        part : the hash of its part's number; None: it goes by its content.  limit : of the sensor's range.
+        """
+        return None
 
     @abstractmethod
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
@@ -136,12 +143,14 @@ class EngineModel(ABC):
         """Be ready to answer at once, in the place of `previous`."""
 
     def tell(  # noqa: B027  # a default: nothing to learn
-        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int
-    ) -> None:
+        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int,
+        predicted: int = 0, looked: float = 1.0,
+    ) -> None:  # fmt: skip
         """Learn what became of a part.
 
         lower, upper : the bound that it was decided by, before its label was known.  success : its label.
         novel : whether it was like nothing learned from.  unobserved : accepted parts of no known outcome since the last.
+        predicted, looked : as in `DecisionRule.tell`.
         """
 
     def forget(self) -> None:  # noqa: B027  # a default: nothing was learned
@@ -179,14 +188,14 @@ class EngineModel(ABC):
 
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
 
-    def look_ahead_safely(self, X: NDArray[np.float32]) -> None:
+    def look_ahead_safely(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:
         """`look_ahead`, or nothing where it fails."""
-        _guarded(lambda: self.look_ahead(X), "traces could not be looked at ahead of a retrain")
+        _guarded(lambda: self.look_ahead(X, numbers), "traces could not be looked at ahead of a retrain")
 
-    def tell_safely(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
+    def tell_safely(self, *told: Any) -> None:
         """`tell`; a model whose rule fails at it must not decide any more: `untold`."""
         try:
-            self.tell(lower, upper, success, novel, unobserved)
+            self.tell(*told)
         except Exception:
             self.untold = True
             log.exception("the rule cannot be told of a part; every part is verified until the engine is opened again")
@@ -235,7 +244,7 @@ class RivalAdapter(EngineModel):
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
     def train(self, X: NDArray[np.float32], y: NDArray[Any], *_: object, **__: object) -> Self:
-        self.model.fit(X, y)
+        self.model.fit(X.copy(), y)  # the window's own, which a rival may write to
         return self
 
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
@@ -267,7 +276,7 @@ class Exportable:
     model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
     stops_all : whether silence until the next decision confirms an accepted part.
     model_version, recipe : what the file says of the engine; 0 and "" without one.
-    note : takes what is to be remembered of the export, a kind and a text, as `Store.put_event`; None: nobody remembers.
+    note : takes what is to be remembered of the export, a kind and a text, as `SqlStore.put_event`; None: nobody remembers.
     """
 
     model: Any
@@ -278,3 +287,7 @@ class Exportable:
     model_version: int = 0
     recipe: str = ""
     note: Callable[[str, str], object] | None = None
+
+    def exported(self, trace: TraceSpec | None = None) -> Exportable:
+        """Itself, as of what exports it; trace : another contract."""
+        return self if trace is None else replace(self, trace=trace)

@@ -8,9 +8,10 @@ coin behind it.
 """
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +31,7 @@ from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
 from ..reducers import make_reducer, reducer_of
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, part, space_scale
-from ..traces import as_traces
+from ..traces import TraceGate, as_traces
 from .base import Embedding, EngineModel, Exportable, Prediction
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -43,17 +44,20 @@ Predicted = tuple[int, int, float, float, int, int, Tensor]
 
 
 class Predictor(nn.Module):
-    """Encoder, scale, novelty, references and rule as one module; compiles where the rule does.
+    """The traces' gate, encoder, scale, novelty, references and rule as one module; compiles where the rule does.
 
+    gate : of traces without a limit, which comes with each.
     encoder : (B, C, T) -> (B, K, d).
     scale : (K,) what each space is divided by.
     """
 
     scale: Tensor
 
-    def __init__(self, encoder: nn.Module, scale: Tensor, novelty: NoveltyGate, neighbours: RadiusNeighbours) -> None:
+    def __init__(
+        self, gate: TraceGate, encoder: nn.Module, scale: Tensor, novelty: NoveltyGate, neighbours: RadiusNeighbours
+    ) -> None:
         super().__init__()
-        self.encoder = encoder
+        self.gate, self.encoder = gate, encoder
         self.register_buffer("scale", scale[:, None])
         self.scaled = bool((scale != 1.0).any())
         self.novelty = novelty
@@ -77,10 +81,12 @@ class Predictor(nn.Module):
         return self.neighbours.ring.size()
 
     @torch.jit.export
-    def tell(self, lower: float, upper: float, success: bool, silent: int, novel: bool) -> None:
+    def tell(
+        self, lower: float, upper: float, success: bool, silent: int, novel: bool, predicted: int, looked: float
+    ) -> None:
         """Tell the rule what became of a part."""
         self.neighbours.rule.observe(silent, novel)
-        self.neighbours.rule.tell(lower, upper, success)
+        self.neighbours.rule.tell(lower, upper, success, predicted, looked)
 
     @torch.jit.export
     def safe_mode(self) -> int:
@@ -97,6 +103,14 @@ class Predictor(nn.Module):
             return 0, self.novel, 0.0, 1.0, 0, 0, z
         action, lower, upper, n_success, n_failure = self.neighbours(z, part)
         return action, self.neighbours.reason(action), lower, upper, n_success, n_failure, z
+
+    @torch.jit.export
+    def look(self, x: Tensor, part: int, limit: float) -> tuple[int, int, Predicted]:
+        """Fault and content hash, as of `TraceGate`, and what `forward` says of a trace without a fault: one call."""
+        fault, content = self.gate.check(x, limit)
+        if fault != 0:
+            return fault, content, (0, fault, 0.0, 1.0, 0, 0, x)
+        return fault, content, self.forward(x, part)
 
 
 class InPython(nn.Module):
@@ -130,7 +144,7 @@ def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
         mould = script(eager)
         with torch.inference_mode():
             for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
-                mould(torch.zeros(trace_shape))
+                mould.look(torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf)
         while len(_COMPILED) >= KINDS:
             _COMPILED.pop(next(iter(_COMPILED)), None)
         _COMPILED[structure] = mould
@@ -232,7 +246,7 @@ class ModelPrediction(EngineModel):
         """Train the reducer, warm where it can be, and make every trace a reference."""
         y = y.astype(np.int64)
         folds = fold_of(hashes, self.n_spaces)
-        points = self.spaces.train(X, y, folds, stop)
+        points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
         own_unit = self.spaces.own_unit
         self.scale = np.ones(self.n_spaces, np.float32) if own_unit else space_scale(points, folds, self.n_spaces)
@@ -240,18 +254,18 @@ class ModelPrediction(EngineModel):
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.weigh()
         self._note = repeats_note(X, hashes)
-        self.gate = fit_novelty(X, self.novelty) if self.novelty else NoveltyGate(*self.trace_shape)
+        self.gate = fit_novelty(X, self.novelty, hashes) if self.novelty else NoveltyGate(*self.trace_shape)
         self._predictor = None  # built by `prepare`, or when it is asked
         return self
 
-    def look_ahead(self, X: NDArray[np.float32]) -> None:
+    def look_ahead(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
-        blank = self.spaces.look_ahead(X)
+        blank = self.spaces.look_ahead(X, numbers)
         if blank is not None and self.rule.scriptable and "index" not in vars(self):
             gate = NoveltyGate(*X.shape[1:])
             gate.asleep = not self.novelty
-            around = self.classifier.around(RadiusIndex(blank.dim, self.classifier.capacity), self.rule)
-            mould_of(Predictor(blank, torch.ones(self.n_spaces), gate, around).eval(), X.shape[1:])
+            around = self.classifier.around(RadiusIndex(blank.dim, self.classifier.capacity), self.rule, self.spaces.scores)
+            mould_of(Predictor(trace_gate(X.shape[1:]), blank, torch.ones(self.n_spaces), gate, around).eval(), X.shape[1:])
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model, and be compiled."""
@@ -260,13 +274,13 @@ class ModelPrediction(EngineModel):
             self._predictor = self._compile()
 
     def _compile(self) -> Any:
-        own, encoder = self.classifier, self.spaces.module()
-        around = RadiusNeighbours(self.index.ring, self.rule, own.radius, own.fraction or 0.0, own.reject_fraction or 0.0)
+        own, encoder, gate = self.classifier, self.spaces.module(), trace_gate(self.trace_shape)
+        around = own.around(self.index, self.rule, self.spaces.scores)
         scale, compiles = torch.from_numpy(self.scale), self.rule.scriptable
         if encoder is not None and compiles:
-            return compiled(Predictor(encoder, scale, self.gate, around).eval(), self.trace_shape)
+            return compiled(Predictor(gate, encoder, scale, self.gate, around).eval(), self.trace_shape)
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        return Predictor(encoder, scale, script(self.gate), script(around) if compiles else around).eval()
+        return Predictor(gate, encoder, scale, script(self.gate), script(around) if compiles else around).eval()
 
     @property
     def predictor(self) -> Any:
@@ -291,7 +305,7 @@ class ModelPrediction(EngineModel):
             return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:
-        self.index.put(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number)
+        self.index.keep(torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number)
 
     def renumber_reference(self, was: int, number: int) -> None:
         self.index.renumber(was, number)
@@ -302,10 +316,13 @@ class ModelPrediction(EngineModel):
     def _fold(self, hash_: int) -> int:
         return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
-    def tell(self, lower: float, upper: float, success: bool, novel: bool, unobserved: int) -> None:
+    def tell(
+        self, lower: float, upper: float, success: bool, novel: bool, unobserved: int,
+        predicted: int = 0, looked: float = 1.0,
+    ) -> None:  # fmt: skip
         before = dict(self.rule.state_dict())
         self.rule.observe(unobserved, novel)
-        self.rule.tell(lower, upper, success)
+        self.rule.tell(lower, upper, success, predicted, looked)
         for name, now in self.rule.state_dict().items():
             if now.data_ptr() != before[name].data_ptr():  # bound anew: the compiled module reads the tensor it shares
                 before[name].copy_(now)
@@ -314,8 +331,7 @@ class ModelPrediction(EngineModel):
 
     def forget(self) -> None:
         """The rule as it was before it was told anything; in place, for the compiled module reads it."""
-        fresh = type(self.rule)(self.rule.alpha, self.rule.accept_at, self.rule.interval)
-        self.rule.load_state_dict(fresh.state_dict())
+        self.rule.load_state_dict(self.rule.anew().state_dict())
 
     @property
     def remembers(self) -> bool:
@@ -339,10 +355,17 @@ class ModelPrediction(EngineModel):
         """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
         if self.untold:
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
+        predictor, part = self.predictor, hash_ if hash_ in self.index.known else 0
         with torch.inference_mode():
-            action, reason, lower, upper, n_success, n_failure, z = self.predictor(torch.from_numpy(x), hash_)
-        embedding = tuple(tuple(row) for row in z.tolist())
-        return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+            return _as_prediction(predictor.forward(torch.from_numpy(x), part))
+
+    def look(self, x: NDArray[np.float32], part: int | None, limit: float) -> tuple[int, int, Prediction] | None:
+        if self.untold:
+            return None
+        with torch._C._InferenceMode(True):  # as `torch.inference_mode`, which takes 2 % of a decision to enter
+            predictor, known = self.predictor, self.index.known
+            fault, content, said = predictor.look(torch.from_numpy(x), part if part in known else 0, limit)
+            return None if part is None and content in known else (fault, content, _as_prediction(said))
 
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
         """The prediction on each trace of (n, T) or (n, C, T)."""
@@ -369,7 +392,7 @@ class ModelPrediction(EngineModel):
         return new
 
     def defect(self) -> str:
-        return "" if np.isfinite(self.index.points).all() else "the embedding of a reference is not finite"
+        return "" if np.isfinite(self.index.held("points")).all() else "the embedding of a reference is not finite"
 
     def get_state(self) -> State:
         """Plain arrays: references always; the reducer's and the rule's own where they have any ("reducer.", "rule.")."""
@@ -411,14 +434,24 @@ class ModelPrediction(EngineModel):
         return self.__dict__ | {"_predictor": None}
 
 
+def _as_prediction(said: Predicted) -> Prediction:
+    action, reason, lower, upper, n_success, n_failure, z = said
+    embedding = tuple(map(tuple, z.tolist()))
+    return Prediction(ACTIONS[action], lower, upper, n_success, n_failure, embedding, REASONS[reason])
+
+
+@lru_cache(KINDS)
+def trace_gate(trace_shape: tuple[int, ...]) -> TraceGate:
+    """The gate of traces (C, T), which nothing changes: one for all versions."""
+    return TraceGate(TraceSpec(channels=trace_shape[0], samples=trace_shape[1]))
+
+
 def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
     """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such (`part=`). This notices
     the plain cases where it is not; it changes no decision. More repeats than `NEIGHBOURS` are not seen.
     """
-    from scipy.spatial.distance import cdist
-
     x, own = traces[-NEWEST:], parts[-NEWEST:]
     if len(x) < 100:
         return 0
@@ -427,12 +460,11 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
     whole = x[:, :, : samples // length * length].astype(np.float64)
     means = whole.reshape(n, channels, -1, length).mean(3)
     scale = means.std((0, 2), keepdims=True)
-    rows = ((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1)
-    distances = cdist(rows, rows)
-    distances[own[:, None] == own] = np.inf
-    nearest = np.partition(distances, NEIGHBOURS, axis=1)[:, [0, NEIGHBOURS]]
-    with np.errstate(invalid="ignore"):
-        return int((nearest[:, 0] < NEAR * nearest[:, 1]).sum())
+    rows = torch.from_numpy(((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1))
+    distances = torch.cdist(rows, rows)
+    distances[torch.from_numpy(own[:, None] == own)] = torch.inf
+    nearest, tenth = distances.amin(1), distances.kthvalue(NEIGHBOURS + 1, 1).values
+    return int((nearest < NEAR * tenth).logical_and(tenth > 1e-6).sum())
 
 
 def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:

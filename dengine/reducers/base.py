@@ -42,19 +42,22 @@ class StopRule:
 
     deadline : reading of `clock` after which no step may begin; None: time decides nothing, so that a seed repeats exactly.
     asked_at : reading of `clock` when last asked; after the fit, the end of its last step.
+    late : whether the deadline ended the fit.
     """
 
     deadline: float | None = None
     max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
     asked_at: float | None = None
+    late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
         """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
         self.asked_at = self.clock()
         if self.max_steps is not None and step >= self.max_steps:
             return True
-        return self.deadline is not None and step >= least and self.asked_at >= self.deadline
+        self.late = self.deadline is not None and step >= least and self.asked_at >= self.deadline
+        return self.late
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +72,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     """A scikit-learn transformer of traces, (n, T) or (n, C, T), into points (n, d), and the model's view of it.
 
     uses_labels : whether `fit` reads `y`. One that does, and does not cross-fit by itself, is cross-fitted from outside.
+    scores : whether the first axis is the predicted probability of success.
     own_unit : whether the embedding has a unit of its own, a probability say, that must not be scaled away.
     single_tolerance : how far a trace may move when embedded alone, in the embedding's root mean square radii.
     """
 
     uses_labels = False
+    scores = False
     own_unit = False
     single_tolerance = 1e-4
 
@@ -97,18 +102,19 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """K, embedding spaces."""
         return 1
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         """Fit for an engine, from where an earlier training ended if the kind can; returns the traces' own places (n, d).
 
         X : (n, C, T).  y : (n,) 1 success, 0 failure.  folds : (n,) permanent folds; space k uses no label of fold k.
         stop : asked before each step of a fit that has steps; None: until done.
+        numbers : (n,) of the labels, increasing: the same number is the same trace in every training; None: all are new.
         Row i of the result lies in space folds[i], where it will live as a reference.
         """
         self.fit(X, y if self.uses_labels else None)
         return self.embed_own(X, folds)
 
-    def look_ahead(self, X: Floats) -> Any:
-        """Do now what `train` on traces X (n, C, T) would begin with, as far as no label is read.
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> Any:
+        """Do now what `train` on X (n, C, T) with labels of these numbers would begin with, as far as no label is read.
 
         Returns a module as `module` will give, with its dimension, `dim`; None where that is not known.
         """
@@ -273,7 +279,7 @@ class _Wrapping(Reducer):
 
     def handed(self, X: Floats) -> Any:
         """Traces (n, C, T) as the transformer takes them: ours as they are, scikit-learn's as rows."""
-        return X if isinstance(self.reducer, Reducer) else as_rows(X)
+        return X if isinstance(self.reducer, Reducer) else as_rows(X).copy()  # which a transformer may write to
 
     @property
     def _n_features_out(self) -> int:
@@ -338,7 +344,7 @@ class CrossFitted(_Wrapping):
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         return self.fit(X, y, folds=folds).embed_own(X, folds)
 
     def embed(self, X: Floats) -> Floats:

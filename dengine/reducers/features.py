@@ -33,8 +33,9 @@ FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, 
 TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
 GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
 VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
+LEARNED = 256  # traces that channels' scales are read from: more tell no more
 MOST = 10**9  # of a parameter that is a whole number
-CHUNK = 64  # traces embedded at a time: what they need stays in the cache
+CHUNK = 32  # traces embedded at a time: what they need stays in the cache, and is not asked of the kernel anew
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 
 
@@ -74,14 +75,14 @@ class Features(nn.Module):
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales and filters from traces (n, C, T); done once, so that the map stays where it is."""
-        if len(X) > 1000:  # more tell no more
-            X = X[torch.from_numpy(rng.permutation(len(X))[:1000])]
+        if len(X) > LEARNED:
+            X = X[torch.from_numpy(rng.permutation(len(X))[:LEARNED])]
         wide = X.double()
         centre, deviation = wide.mean((0, 2)), wide.std((0, 2), unbiased=False)
         scale = 1.0 / torch.where(deviation > 0, deviation, 1.0)
         self.scale.copy_(scale[:, None])
         self.shift.copy_((-centre * scale)[:, None])
-        some = X[torch.from_numpy(rng.permutation(len(X))[:128])]
+        some = X[torch.from_numpy(rng.permutation(len(X))[:64])]
         self.learn_filters(torch.addcmul(self.shift, some, self.scale), rng)
 
     def standardise(self, raw: Tensor) -> None:
@@ -149,25 +150,28 @@ def fit_heads(
     ridge = torch.full_like(w, l2)
     ridge[:, -1] = 1e-3  # the base rate is not shrunk
 
-    def losses(s: Tensor) -> Tensor:
-        return mask * (F.softplus(s) - y * s)
-
     def objective(w: Tensor) -> Tensor:
-        return losses(w @ g.T).sum(1) + 0.5 * (ridge * w * w).sum(1)
+        s = w @ g.T
+        return (mask * (F.softplus(s) - y * s)).sum(1) + 0.5 * (ridge * w * w).sum(1)
 
-    def triangles(v: Tensor) -> Tensor:
-        """Cholesky factors of the heads' Hessians, (K, W+1, W+1); v (K, n) the rows' curvatures."""
-        products = torch.stack([(small * each[:, None]).T @ small for each in v.float()])  # a step need not be exact
-        found: Tensor = torch.linalg.cholesky(products.double() + torch.diag_embed(ridge))
+    def triangle(k: int, p: Tensor) -> Tensor:
+        """Cholesky factor of head k's Hessian, (W+1, W+1); p (n,) what it says."""
+        curvature = (mask[k] * p * (1.0 - p)).float()
+        product = (small * curvature[:, None]).T @ small  # a step need not be exact
+        found: Tensor = torch.linalg.cholesky(product.double() + torch.diag(ridge[k]))
         return found
 
     # Every head takes part in every product, done or not: of another shape it would round otherwise, and so tell head k
-    # of fold k's labels by the last step of another head.
+    # of fold k's labels by the last step of another head. Its factor is its own affair for the same reason.
     done, before, step = torch.zeros(len(w), dtype=torch.bool), objective(w), 0
+    factors = [triangle(k, torch.sigmoid(w[k] @ g.T)) for k in range(len(w))]
+    stale, last = done, torch.ones(len(w), dtype=torch.float64)
     while step < max_iter and not done.all() and not (stop is not None and stop.exhausted(step, least)):
         p = torch.sigmoid(w @ g.T)
+        for k in stale.nonzero().flatten().tolist():
+            factors[k] = triangle(k, p[k])
         slope = (mask * (p - y)) @ g + ridge * w
-        d = torch.cholesky_solve(slope[..., None], triangles(mask * p * (1.0 - p)))[..., 0]
+        d = torch.cholesky_solve(slope[..., None], torch.stack(factors))[..., 0]
         d[done] = 0.0
         for _ in range(6):
             after = objective(w - d)
@@ -177,19 +181,30 @@ def fit_heads(
             d[rises] /= 2.0
         d[rises] = 0.0
         w, before, step = w - d, torch.where(rises, before, after), step + 1
-        done |= d.abs().amax(1) < 1e-3  # what is left after such a step is its square
-    s = w @ g.T
-    p = torch.sigmoid(s)
-    v = p * (1.0 - p)
-    # Every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
-    solved = torch.linalg.solve_triangular(triangles(mask * v).float(), small.T[None], upper=False)
-    left_out = s + (lever := solved.square().sum(1)) * (p - y) / (1.0 - lever * v).clamp(min=0.05)
-    n = mask.sum(1)
-    loss, rate = losses(left_out).sum(1) / n, (mask @ y) / n
-    worse = loss > F.binary_cross_entropy(rate, rate, reduction="none")
+        size, fresh = d.abs().amax(1), stale | (step == 1)
+        done |= (size * (size / last).clamp(max=1.0) < 2e-4) & (fresh | ~rises)  # about what the next step would be
+        # A step with a former factor costs a tenth: a new one where that serves no more.
+        stale, last = ~done & (rises | (size > (last / 4.0).clamp(max=0.3))), size
+    loss, base, rate = left_out_losses(small, y, mask, w @ g.T, torch.stack(factors))
+    worse = loss > base
     w = torch.where(worse[:, None], 0.0, w)  # anew: who has the former heads keeps them
     w[worse, -1] = torch.logit(rate[worse])
     return w, loss, worse.nonzero().flatten().tolist(), step
+
+
+def left_out_losses(x: Tensor, y: Tensor, mask: Tensor, s: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Of each head its leave-one-out log loss, that of the base rate, and that rate, (K,) each.
+
+    x (n, W+1), y (n,), mask (K, n) of the rows that count.  s (K, n) scores.  factors (K, W+1, W+1) of the Hessians.
+    Every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
+    """
+    p = torch.sigmoid(s)
+    lever = torch.stack([((x @ each) * x).sum(1) for each in torch.cholesky_inverse(factors).float()])
+    left_out = s + lever * (p - y) / (1.0 - lever * p * (1.0 - p)).clamp(min=0.05)
+    n = mask.sum(1)
+    rate = (mask @ y) / n
+    losses = (mask * (F.softplus(left_out) - y * left_out)).sum(1) / n
+    return losses, F.binary_cross_entropy(rate, rate, reduction="none"), rate
 
 
 class FeatureReducer(Reducer):
@@ -201,6 +216,7 @@ class FeatureReducer(Reducer):
     """
 
     uses_labels = True
+    scores = True
     own_unit = True  # a radius of 0.05 is five in a hundred, never rescaled
     width = 128  # W
     sizes: tuple[str, ...] = ()  # parameters of a kind that are whole numbers
@@ -234,25 +250,26 @@ class FeatureReducer(Reducer):
         within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
         expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         self._start(traces)
-        self._fit_heads(traces, labels, folds, stop)
+        self._fit_heads(self.raw_features(traces), labels, folds, stop)
         return self
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         """Fit the heads from their present weights, on features that the first training set; see `Reducer.train`."""
         if len(X) < MIN_TRACES:
             raise SettingError(f"Expected at least {MIN_TRACES} traces, got {len(X)}; verify more parts first.")
-        f = self._fit_heads(self._begun(X), binary_labels(y, len(X), type(self).__name__), folds, stop)
+        raw = self.raw_features(self._begun(X), numbers)
+        self._fit_heads(raw, binary_labels(y, len(X), type(self).__name__), folds, stop, numbers)
         with torch.inference_mode():
-            return own_places(self.net_.places(f).numpy(), folds)
+            places = in_chunks(lambda some: self.net_.places(self.net_.features.clipped(some)), raw, 16 * CHUNK)
+            return own_places(places.numpy(), folds)
 
-    def look_ahead(self, X: Floats) -> FeatureEmbedding:
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> FeatureEmbedding:
         """Compute the features of traces that a store brings: in the first retrain it would take too long."""
         enough = len(X) >= MIN_TRACES
         new: Self = self if enough or "net_" in vars(self) else clone(self)
         traces = new._begun(X)
         if enough:
-            with torch.no_grad():
-                self.raw_features(traces)
+            self.raw_features(traces, numbers)
         return new.net_
 
     def _begun(self, X: Floats) -> Floats:
@@ -271,27 +288,28 @@ class FeatureReducer(Reducer):
         features = self.make_features(channels, samples)
         self.net_ = FeatureEmbedding(features, self.folds, self.n_components).eval()
         self.n_fits_ = self.n_seen_ = 0
-        self._rows: dict[int, int] = {}  # of each trace that was seen last, by its exact samples
+        self._numbers = np.zeros(0, dtype=np.int64)  # of the labels that were seen last
         self._raw = torch.empty(0, len(features.gain))
 
-    def _fit_heads(self, traces: Floats, labels: Ints, folds: Ints, stop: StopRule | None) -> Tensor:
-        """Train head k on rows outside fold k, from the present weights; returns the features (n, P)."""
+    def _fit_heads(
+        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None, numbers: Ints | None = None
+    ) -> None:
+        """Train head k on rows outside fold k of the features (n, P), from the present weights."""
         with torch.no_grad():
-            raw = self.raw_features(traces)
-            least = 0
             if len(raw) >= GROWN * self.n_seen_ or self.n_fits_ % FITS == 0:
                 self._compress(raw)
-                least = FIRST_STEPS
-            f, rows = self.net_.features.clipped(raw), np.arange(len(raw))
-            if len(rows) > TRAIN_TRACES:  # a draw that is blind to labels, another at each fit
-                rows = np.random.default_rng([seed_of(self.random_state) or 0, self.n_fits_]).permutation(rows)[
-                    :TRAIN_TRACES
-                ]
+            least = 0 if self.n_fits_ else FIRST_STEPS
+            rows = np.arange(len(raw))
+            if len(rows) > TRAIN_TRACES:
+                # A draw that is blind to labels, even in time, and mostly the last fit's: the heads are near their places.
+                draw = (rows if numbers is None else numbers).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+                rows = np.sort(np.argpartition(draw, TRAIN_TRACES)[:TRAIN_TRACES])
+                raw = raw[rows]
             outside = self.trained_on(folds[rows])
             for k, some in enumerate(outside):
                 if (classes := len(np.unique(labels[rows][some]))) < 2:
                     raise one_class_outside(k, int(some.sum()), classes)
-            g, y = torch.addmm(self.centre_, f[rows], self.axes_), torch.from_numpy(labels[rows])
+            g, y = torch.addmm(self.centre_, self.net_.features.clipped(raw), self.axes_), torch.from_numpy(labels[rows])
             fitted = fit_heads(g, y, torch.from_numpy(outside), self.w_, self.l2, self.max_iter, stop, least)
             self.w_, losses, unsure, self.n_iter_ = fitted
             first = slice(None, None, self.n_components)
@@ -300,41 +318,56 @@ class FeatureReducer(Reducer):
         self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
         heads = ", ".join(map(str, unsure))
         self.note_ = f"head {heads} says the base rate: it would have done worse" if unsure else ""
-        return f
 
     def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
         """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compress(self, raw: Tensor) -> None:
-        """Find the principal components of raw features (n, P); heads on them start from nothing."""
+        """Find the principal components of raw features (n, P), and what the heads, if any, come to on these."""
         net, self.n_seen_ = self.net_, len(raw)
         some = raw[:: 1 + (len(raw) - 1) // 1000]
+        weights, biases = net.weight[:, :: self.n_components], net.bias[:: self.n_components]  # of every head
+        scores = torch.addmm(biases, net.features.clipped(some), weights).mean(0)
+        weights = weights * net.features.gain[:, None]
         net.features.standardise(some)
-        f = net.features.clipped(some).double()
+        weights = weights / net.features.gain[:, None]
+        f = net.features.clipped(some)
         centred = f - f.mean(0)
+        # In float32, in half the time: components are told from noise to 1e-6.
         sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
         sizes, axes = (each[..., -self.width :].flip(-1) for each in (sizes.clamp(min=0.0), axes))
-        axes = axes * (sizes > 1e-9 * sizes[0])
+        axes = axes * (sizes > 1e-6 * sizes[0])
         if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
-            second = (2.0 * axes[:, 0] / sizes[0].clamp(min=1e-12).sqrt()).float()
+            second = 2.0 * axes[:, 0] / sizes[0].clamp(min=1e-12).sqrt()
             second = second if second @ net.weight[:, 1] >= 0 else -second  # its sign as it was
-            net.weight[:, 1::2], net.bias[1::2] = second[:, None], -(f.mean(0).float() @ second)
-        self.axes_ = (axes * (VARIANCE / sizes.sum().clamp(min=1e-9)).sqrt()).float()
-        self.centre_ = -(f.mean(0).float() @ self.axes_)
-        self.w_ = torch.zeros(self.folds, self.axes_.size(1) + 1, dtype=torch.float64)
+            net.weight[:, 1::2], net.bias[1::2] = second[:, None], -(f.mean(0) @ second)
+        size = (VARIANCE / sizes.sum().clamp(min=1e-9)).sqrt()
+        self.w_ = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double()
+        self.axes_ = axes * size
+        self.centre_ = -(f.mean(0) @ self.axes_)
 
-    def raw_features(self, traces: Floats) -> Tensor:
-        """(n, C, T) -> (n, P), not standardised: computed once a trace, and forgotten once it has left the window."""
-        keys = [hash(trace.tobytes()) for trace in traces]
-        new = {key: i for i, key in enumerate(keys) if key not in self._rows}
-        if new:
-            computed = in_chunks(self.net_.features.raw, torch.from_numpy(traces[list(new.values())]))
-            self._rows = self._rows | {key: len(self._raw) + j for j, key in enumerate(new)}
-            self._raw = torch.cat([self._raw, computed])
-        self._raw = self._raw[[self._rows[key] for key in keys]]
-        self._rows = {key: i for i, key in enumerate(keys)}
+    def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
+        """(n, C, T) -> (n, P), not standardised: computed once a label's number, and forgotten once that is not given."""
+        with torch.no_grad():
+            if numbers is None:
+                return self._computed(traces)
+            at = np.searchsorted(self._numbers, numbers)
+            new = np.append(self._numbers, -1)[at] != numbers
+            if new.any():
+                at[new] = len(self._raw) + np.arange(new.sum())
+                self._raw = torch.cat([self._raw, self._computed(traces[new])])
+            joined = len(at) > 0 and (np.diff(at) == 1).all()  # as long as nothing is forgotten: then none is moved
+            self._numbers, self._raw = numbers, self._raw[at[0] : at[-1] + 1] if joined else self._raw[torch.from_numpy(at)]
         return self._raw
+
+    def _computed(self, traces: Floats) -> Tensor:
+        """(n, C, T) -> (n, P), the same to the bit whatever is beside a trace: each chunk is full, or filled up."""
+        whole = len(traces) // CHUNK * CHUNK
+        rest = np.zeros((CHUNK, *traces.shape[1:]), dtype=np.float32)
+        rest[: len(traces) - whole] = traces[whole:]
+        x = [torch.from_numpy(traces[i : i + CHUNK]) for i in range(0, whole, CHUNK)]
+        return torch.cat([self.net_.features.raw(each) for each in (*x, torch.from_numpy(rest))])[: len(traces)]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """A training changes the module in place; all else it binds anew, so that may be shared."""
@@ -384,6 +417,6 @@ class FeatureReducer(Reducer):
         expect(self.folds >= 2, "folds >= 2 where labels are used", self.folds)
 
 
-def in_chunks(f: Any, x: Tensor) -> Tensor:
-    """The function over x, `CHUNK` traces at a time."""
-    return torch.cat([f(x[i : i + CHUNK]) for i in range(0, max(1, len(x)), CHUNK)])
+def in_chunks(f: Any, x: Tensor, size: int = CHUNK) -> Tensor:
+    """The function over x, so many rows at a time."""
+    return torch.cat([f(x[i : i + size]) for i in range(0, max(1, len(x)), size)])

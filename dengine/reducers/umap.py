@@ -52,7 +52,7 @@ class UmapReducer(Reducer):
             self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
-    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
         """Fit; the fit has placed its traces, a transform would place them anew, slowly."""
         return as_points(self.fit(X).umap_.embedding_)
 

@@ -1,7 +1,7 @@
 """The one schema of the server: what requests and answers hold, how they are read and written, and their OpenAPI document.
 
-Requests are structs, read strictly by msgspec; answers are derived from the fields of dengine's records. JSON has no NaN: a
-sample that is null is one that the sensor did not give, and a number that is not finite is answered as null.
+A request holds what the function takes that answers it, and is read strictly by msgspec; answers are derived from dengine's
+records. JSON has no NaN: a sample that is null is one that the sensor did not give, a number that is not finite is null.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import fields, is_dataclass
-from functools import cache, reduce
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache, cached_property, reduce
 from http import HTTPStatus
+from inspect import Parameter, signature
 from operator import or_
 from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -24,7 +25,6 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..errors import (
     BusyError,
@@ -32,16 +32,17 @@ from ..errors import (
     ReportConflictError,
     StoreError,
     TraceConflictError,
+    TraceError,
     UnknownDecisionError,
+    as_options,
     shortened,
     without_password,
 )
 from ..history.explain import Explanation
 from ..history.map import PartMap
-from ..history.status import NEWEST, Course, Status
+from ..history.status import Course, Status
 from ..records import Action, Decision, plain
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
-from ..store.views import HistoryFilter
 from .service import Told
 
 log = logging.getLogger("dengine")
@@ -51,123 +52,16 @@ JSON, RAW, MSGPACK = "application/json", "application/octet-stream", "applicatio
 PROBLEM = "application/problem+json"
 LATER = (429, 503)
 RETRY_AFTER = 1  # seconds
+NO_ROUTE = {404: "Expected one of the paths in /openapi.json, got another.", 405: "Expected another method on this path."}
 DECODERS: Mapping[str, Callable[..., Any]] = {JSON: msgspec.json.decode, MSGPACK: msgspec.msgpack.decode}
 STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # of a JSON object; those before a colon are its keys
 FIELD = re.compile(r"(?:^ *|  )((?:\w+, )*\w+) : ", re.MULTILINE)  # "name, name : what it is", in a docstring
+REF = "#/components/schemas/{name}"
+PROBLEMATIC = {PROBLEM: {"schema": {"$ref": REF.format(name="Problem")}}}
 
 # What is asked
 
-
-class TraceRequest(Struct, forbid_unknown_fields=True):
-    """A trace to decide on.
-
-    trace : (samples,) or (channels, samples), null for a missing sample; or bytes, raw float32, little-endian.
-    request : the caller's id of this trace, once for every trace: asked again, the answer is the same.
-    part : the part's number, where one is known.
-    """
-
-    trace: bytes | list[float | list[float | None] | None]
-    request: str | UnsetType | None = UNSET
-    part: str | int | UnsetType | None = UNSET
-
-
-class RawQuery(Struct, forbid_unknown_fields=True):
-    """What stands beside a raw trace.  request, part : as in TraceRequest.  channels : of the body, one after another."""
-
-    request: str | UnsetType = UNSET
-    part: str | UnsetType = UNSET
-    channels: Annotated[int, Meta(ge=1, le=99_999)] = 1
-
-
-class Report(Struct, forbid_unknown_fields=True):
-    """What became of a part; false for one that was accepted and came back is a system stop.
-
-    id : of the decision.  part : its number in the place of that, where there is one decision of it; or the id.
-    success : true, or 1: good; false, or 0: bad.  author : who says so, for the event log; a robot leaves it out.
-    """
-
-    success: bool | float
-    id: str | UnsetType = UNSET
-    part: str | UnsetType = UNSET
-    author: str = ""
-
-
-class Signed(Struct, forbid_unknown_fields=True):
-    """Who asks for it.  author : a name, for the event log."""
-
-    author: str
-
-
-class Correct(Signed, forbid_unknown_fields=True):
-    """A label to put right.  id : of the decision.  success : what it counts as from now on."""
-
-    id: str
-    success: bool
-
-
-class Forget(Signed, forbid_unknown_fields=True):
-    """Labels to leave out.  ids : of the decisions.  reason : for the event log."""
-
-    ids: list[str]
-    reason: str = ""
-
-
-class Rollback(Signed, forbid_unknown_fields=True):
-    """A version to go back to.  version : its number, as /versions lists it."""
-
-    version: int
-
-
-class StatusQuery(Struct, forbid_unknown_fields=True):
-    """last : the newest so many decisions are looked at apart.  watch : how far the safe mode's detectors are, too."""
-
-    last: Annotated[int, Meta(ge=1, le=100_000)] = NEWEST
-    watch: bool = False
-
-
-class EventQuery(Struct, forbid_unknown_fields=True):
-    """limit : how many at most."""
-
-    limit: Annotated[int, Meta(ge=1, le=200)] = 20
-
-
-class DecisionQuery(Struct, forbid_unknown_fields=True):
-    """Which decision.  trace : with its samples too."""
-
-    id: str
-    trace: bool = False
-
-
-class Nothing(Struct, forbid_unknown_fields=True):
-    """There is nothing to ask for."""
-
-
-def _optional(name: str, record: type, doc: str, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
-    """A request of a record's fields, each of which may be left out, and of more of them: a type, and a default."""
-    kinds = {key: (kind | UnsetType, UNSET) for key, kind in get_type_hints(record).items() if key not in without} | more
-    members = [(key, *kind) for key, kind in kinds.items()]
-    space = {"__doc__": f"{doc}\n{record.__doc__}"}
-    return msgspec.defstruct(name, members, namespace=space, forbid_unknown_fields=True, kw_only=True)
-
-
-ListQuery = _optional(
-    "ListQuery",
-    HistoryFilter,
-    "Which decisions.  open : verified ones that wait for a label.  limit : how many at most.  before : older ones than "
-    "the answer that said so as `older`.",
-    label=(Literal["good", "bad", "none"] | UnsetType, UNSET),
-    open=(bool, False),
-    limit=(Annotated[int, Meta(ge=1, le=200)], 20),
-    before=(str, ""),
-)
-# A guarantee may be a class by name, and nothing that is asked over the network may have one imported.
-PolicyChange = _optional("PolicyChange", Policy, "What is to change.  author : who asks.", ("guarantee",), author=(str,))
-
-
-def given(asked: Struct, record: type) -> Json:
-    """What a request says of a record's fields."""
-    names = {field.name for field in fields(record)}
-    return {key: value for key, value in msgspec.structs.asdict(asked).items() if key in names and value is not UNSET}
+Samples = list[float | list[float | None] | None]
 
 
 class Refusal(Exception):  # noqa: N818  # it is an answer, not a fault
@@ -178,22 +72,28 @@ class Refusal(Exception):  # noqa: N818  # it is an answer, not a fault
         self.status, self.detail, self.headers = status, detail, dict(headers or {})
 
 
+def fields_of(record: type, *without: str) -> Json:
+    """The types of a record's fields but for some."""
+    return {name: kind for name, kind in get_type_hints(record).items() if name not in without}
+
+
+def _taken(run: Callable[..., Any], fields: Json) -> type[Struct]:
+    """What a function takes, and fields that may be left out, as a struct; `id_` is `id` in a request."""
+    hints, members = get_type_hints(run, include_extras=True), list[tuple[Any, ...]]()
+    for name, each in signature(run).parameters.items():
+        if each.kind is not Parameter.VAR_KEYWORD:
+            members.append((name, hints[name], *([] if each.default is Parameter.empty else [each.default])))
+    members += [(name, kind | UnsetType, UNSET) for name, kind in fields.items()]
+    rules: Json = {"forbid_unknown_fields": True, "kw_only": True, "rename": lambda name: name.rstrip("_")}
+    return msgspec.defstruct(f"{run.__name__.capitalize()}Request", members, namespace={"__doc__": run.__doc__}, **rules)
+
+
 def media_type(request: Request) -> str:
     """What a request says that its body is, without parameters; "" where it says nothing."""
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def read_body(request: Request, most: int) -> bytes | None:
-    """A request's body; None where it has more bytes than that, the rest of which are not read."""
-    body = bytearray()
-    async for piece in request.stream():
-        body += piece
-        if len(body) > most:
-            return None
-    return bytes(body)
-
-
-async def read_struct(request: Request, kind: type[T], *others: str) -> T:
+async def read_body(request: Request, kind: type[T], *others: str) -> T:
     """A request's body as a struct. Refusal: 415 for another media type, 400 for what is none, 422 for other fields."""
     media = media_type(request)
     if media not in DECODERS:
@@ -218,9 +118,9 @@ def _keys(media: str, body: bytes) -> int:
     return body[0] & 0x0F if body[0] < 0xDE else int.from_bytes(body[1 : 3 if body[0] == 0xDE else 5])
 
 
-def read_query(request: Request, kind: type[T]) -> T:
-    """A request's query, and what its path names, as a struct; Refusal for another name, a name twice, or a wrong value."""
-    pairs = [*request.query_params.multi_items(), *request.path_params.items()]
+def read_query(request: Request, kind: type[T], **body: bytes) -> T:
+    """A request's query, what its path names, and a raw body, as a struct; Refusal for another name, or a wrong value."""
+    pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
         if len(dict(pairs)) < len(pairs):
             raise ValueError("Expected each name of the query once")
@@ -229,53 +129,46 @@ def read_query(request: Request, kind: type[T]) -> T:
         raise Refusal(422, f"{error}, in the query.") from error
 
 
-async def read_trace(request: Request) -> tuple[NDArray[Any], str | None, str | int | None]:
-    """The trace to decide on, (T,) or (channels, T), its request id and its part; Refusal where there is none."""
-    asked: TraceRequest | RawQuery
-    if media_type(request) == RAW:
-        asked = read_query(request, RawQuery)
-        trace = _samples(await request.body(), asked.channels)
-    else:
-        asked = await read_struct(request, TraceRequest, RAW)
-        trace = _samples(asked.trace, 1)
-    return trace, None if asked.request is UNSET else asked.request, None if asked.part is UNSET else asked.part
+def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
+    """A trace, (T,) or (channels, T); TraceError for anything else.
 
-
-def _samples(given: bytes | list[Any], channels: int) -> NDArray[Any]:
-    try:
-        if isinstance(given, bytes):
-            samples = np.frombuffer(given, dtype="<f4")
-            samples = samples if channels == 1 else samples.reshape(channels, -1)
-        else:
-            samples = np.array(given, dtype=np.float64)  # None becomes NaN
-    except ValueError as error:
-        if isinstance(given, bytes):
+    value : raw float32, little-endian, so many channels one after another; a list of numbers; or one of such lists, a
+        channel each. None becomes NaN, and a number beyond float32 an infinity, both of which are found and reported.
+    """
+    if isinstance(value, bytes):
+        if len(value) % (4 * channels):
             held = f"float32, little-endian, channel after channel, {channels} of them"
-            raise Refusal(422, f"Expected {held}, got {len(given)} bytes.") from error
-        raise Refusal(422, "Expected a list of numbers, or a list as long for each channel.") from error
-    if not samples.size:
-        raise Refusal(422, "Expected a trace of at least one sample, got none.")
-    return samples
+            raise TraceError(f"Expected {held}, got {len(value)} bytes.")
+        x = np.frombuffer(value, dtype="<f4").reshape(channels, -1)
+    else:
+        try:
+            with np.errstate(over="ignore"):
+                x = np.array(msgspec.convert(value, Samples), dtype=np.float64).astype(np.float32)
+        except (ValueError, OverflowError) as error:
+            raise TraceError("Expected numbers in a list, or a list of such lists of one length for channels.") from error
+    if not x.size:
+        raise TraceError("Expected at least one sample, got none.")
+    return x
 
 
 # What is answered
 
 
-def _answer(name: str, about: str, *records: type, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
-    """The type of an answer: the fields of records as JSON has them but for some, and more of them."""
-    kinds = {key: kind for each in records for key, kind in _members(each).items() if key not in without} | more
-    doc = "\n".join([about, *(each.__doc__ or "" for each in records)])
-    return msgspec.defstruct(name, kinds.items(), namespace={"__doc__": doc}, kw_only=True)
+def _answer(name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any) -> type[Struct]:
+    """The type of an answer: the fields of a record as JSON has them but for some, and more of them."""
+    kinds = {key: kind for key, kind in _members(record).items() if key not in without} if record else {}
+    doc = f"{about}\n{record.__doc__ if record else ''}"
+    return msgspec.defstruct(name, (kinds | more).items(), namespace={"__doc__": doc}, kw_only=True)
 
 
 def _members(record: type) -> Json:
     """A record's fields as `plain` gives them: without those that stand apart, and with those of one that is flat."""
     hints, found = get_type_hints(record), dict[str, Any]()
-    for field in fields(record):
-        if "flat" in field.metadata:
-            found |= _members(hints[field.name])
-        elif "apart" not in field.metadata:
-            found[field.name] = _shape(hints[field.name])
+    for each in fields(record):
+        if "flat" in each.metadata:
+            found |= _members(hints[each.name])
+        elif "apart" not in each.metadata:
+            found[each.name] = _shape(hints[each.name])
     return found
 
 
@@ -299,6 +192,13 @@ class Health(Struct):
     waiting: int
 
 
+class Me(Struct):
+    """Whose token was shown.  name : that the event log gets; "": the one that is said.  operates : else he only looks."""
+
+    name: str
+    operates: bool
+
+
 class Problem(Struct):
     """Why a request is not served, as RFC 9457 has it. A part that got no decision is verified.
 
@@ -312,54 +212,49 @@ class Problem(Struct):
     action: Action = Action.VERIFY
 
 
-LATE = (
-    "late : deadline exceeded in the queue; recorded as VERIFY.  seconds : from the request to the answer, in the server."
-)
-LINE = (
-    "waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.  "
-    "deadline : seconds in line, after which the answer is verify.  alarm : what somebody should look at.  "
-    "check_seconds : that a verification takes."
-)
-ARRAYS = (
-    "trace : (channels, samples).  low, median, high : of the band of good parts, likewise; null while there is none.  "
-    "bads : the newest bad parts' traces.  corrections : of its label, oldest first."
-)
-Samples = list[list[float | None]]
-HASH, MUCH = ("content_hash",), ("settings", "retrains")  # 64 bits are no JavaScript's; `ever.retrains` counts those
-IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float, "check_seconds": float}
-ANSWERS: dict[str, type[Struct]] = {
-    "Answer": _answer("Answer", f"A decision, as it is recorded.\n{LATE}", Decision, late=bool, seconds=float),
-    "Told": _answer("Told", "The label is on the disk.", Told),
-    "Changed": _answer("Changed", "", Changed),
-    "Decision": _answer("Decision", "A decision with its label.", StoredDecision, without=HASH),
-    "Traced": _answer("Traced", "A decision with its label and trace.", StoredDecision, without=HASH, trace=Samples | None),
-    "Explanation": _answer(
-        "Explanation",
-        ARRAYS,
-        Explanation,
-        trace=Samples,
-        low=Samples | None,
-        median=Samples | None,
-        high=Samples | None,
-        bads=list[Samples],
-        corrections=list[_shape(Correction)],  # type: ignore[misc]  # made above
-    ),
-    "Status": _answer("Status", LINE, Status, without=MUCH, **IN_LINE, alarm=str),
-    "Course": _answer("Course", "", Course),
-    "PartMap": _answer("PartMap", "", PartMap),
-    "Events": _answer("Events", "Newest first.", events=list[_shape(Event)]),  # type: ignore[misc]
-    "Versions": _answer("Versions", "Oldest first.", versions=list[_shape(StoredVersion)]),  # type: ignore[misc]
-    "Health": Health,
-    "Problem": Problem,
-}
+LINE = """How the cell is doing.
+
+waiting : requests in line.  late, busy : deadlines exceeded, and requests refused, since the server began.
+deadline : seconds in line, after which the answer is verify.  check_seconds : that a verification takes.
+alarm : what somebody should look at.
+"""
+ARRAYS = """Why a decision came out so.
+
+trace : (channels, samples).  low, median, high : of the band of good parts, likewise; null while there is none.
+bads : the newest bad parts' traces.  corrections : of its label, oldest first.
+"""
+LATE = "late : deadline exceeded in line; recorded as VERIFY.  seconds : from the request to the answer, in the server."
 OLDER = "Newest first.  older : what `before` of the next request says for the ones before these; null: there are none."
-Known: Any = ANSWERS["Decision"]
-ANSWERS["Decisions"] = _answer("Decisions", OLDER, decisions=list[Known], older=str | None)
+IN_LINE = {"waiting": int, "late": int, "busy": int, "deadline": float, "check_seconds": float}
+HASH, MUCH = ("content_hash",), ("settings", "retrains")  # 64 bits are no JavaScript's; `ever.retrains` counts those
+Traces: Any = list[list[float | None]]
+AROUND = {"trace": Traces, **dict.fromkeys(("low", "median", "high"), Traces | None), "bads": list[Traces]}
+Known: Any = _answer("Decision", "trace : where it was asked for.", StoredDecision, HASH, trace=Traces | None)
+SHAPES: dict[type, Any] = {each: list[_shape(each)] for each in (Correction, Event, StoredVersion)}  # type: ignore[misc]
+ANSWERS = {
+    each.__name__: each
+    for each in (
+        _answer("Answer", LATE, Decision, late=bool, seconds=float),
+        _answer("Told", "The label is on the disk.", Told),
+        _answer("Changed", "", Changed),
+        Known,
+        _answer("Decisions", OLDER, decisions=list[Known], older=str | None),
+        _answer("Explanation", ARRAYS, Explanation, **AROUND, corrections=SHAPES[Correction]),
+        _answer("Status", LINE, Status, MUCH, **IN_LINE, alarm=str),
+        _answer("Course", "", Course),
+        _answer("PartMap", "", PartMap),
+        _answer("Events", "Newest first.", events=SHAPES[Event]),
+        _answer("Versions", "Oldest first.", versions=SHAPES[StoredVersion]),
+        Health,
+        Me,
+        Problem,
+    )
+}
 
 
-def answer(name: str, *records: object, **more: Any) -> Json:
-    """An answer: what it has of records' fields, and more of them."""
-    said = {key: value for each in records for key, value in plain(each).items()} | more
+def answer(name: str, record: object = None, **more: Any) -> Json:
+    """An answer: what it has of a record's fields, and more of them."""
+    said = (plain(record) or {}) | more
     return {key: said[key] for key in ANSWERS[name].__struct_fields__ if key in said}
 
 
@@ -384,16 +279,12 @@ def _refused(request: Request, error: Any) -> Response:
     if isinstance(error, Refusal):
         return problem(error.status, error.detail, error.headers)
     if isinstance(error, HTTPException):
-        said = {
-            404: "Expected one of the paths in /openapi.json, got another.",
-            405: "Expected another method on this path.",
-        }
-        return problem(error.status_code, said.get(error.status_code, str(error.detail)), error.headers)
+        return problem(error.status_code, NO_ROUTE.get(error.status_code, str(error.detail)), error.headers)
     if isinstance(error, ClientDisconnect):
         return problem(400, "Expected the whole of the request.")  # which nobody reads
     for kind, status in STATUSES.items():
         if isinstance(error, kind):
-            return problem(status, str(error))
+            return problem(status, as_options(str(error)))
     log.error("a request failed: %s %s", request.method, request.scope["path"], exc_info=error)
     return problem(500, "The server failed at this request; its log says why.")
 
@@ -414,53 +305,56 @@ HANDLERS: Mapping[Any, Callable[[Request, Any], Response]] = dict.fromkeys(
 # The OpenAPI document
 
 
-PROBLEMATIC = {PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-
-
-class Operation(NamedTuple):
+@dataclass(frozen=True)
+class Operation:
     """One method on one path.
 
-    run : answers what is asked; its docstring says what it does.  answer : of `ANSWERS`, or a media type.
-    takes : the struct of a POST's body, of a GET's query and path; None: it is not looked at.
-    raw : whether the body may be bytes: `run` reads the request itself.  examples : of the body.
+    run : answers what its parameters name; its docstring says what it does, and what each is.
+    answer : of `ANSWERS`, or a media type.  fields : that `run` takes as well, where they are given.
+    raw : of its parameters, the one that a body of bytes is; the others are a query then.  examples : of the body.
     """
 
     method: str
     path: str
-    run: Callable[[Any], Awaitable[Json | Response]]
+    run: Callable[..., Awaitable[Json | Response]]
     answer: str
-    takes: type[Struct] | None = None
-    raw: bool = False
+    fields: Json = field(default_factory=dict)
+    raw: str = ""
     examples: tuple[Json, ...] = ()
 
+    @cached_property
+    def takes(self) -> type[Struct]:
+        """What stands in the body of a POST, in the query and the path of a GET."""
+        return _taken(self.run, self.fields)
+
     async def serve(self, request: Request) -> Response:
-        """Read what is asked, and answer it."""
-        asked: Any = request
-        if self.takes is not None and not self.raw:
-            asked = read_query(request, self.takes) if self.method == "GET" else await read_struct(request, self.takes)
-        found = await self.run(asked)
+        if self.method == "GET":
+            asked = read_query(request, self.takes)
+        elif self.raw and media_type(request) == RAW:
+            asked = read_query(request, self.takes, **{self.raw: await request.body()})
+        else:
+            asked = await read_body(request, self.takes, *([RAW] if self.raw else []))
+        given = msgspec.structs.asdict(asked).items()
+        found = await self.run(**{name: value for name, value in given if value is not UNSET})
         return found if isinstance(found, Response) else answered(found)
 
-    def described(self) -> Json:
-        """It, as the document has it."""
-        known = self.answer in ANSWERS
-        schema = {"$ref": f"#/components/schemas/{self.answer}"} if known else {"type": "string"}
+    def described(self, schemas: Json) -> Json:
+        """It, as the document has it. schemas : of all that is asked and answered."""
+        takes, known = schemas[self.takes.__name__], self.answer in ANSWERS
+        schema = {"$ref": REF.format(name=self.answer)} if known else {"type": "string"}
         responses = {
             "200": {"description": "Done.", "content": {JSON if known else self.answer: {"schema": schema}}},
             "default": {"description": "A problem.", "content": PROBLEMATIC},
         }
-        said: Json = {"summary": " ".join((self.run.__doc__ or "").split()), "parameters": [], "responses": responses}
-        if self.takes is None:
-            return said
-        query = RawQuery if self.raw else self.takes
+        said: Json = {"summary": takes["description"], "parameters": [], "responses": responses}
         if self.method == "GET" or self.raw:
-            for name, kind in _schemas([query])[query.__name__]["properties"].items():
-                here = f"{{{name}" in self.path
-                place = {"name": name, "in": "path" if here else "query", "required": here, "schema": kind}
-                said["parameters"].append(place)
+            for name, kind in takes["properties"].items():
+                place = "path" if f"{{{name}" in self.path else "query"
+                if name != self.raw:
+                    said["parameters"].append({"name": name, "in": place, "required": place == "path", "schema": kind})
         if self.method == "GET":
             return said
-        body: Json = {"schema": {"$ref": f"#/components/schemas/{self.takes.__name__}"}}
+        body: Json = {"schema": {"$ref": REF.format(name=self.takes.__name__)}}
         examples = {"examples": {str(i): {"value": value} for i, value in enumerate(self.examples)}}
         content = {JSON: body | examples, MSGPACK: body}
         if self.raw:
@@ -470,7 +364,7 @@ class Operation(NamedTuple):
 
 def _schemas(kinds: Iterable[Any]) -> Json:
     """The schemas of these types; what a docstring says of a field stands with the field."""
-    _, schemas = msgspec.json.schema_components(list(kinds), ref_template="#/components/schemas/{name}")
+    _, schemas = msgspec.json.schema_components(list(kinds), ref_template=REF)
     for schema in schemas.values():
         about, *told = FIELD.split(schema.get("description", ""))
         schema["description"] = " ".join(about.split())
@@ -483,16 +377,15 @@ def _schemas(kinds: Iterable[Any]) -> Json:
 
 def document(operations: Iterable[Operation], version: str) -> Json:
     """The OpenAPI document of these operations."""
-    paths: Json = {}
+    schemas, paths = _schemas([*ANSWERS.values(), *(each.takes for each in operations)]), dict[str, Json]()
     for each in operations:
-        paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = each.described()
-    bodies = {each.takes for each in operations if each.takes and each.method == "POST"}
+        paths.setdefault(each.path.replace(":path", ""), {})[each.method.lower()] = each.described(schemas)
     return {
         "openapi": "3.1.0",
         "info": {"title": "dengine serve", "version": version, "description": "A robot cell's data engine."},
         "paths": paths,
         "components": {
-            "schemas": _schemas([*ANSWERS.values(), *bodies]),
+            "schemas": schemas,
             "securitySchemes": {name: {"type": "http", "scheme": name} for name in ("bearer", "basic")},
         },
         "security": [{}, {"bearer": []}, {"basic": []}],

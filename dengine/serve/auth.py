@@ -1,4 +1,4 @@
-"""Who may ask, and how much: a token, the names by which the server is called, sizes, times and rates.
+"""Who may ask, and how much: tokens, the names by which the server is called, sizes, times and rates.
 
 Whoever is on this machine may ask without a token, but for web pages of others: a browser carries their requests here too.
 They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
@@ -14,15 +14,16 @@ import os
 import stat
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, MutableMapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import lru_cache
 from http import HTTPStatus
 from ipaddress import ip_address
+from itertools import compress
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import SettingError
@@ -31,37 +32,60 @@ from .api import Refusal, problem
 log = logging.getLogger("dengine")
 SHORTEST = 16  # characters of a token
 CLIENTS = 4096  # whose rate is remembered
+LET_IN = "dengine.let_in"  # in the scope of a request of somebody who may ask, for `connections.Places`
+LOOKS = "GET", "HEAD", "OPTIONS"  # methods that change nothing
 RPC = "/RPC2"  # below which a robot that cannot send headers may have its token
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """What `Authorization: Bearer` has to say, or Basic as its password.
+
+    operates : reports, corrects, and changes the policy; else its owner only looks.
+    name : the author of what is asked for by it; "": a machine's, or of whoever says his name.
+    """
+
+    secret: str = field(default="", repr=False)
+    operates: bool = True
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
     """Who may ask, and how much.
 
-    token : what `Authorization: Bearer` has to say, or Basic as its password; "" asks for none.
+    tokens : one of which a request has to show; none: it need not.
     hosts : names by which the server is called, beside localhost; an address of numbers is always taken.
     largest : bytes of a request's body.  body_seconds : in which it has to come.
-    rate : requests a second of one client, on average; 0: as many as it likes.  burst : of them at once.
+    rate : requests a second of one client, on average, twice as many at once; 0: as many as it likes.
     """
 
-    token: str = field(default="", repr=False)
+    tokens: tuple[Token, ...] = ()
     hosts: tuple[str, ...] = ()
     largest: int = 2**20
     body_seconds: float = 5.0
     rate: float = 500.0
-    burst: int = 1000
+
+    def shown(self, said: str) -> Token | None:
+        """The token that this is; None where it is none. Each is compared, in the same time whatever was said."""
+        same = [hmac.compare_digest(each.secret.encode(), said.encode("utf-8", "surrogatepass")) for each in self.tokens]
+        return next(compress(self.tokens, same), None)
+
+
+ANYBODY = Token()  # where no token is asked for
+SHOWN = ContextVar("SHOWN", default=ANYBODY)  # by the request that is being answered, in a task of its own
 
 
 class Rates:
     """A token bucket for each client; those that were not seen for longest are forgotten first."""
 
-    def __init__(self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic) -> None:
-        self.rate, self.burst, self.clock = rate, burst, clock
+    def __init__(self, rate: float, burst: float) -> None:
+        self.rate, self.burst = rate, burst
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()  # tokens, and when they were counted
 
     def take(self, client: str) -> bool:
         """Take one token; False where there is none."""
-        now = self.clock()
+        now = time.monotonic()
         tokens, since = self._buckets.pop(client, (self.burst, now))
         tokens = min(self.burst, tokens + (now - since) * self.rate)
         taken = self.rate <= 0.0 or tokens >= 1.0
@@ -71,24 +95,33 @@ class Rates:
         return taken
 
 
-def read_token(file: Path) -> str:
-    """The token in a file that nobody but its owner may read; SettingError where it is none, or others may."""
+def read_tokens(file: Path) -> tuple[Token, ...]:
+    """The tokens in a file that nobody but its owner may read, one a line; SettingError where it has none, or others may.
+
+    A line is a token; or that, `viewer` or `operator`, and the name of who has it.
+    """
     try:
         with file.open("rb") as opened:
-            mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(4096)
+            mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
     except OSError as error:
         raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
     # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
     if mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
-    token = text.strip()
-    if len(token) < SHORTEST or not token.isascii() or not token.decode("ascii").isprintable() or b" " in token:
+    lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
+    tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
+    wrong = [
+        each for each in tokens if len(each.secret) < SHORTEST or not (each.secret.isascii() and each.secret.isprintable())
+    ]
+    if wrong or not tokens or len({each.secret for each in tokens}) < len(tokens):
         raise SettingError(
-            f"Expected a token of at least {SHORTEST} characters of ASCII without blanks in {file}; "
+            f"Expected tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line; "
             f"make one: (umask 077; openssl rand -hex 24 > {file})"
         )
-    return token.decode("ascii")
+    if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
+        raise SettingError(f"Expected viewer or operator behind each token of {file}, then a name; or the token alone.")
+    return tokens
 
 
 def is_loopback(host: str) -> bool:
@@ -104,7 +137,8 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def is_called(host: str | None, names: Iterable[str]) -> bool:
+@lru_cache(64)
+def is_called(host: str | None, names: tuple[str, ...]) -> bool:
     """Whether a request calls the server by a name that is its own: a page that had its own name point here does not."""
     if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
         return False
@@ -120,41 +154,38 @@ def is_called(host: str | None, names: Iterable[str]) -> bool:
     return True
 
 
-def is_own_page(origin: str | None, fetch_site: str | None, host: str | None) -> bool:
-    """Whether what a browser says of a request lets it be one of this server's own pages, or of no page at all."""
-    if fetch_site is not None and fetch_site not in ("same-origin", "none"):
-        return False
-    return origin is None or (host is not None and origin.partition("://")[2].lower() == host.lower())
+def said_token(scope: Scope, authorization: str) -> str:
+    """What a request says for the token: as a bearer's, as the password that a browser asks for, or behind /RPC2/.
 
-
-def may_ask(token: str, authorization: str | None) -> bool:
-    """Whether a request says the token: as a bearer's, or as the password that a browser asks for."""
-    kind, _, said = (authorization or "").partition(" ")
-    if kind.lower() == "bearer":
-        return is_same(token, said.strip())
+    What stands there is nobody's business from here on: the scope is of /RPC2 afterwards.
+    """
+    if scope["path"].startswith(f"{RPC}/"):
+        said = str(scope["path"]).removeprefix(f"{RPC}/")
+        scope.update(path=RPC, raw_path=RPC.encode("ascii"))
+        return said
+    kind, _, said = authorization.partition(" ")
+    if kind.lower() != "basic":
+        return said.strip() if kind.lower() == "bearer" else ""
     try:
-        password = base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2]
+        return base64.b64decode(said.strip(), validate=True).decode("utf-8").partition(":")[2]
     except ValueError:  # binascii's and UnicodeDecodeError are such
-        return False
-    return kind.lower() == "basic" and is_same(token, password)
-
-
-def is_same(token: str, said: str) -> bool:
-    """Compare in a time that says nothing of where they differ."""
-    return hmac.compare_digest(token.encode(), said.encode("utf-8", "surrogatepass"))
+        return ""
 
 
 CLOSE = {"Connection": "close"}  # what was not read is not to be taken for the next request
-HEADERS = {
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Content-Security-Policy": "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'self'; "
-    "frame-ancestors 'none'",
-    "Cache-Control": "no-store",
-}
+HEADERS = [  # of every answer
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (
+        b"content-security-policy",
+        b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        b"connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
+    ),
+    (b"cache-control", b"no-store"),
+]
 
 
 class Guard:
@@ -163,20 +194,14 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
         self.access = access
-        self.rates = Rates(access.rate, access.burst)
+        self.rates = Rates(access.rate, max(1.0, 2.0 * access.rate))
         self.lines = Rates(0.1, 3)  # of the log, on a client's wrong tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a request in, or answer it."""
-        if scope["type"] == "lifespan":
+        """Let a request in, or answer it; the application has no websockets, and uvicorn is told to speak none."""
+        if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        if scope["type"] != "http":  # there is no websocket here
-            await send({"type": "websocket.close", "code": 1008})
-            return
-        connection = scope.get("state", {}).get("connection")  # of `connections`; a test has none
-        if connection is not None:
-            connection.begin_request()
         try:
             self._look(scope)
         except Refusal as refusal:
@@ -186,42 +211,40 @@ class Guard:
             await answer(scope, receive, _with_headers(send))
         else:
             await self.app(scope, _limited(receive, self.access), _with_headers(send))
-        finally:
-            if connection is not None:
-                connection.end_request()
 
-    def _look(self, scope: MutableMapping[str, Any]) -> None:
+    def _look(self, scope: Scope) -> None:
         headers, access = Headers(scope=scope), self.access
         host, client = headers.get("host"), (scope.get("client") or ("", 0))[0]
         if not is_called(host, access.hosts):
             names = "its address, localhost, or a name that it was given (dengine serve --allow-host NAME)"
             raise Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}.")
-        if not self.rates.take(client):
-            raise Refusal(
-                HTTPStatus.TOO_MANY_REQUESTS, f"Expected at most {access.rate:g} requests a second of one client."
-            )
-        self._must_have_token(scope, headers.get("authorization"), client)
-        own = is_own_page(headers.get("origin"), headers.get("sec-fetch-site"), host)
-        if scope["method"] not in ("GET", "HEAD", "OPTIONS") and not own:
+        said = said_token(scope, headers.get("authorization", ""))
+        known = access.shown(said) if access.tokens else ANYBODY
+        # Who uses it up without the token keeps out nobody who has it.
+        if not self.rates.take(client if known else f"{client}, without"):
+            most = f"Expected at most {access.rate:g} requests a second of one client."
+            raise Refusal(HTTPStatus.TOO_MANY_REQUESTS, most)
+        if known is not None:
+            scope[LET_IN] = True
+            SHOWN.set(known)
+            if not known.operates and scope["method"] not in LOOKS:
+                raise Refusal(HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's, who only looks.")
+        elif scope["path"] != "/healthz":
+            if (said or "authorization" in headers) and self.lines.take(client):
+                log.warning("a wrong token came from %s", client)
+            how = "Authorization: Bearer TOKEN, or any user name with it as the password"
+            ask = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
+            raise Refusal(HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", ask)
+        # What a browser says of a request has to be that it is of one of this server's own pages, or of no page at all.
+        origin, site = headers.get("origin"), headers.get("sec-fetch-site", "none")
+        own = origin is None or origin.partition("://")[2].lower() == str(host).lower()
+        if scope["method"] not in LOOKS and not (own and site in ("same-origin", "none")):
             raise Refusal(HTTPStatus.FORBIDDEN, "Expected a request of this server's own pages, got one of another site.")
         length = headers.get("content-length", "0")
         if not (length.isascii() and length.isdecimal()):
             raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
         if len(length) > 18 or int(length) > access.largest:
             raise _too_large(access.largest)
-
-    def _must_have_token(self, scope: MutableMapping[str, Any], authorization: str | None, client: str) -> None:
-        token, said = self.access.token, ""
-        if scope["path"].startswith(f"{RPC}/"):  # it is nobody's business from here on, with a token or without
-            said = scope["path"].removeprefix(f"{RPC}/")
-            scope.update(path=RPC, raw_path=RPC.encode("ascii"))
-        if not token or scope["path"] == "/healthz" or is_same(token, said) or may_ask(token, authorization):
-            return
-        if (authorization or said) and self.lines.take(client):
-            log.warning("a wrong token came from %s", client)
-        how = "Authorization: Bearer TOKEN, or any user name with it as the password"
-        ask = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
-        raise Refusal(HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", ask)
 
 
 def _limited(receive: Receive, access: Access) -> Receive:
@@ -256,9 +279,7 @@ def _too_large(largest: int) -> Refusal:
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            for name, value in HEADERS.items():
-                headers.setdefault(name, value)
+            message["headers"] = [*message.get("headers", ()), *HEADERS]
         await send(message)
 
     return sending

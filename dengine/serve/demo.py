@@ -7,6 +7,7 @@ import logging
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +24,9 @@ POLICY = {"alpha": 0.1, "lower_bound": 0.9, "audit_rate": 0.05}
 
 
 @asynccontextmanager
-async def playing(service: CellService, speed: float = 1.0, seed: int = 0) -> AsyncIterator[None]:
+async def playing(service: CellService, data: Any = "insertion", speed: float = 1.0, seed: int = 0) -> AsyncIterator[None]:
     """Play recordings in a drawn order, beside a server.  speed : parts a second after the first `BEFORE`."""
-    cell = ReplayCell("insertion")
+    cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
     driving = asyncio.create_task(drive(service, cell, speed))
     yield

@@ -1,4 +1,4 @@
-"""HTTP: decide, report, put right, and what can be asked of the engine; the application, every interface behind one guard.
+"""HTTP: decide, report, put right, what can be asked of the engine, and the page; the application behind one guard.
 
 curl -d '{"trace": [0.1, 0.3, ...], "request": "order-7"}' -H 'Content-Type: application/json' localhost:8000/decide
 app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db"))
@@ -6,82 +6,92 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+import asyncio
+import copy
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import replace
-from io import BytesIO
+from functools import cached_property
+from itertools import islice
 from pathlib import Path
+from shutil import make_archive
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
-from zipfile import ZipFile
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import Response, StreamingResponse
-from starlette.routing import BaseRoute, Route
+from starlette.responses import FileResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from .. import __version__
+from ..decision.policy import Policy
 from ..engine.corrections import Changed
 from ..engine.engine import DataEngine
-from ..errors import SettingError, UnknownDecisionError, shortened
 from ..history.explain import explain
 from ..history.map import part_map
-from ..history.status import course
+from ..history.status import NEWEST, course, of_part, paged
+from ..model.base import Exportable
 from ..records import Action, is_name
-from ..store.base import Store
-from ..store.records import Key, StoredDecision
+from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
-from . import api, page, xmlrpc
-from .api import Json, Operation, Refusal, answer
-from .auth import Access, Guard
+from . import api
+from .api import Json, Operation, Refusal, answer, fields_of
+from .auth import SHOWN, Access, Guard
 from .metrics import Metrics
 from .robot_calls import Recorder
 from .service import CellService
+from .xmlrpc import routes as xmlrpc_routes
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
+
 HUNG = 60.0  # seconds without a sign of the engine's thread, after which the server is not well
 TICK = 5.0  # seconds of quiet, after which who listens is told that the line still stands
 RETRY = 1000  # ms after which a browser that was cut off tries again
 BADS, AMONG = 10, 200  # newest bad parts that an explanation is drawn with, of so many newest labels
-CONFLICT = "Expected one decision of that part to report on, there are {}; say which by its id: {}."
-
-
-def routes(service: CellService) -> Sequence[BaseRoute]:
-    """What is asked over HTTP."""
-    return [*(Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations()), page.files()]
+STATIC = Path(__file__).parent / "page" / "static"
+VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")  # one file: its script shows the one that is asked for
+Limit = Annotated[int, Meta(ge=1, le=200)]
+Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
 
 class HttpApi:
-    """What is answered over HTTP; a method's docstring is its summary in the OpenAPI document."""
+    """What is answered over HTTP; a method's docstring and parameters are what the OpenAPI document says of it."""
 
     def __init__(self, service: CellService) -> None:
         self.service = service
         self._metrics = Metrics(service)
 
+    @cached_property
     def operations(self) -> list[Operation]:
         """Every path and method."""
         one: Json = {"trace": [0.1, 1.5, 2.25, None, 0.4], "request": "order-7", "part": "P-1007"}
         traces = one, {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
         reports = {"id": "order-7", "success": True}, {"part": "P-1007", "success": False, "author": "Kim"}
+        # A guarantee may be a class by name, and nothing that is asked over the network may have one imported.
+        policy = fields_of(Policy, "guarantee")
         return [
-            Operation("POST", "/decide", self.decide, "Answer", api.TraceRequest, raw=True, examples=traces),
-            Operation("POST", "/report", self.report, "Told", api.Report, examples=reports),
-            Operation("POST", "/correct", self.correct, "Changed", api.Correct),
-            Operation("POST", "/forget", self.forget, "Changed", api.Forget),
-            Operation("POST", "/rollback", self.rollback, "Changed", api.Rollback),
-            Operation("POST", "/policy", self.policy, "Changed", api.PolicyChange),
-            Operation("POST", "/retrain", self.retrain, "Changed", api.Signed),
-            Operation("POST", "/export", self.export, "application/zip", api.Signed),
-            Operation("GET", "/status", self.status, "Status", api.StatusQuery),
-            Operation("GET", "/decisions", self.decisions, "Decisions", api.ListQuery),
-            Operation("GET", "/decisions/{id:path}", self.decision, "Traced", api.DecisionQuery),
-            Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation", api.DecisionQuery),
-            Operation("GET", "/course", self.course, "Course", api.Nothing),
-            Operation("GET", "/embedding", self.embedding, "PartMap", api.Nothing),
-            Operation("GET", "/versions", self.versions, "Versions", api.Nothing),
-            Operation("GET", "/events", self.events, "Events", api.EventQuery),
+            Operation("POST", "/decide", self.decide, "Answer", raw="trace", examples=traces),
+            Operation("POST", "/report", self.report, "Told", examples=reports),
+            Operation("POST", "/correct", self.correct, "Changed"),
+            Operation("POST", "/forget", self.forget, "Changed"),
+            Operation("POST", "/rollback", self.rollback, "Changed"),
+            Operation("POST", "/policy", self.policy, "Changed", policy),
+            Operation("POST", "/retrain", self.retrain, "Changed"),
+            Operation("POST", "/export", self.export, "application/zip"),
+            Operation("GET", "/status", self.status, "Status"),
+            Operation("GET", "/decisions", self.decisions, "Decisions", fields_of(HistoryFilter, "label")),
+            Operation("GET", "/decisions/{id:path}", self.decision, "Decision"),
+            Operation("GET", "/explanations/{id:path}", self.explanation, "Explanation"),
+            Operation("GET", "/course", self.course, "Course"),
+            Operation("GET", "/embedding", self.embedding, "PartMap"),
+            Operation("GET", "/versions", self.versions, "Versions"),
+            Operation("GET", "/events", self.events, "Events"),
+            Operation("GET", "/me", self.me, "Me"),
             Operation("GET", "/changes", self.changes, "text/event-stream"),
             Operation("GET", "/metrics", self.metrics, "text/plain"),
             Operation("GET", "/healthz", self.healthz, "Health"),
@@ -89,41 +99,62 @@ class HttpApi:
             Operation("GET", "/docs", self.docs, "text/html"),
         ]
 
-    async def decide(self, request: Request) -> Json:
-        """Decide on a trace; asked again under its request id, it answers the same. The query is of a raw body alone."""
-        told = await self.service.decide(*await api.read_trace(request))
+    async def decide(
+        self,
+        trace: bytes | api.Samples,
+        request: str | None = None,
+        part: str | int | None = None,
+        channels: Annotated[int, Meta(ge=1, le=99_999)] = 1,
+    ) -> Json:
+        """Decide on a trace; asked again under its request id, it answers the same. The query is of a raw body alone.
+
+        trace : (samples,) or (channels, samples), null for a missing sample; or bytes, raw float32, little-endian.
+        request : the caller's id of this trace, once for every trace.  part : the part's number, where one is known.
+        channels : of bytes, one after another.
+        """
+        told = await self.service.decide(api.as_samples(trace, channels), request, part)
         return answer("Answer", told.decision, late=told.late, seconds=told.seconds)
 
-    async def report(self, asked: Any) -> Json:
-        """Report what became of a part; the label is on the disk when this answers. The same twice is no error."""
-        if bool(asked.id) == bool(asked.part):
+    async def report(self, success: bool | float, id_: str = "", part: str = "", author: str = "") -> Json:
+        """Report what became of a part; the label is on the disk when this answers. The same twice is no error.
+
+        id : of the decision.  part : its number in the place of that, where there is one decision of it; or the id.
+        success : true, or 1: good; false, or 0: bad, of an accepted part that came back a system stop.
+        author : who says so, for the event log, where the token has no name; a robot leaves it out.
+        """
+        if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
-        author = _name(asked.author) if asked.author else ""
-        id_ = asked.id or await self.service.look(lambda store: _only_one(store, asked.part))
-        return answer("Told", await self.service.report(id_, asked.success, author))
+        by = _name(author) if author or SHOWN.get().name else ""
+        found = id_ or await self.service.look(lambda store: of_part(store, part))
+        return answer("Told", await self.service.report(found, success, by))
 
-    async def correct(self, asked: Any) -> Json:
-        """Put a label right, from the next decision on; what was reported stays on record."""
-        return await self._change(asked, lambda engine, by: engine.correct(asked.id, asked.success, by))
+    async def correct(self, id_: str, success: bool, author: str = "") -> Json:
+        """Put a label right, from the next decision on; what was reported stays on record.
 
-    async def forget(self, asked: Any) -> Json:
-        """Leave labels out of all that is learned and counted; /correct brings one back."""
-        reason = " ".join(asked.reason.split())
-        return await self._change(asked, lambda engine, by: engine.forget(*asked.ids, author=by, reason=reason))
+        id : of the decision.  success : what it counts as from now on.  author : who asks, for the event log.
+        """
+        return await self._change(author, lambda engine, by: engine.correct(id_, success, by))
 
-    async def rollback(self, asked: Any) -> Json:
-        """Let an earlier version answer again, as a new version."""
-        return await self._change(asked, lambda engine, by: engine.rollback(asked.version, by))
+    async def forget(self, ids: list[str], author: str = "", reason: str = "") -> Json:
+        """Leave labels out of all that is learned and counted; /correct brings one back.
 
-    async def policy(self, asked: Any) -> Json:
+        ids : of the decisions.  author, reason : for the event log.
+        """
+        why = " ".join(reason.split())
+        return await self._change(author, lambda engine, by: engine.forget(*ids, author=by, reason=why))
+
+    async def rollback(self, version: int, author: str = "") -> Json:
+        """Let an earlier version answer again, as a new version.
+
+        version : its number, as /versions lists it.  author : who asks, for the event log.
+        """
+        return await self._change(author, lambda engine, by: engine.rollback(version, by))
+
+    async def policy(self, author: str = "", **changes: Any) -> Json:
         """Decide by other settings from the next decision on; with shadow, verify every part, or end that."""
+        return await self._change(author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by))
 
-        def change(engine: DataEngine, by: str) -> Changed:
-            return engine.set_policy(replace(engine.policy, **api.given(asked, type(engine.policy))), by)
-
-        return await self._change(asked, change)
-
-    async def retrain(self, asked: Any) -> Json:
+    async def retrain(self, author: str = "") -> Json:
         """Begin a retrain on all labels known by now, where none is under way."""
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -133,71 +164,78 @@ class HttpApi:
             engine.start_retrain()
             return Changed("retrain", "The retrain has begun.", engine.store.events(1)[-1].number, engine.version)
 
-        return await self._change(asked, begin)
+        return await self._change(author, begin)
 
-    async def export(self, asked: Any) -> Response:
+    async def export(self, author: str = "") -> Response:
         """The model that answers now, as a TorchScript file with its checksum, in an archive."""
 
-        def packed(engine: DataEngine) -> tuple[bytes, int]:
-            from ..export import export_torchscript
+        def copied(engine: DataEngine) -> Exportable:
+            found = engine.exported()
+            return replace(found, model=copy.deepcopy(found.model))  # the engine goes on learning meanwhile
 
-            content = BytesIO()
-            with TemporaryDirectory(prefix="dengine-export-") as folder, ZipFile(content, "w") as archive:
-                export_torchscript(engine, Path(folder) / "model.ts")
-                for file in sorted(Path(folder).iterdir()):
-                    archive.write(file, file.name)
-            engine.store.put_event("export", f"version {engine.version} was downloaded", author=by)
-            return content.getvalue(), engine.version
-
-        by = _name(asked.author)
-        content, version = await self.service.ask(packed)
-        headers = {"Content-Disposition": f'attachment; filename="model_{version}.zip"'}
+        by, source = _name(author), await self.service.ask(copied)
+        content = await asyncio.to_thread(_packed, source)
+        told = f"version {source.model_version} was downloaded"
+        await self.service.ask(lambda engine: engine.store.put_event("export", told, author=by))
+        headers = {"Content-Disposition": f'attachment; filename="model_{source.model_version}.zip"'}
         return Response(content, media_type="application/zip", headers=headers)
 
-    async def status(self, asked: Any) -> Json:
-        """How the cell is doing."""
-        found, service = await self.service.status(asked.last, asked.watch), self.service
+    async def status(self, last: Annotated[int, Meta(ge=1, le=100_000)] = NEWEST, watch: bool = False) -> Json:
+        """How the cell is doing.
+
+        last : the newest so many decisions are looked at apart.  watch : how far the safe mode's detectors are, too.
+        """
+        found, service = await self.service.status(last, watch), self.service
         line = {name: getattr(service, name) for name in api.IN_LINE}
         return answer("Status", found, alarm=found.alarm, **line)
 
-    async def decision(self, asked: Any) -> Json:
-        """One decision with its label; with trace=true its trace too."""
-        known = await self.service.find(asked.id)
-        if known is None:
-            raise _unknown()
-        return answer("Traced", known, trace=known.trace if asked.trace else None)
+    async def decision(self, id_: str, trace: bool = False) -> Json:
+        """One decision with its label.  trace : with its samples too."""
+        known = await self._known(id_)
+        return answer("Decision", known, trace=known.trace if trace else None)
 
-    async def decisions(self, asked: Any) -> Json:
-        """Decisions, newest first; with open=true those that wait for a label."""
-        where = HistoryFilter(**api.given(asked, HistoryFilter))
-        before = _key(asked.before) if asked.before else None
-        found = await self.service.look(lambda store: _newest(store, where, asked.limit, before, asked.open))
-        older = f"{found[-1].time!r},{found[-1].decision.id}" if len(found) == asked.limit else None
-        return {"decisions": [answer("Decision", each) for each in found], "older": older}
+    async def decisions(
+        self,
+        label: Literal["good", "bad", "none"] | None = None,
+        open_: bool = False,
+        limit: Limit = 20,
+        before: str = "",
+        **where: Any,
+    ) -> Json:
+        """Decisions, newest first; with open=true verified ones that wait for a label.
 
-    async def explanation(self, asked: Any) -> Json:
+        limit : how many at most.  before : older ones than this one, by its id, as the answer before said it, `older`.
+        since, until : times in seconds, the first included, the last not.
+        predicted : what the model alone would have done.  part : its number.
+        """
+        asked, beyond = HistoryFilter(label=label, **where), (await self._known(before)).decision.id if before else None
+        found = await self.service.look(lambda store: _newest(store, asked, limit, beyond, open_))
+        older = found[-1].decision.id if len(found) == limit else None
+        return {"decisions": [answer("Decision", each, trace=None) for each in found], "older": older}
+
+    async def explanation(self, id_: str) -> Json:
         """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones."""
-        return await self.service.look(lambda store: _explained(store, asked.id))
+        return await self.service.look(lambda store: _explained(store, id_))
 
-    async def course(self, asked: Any) -> Json:
+    async def course(self) -> Json:
         """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile."""
         recipe = self.service.engine.recipe
         return answer("Course", await self.service.look(lambda store: course(store, recipe, AMONG)))
 
-    async def embedding(self, asked: Any) -> Json:
+    async def embedding(self) -> Json:
         """Where the known and the newest parts lie for the model that answers."""
         engine = self.service.engine
         return answer("PartMap", await self.service.look(lambda store: part_map(store, engine.recipe, engine.version)))
 
-    async def versions(self, asked: Any) -> Json:
+    async def versions(self) -> Json:
         """Every retrain; kept: its model can be rolled back to."""
         return answer("Versions", versions=await self.service.look(lambda store: store.versions()))
 
-    async def events(self, asked: Any) -> Json:
-        """What happened beside decisions, and who did it; newest first."""
-        return answer("Events", events=(await self.service.look(lambda store: store.events(asked.limit)))[::-1])
+    async def events(self, limit: Limit = 20) -> Json:
+        """What happened beside decisions, and who did it; newest first.  limit : how many at most."""
+        return answer("Events", events=(await self.service.look(lambda store: store.events(limit)))[::-1])
 
-    async def changes(self, request: Request) -> Response:
+    async def changes(self) -> Response:
         """Server-sent events: hello, with the server's version; changed, whenever something has; tick, in quiet."""
 
         async def told() -> AsyncIterator[str]:
@@ -207,76 +245,57 @@ class HttpApi:
 
         return StreamingResponse(told(), media_type="text/event-stream")
 
-    async def metrics(self, request: Request) -> Response:
+    async def me(self) -> Json:
+        """Whose token was shown, and what it may."""
+        return answer("Me", SHOWN.get())
+
+    async def metrics(self) -> Response:
         """What Prometheus reads."""
         body, kind = self._metrics.text()
         return Response(body, media_type=kind)
 
-    async def healthz(self, request: Request) -> Response:
+    async def healthz(self) -> Response:
         """Whether the engine answers: ok; degraded (200): its store cannot be written; down (503). It asks for no token."""
         engine, alive = self.service.engine, self.service.silent < HUNG
         state = "down" if not alive else "degraded" if engine.store_fault else "ok"
         return api.answered(api.Health(state, engine.store_fault, self.service.waiting), 200 if alive else 503)
 
-    async def openapi(self, request: Request) -> Json:
+    async def openapi(self) -> Json:
         """The OpenAPI document."""
-        return api.document(self.operations(), __version__)
+        return api.document(self.operations, __version__)
 
-    async def docs(self, request: Request) -> Response:
+    async def docs(self) -> Response:
         """The same, to read."""
-        return await page.shown(request)
+        return FileResponse(STATIC / "docs.html")
 
-    async def _change(self, asked: api.Signed, work: Callable[[DataEngine, str], Changed]) -> Json:
-        """What a change by somebody did."""
-        author = _name(asked.author)
-        return answer("Changed", await self.service.ask(lambda engine: work(engine, author)))
+    async def _known(self, id_: str) -> StoredDecision:
+        known = await self.service.find(id_)
+        if known is None:
+            raise unknown_decision(id_)
+        return known
+
+    async def _change(self, author: str, work: Callable[[DataEngine, str], Changed]) -> Json:
+        by = _name(author)
+        return answer("Changed", await self.service.ask(lambda engine: work(engine, by)))
 
 
 def _name(author: str) -> str:
-    """An author's name for the event log; Refusal for none."""
-    name = " ".join(author.split())
-    if not is_name(name):
+    """An author's name for the event log, the token's where it has one; Refusal for none, and for another than that."""
+    owner, name = SHOWN.get().name, " ".join(author.split())
+    if owner and name not in ("", owner):
+        raise Refusal(422, f"Expected author to be {owner}, whose token it is, or to be left out.")
+    if not is_name(owner or name):
         raise Refusal(422, "Expected author, the name of who asks for it, for the event log.")
-    return name
+    return owner or name
 
 
-def _unknown() -> UnknownDecisionError:
-    return UnknownDecisionError("Expected the id of a decision of this cell, got one that is unknown.")
-
-
-def _only_one(store: Store, part: str) -> str:
-    """The id of the one decision of a part that a label can be of; of a part that is unknown, it may be the id itself."""
-    found = [each for each in store.decisions(HistoryFilter(part=part), 20) if each.decision.action is not Action.REJECT]
-    found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
-    if not found:
-        got = f"{shortened(part)}, which is unknown"
-        raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
-    if len(found) > 1:
-        raise Refusal(409, CONFLICT.format(len(found), ", ".join(each.decision.id for each in reversed(found))))
-    return found[0].decision.id
-
-
-def _key(text: str) -> Key:
-    time, _, id_ = text.partition(",")
-    try:
-        return float(time), id_
-    except ValueError as error:
-        raise Refusal(422, "Expected before as an answer said it, as `older`.") from error
-
-
-def _newest(store: Store, where: HistoryFilter, limit: int, before: Key | None, waiting: bool) -> list[StoredDecision]:
+def _newest(store: SqlStore, where: HistoryFilter, limit: int, before: str | None, waiting: bool) -> list[StoredDecision]:
     """Newest first. A forgotten label is none that is waited for."""
     where = replace(where, action=Action.VERIFY, label="none") if waiting else where
-    found: list[StoredDecision] = []
-    while len(found) < limit and (page := store.decisions(where, limit, before)):
-        found += [past for past in reversed(page) if not waiting or past.source is None]
-        before = page[0].key
-    return found[:limit]
+    return list(islice((past for past in paged(store, where, limit, before) if not waiting or past.source is None), limit))
 
 
-def _explained(store: Store, id_: str) -> Json:
-    if store.get_decision(id_, trace=False) is None:
-        raise _unknown()
+def _explained(store: SqlStore, id_: str) -> Json:
     found, labelled = explain(store, id_), store.labelled(AMONG)
     trace, band = found.trace, found.envelope
     bads = labelled.traces[labelled.labels == 0][-BADS:]
@@ -288,32 +307,39 @@ def _explained(store: Store, id_: str) -> Json:
     return answer("Explanation", found, trace=trace, corrections=corrections, **drawn)
 
 
-INTERFACES: Mapping[str, Callable[[CellService, Recorder | None], Sequence[BaseRoute]]] = {
-    "http": lambda service, recorder: routes(service),
-    "xmlrpc": xmlrpc.routes,
-    "page": lambda service, recorder: page.routes(),
-}
-Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
+def _packed(source: Exportable) -> bytes:
+    from ..export import export_torchscript
+
+    with TemporaryDirectory(prefix="dengine-export-") as folder:
+        (Path(folder) / "model").mkdir()
+        export_torchscript(source, Path(folder) / "model" / "model.ts")
+        return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
+
+
+async def _page(request: Request) -> Response:
+    return FileResponse(STATIC / "index.html")
 
 
 def create_app(
     service: CellService,
     access: Access | None = None,
-    interfaces: Sequence[str] = tuple(INTERFACES),
+    *,
+    xmlrpc: bool = True,
+    page: bool = True,
     beside: Sequence[Beside] = (),
     recorder: Recorder | None = None,
 ) -> Starlette:
     """The application; whoever made the service closes it, once the application has ended.
 
     access : who may ask, and how much; None: whoever is on this machine.
-    interfaces : those that answer, of `INTERFACES`; their routes are tried in this order.
+    xmlrpc, page : whether XML-RPC and the live page are served beside HTTP.
     beside : what runs in the same loop as long as the application does, an OPC UA server for one.
     recorder : of what a robot's program asks to decide on by `decide_recorded`; whoever made it closes it.
-    SettingError for an interface that there is not.
     """
-    if unknown := [name for name in interfaces if name not in INTERFACES]:
-        raise SettingError(f"Expected interfaces among {', '.join(INTERFACES)}, got {shortened(unknown[0])}.")
-    every = [route for name in interfaces for route in INTERFACES[name](service, recorder)]
+    every: list[BaseRoute] = [Route(each.path, each.serve, methods=[each.method]) for each in HttpApi(service).operations]
+    every += [Mount("/page/static", StaticFiles(directory=STATIC))]  # of /docs too
+    every += xmlrpc_routes(service, recorder) if xmlrpc else []
+    every += [Route(path, _page) for path in VIEWS] if page else []
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
 from ..records import RetrainReport
 from .service import Answer, CellService, Told
+
+QUICK = 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0  # seconds
+SLOW = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
+HEARD: Mapping[type, tuple[str, str, tuple[str, ...], tuple[float, ...]]] = {  # its labels are its fields' names
+    Answer: ("decide", "From a trace to its answer, in line too.", ("action", "reason"), QUICK),
+    Told: ("report", "From a label to its being on the disk.", ("success", "repeated"), QUICK),
+    RetrainReport: ("retrain", "From the data to the new version answering.", ("accepted",), SLOW),
+}
 
 
 class Metrics:
@@ -17,32 +25,18 @@ class Metrics:
 
     def __init__(self, service: CellService) -> None:
         self._service, self._registry = service, CollectorRegistry()
-        registry = self._registry
-        self._decisions = Counter("dengine_decisions", "Decisions answered.", ("action", "reason"), registry=registry)
-        self._reports = Counter("dengine_reports", "Labels taken.", ("success", "repeated"), registry=registry)
-        self._retrains = Counter("dengine_retrains", "Retrains that ended.", ("accepted",), registry=registry)
-        quick = 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0
-        slow = 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 1.0, 2.0, 5.0, 15.0, 60.0
         self._seconds = {
-            kind: Histogram(f"dengine_{name}_seconds", about, buckets=buckets, registry=registry)
-            for kind, name, about, buckets in (
-                (Answer, "decide", "From a trace to its answer, in line too.", quick),
-                (Told, "report", "From a label to its being on the disk.", quick),
-                (RetrainReport, "retrain", "From the data to the new version answering.", slow),
-            )
+            kind: Histogram(f"dengine_{name}_seconds", about, labels, buckets=buckets, registry=self._registry)
+            for kind, (name, about, labels, buckets) in HEARD.items()
         }
-        registry.register(self)
+        self._registry.register(self)
         service.observers.append(self.observe)
 
     def observe(self, news: Answer | Told | RetrainReport) -> None:
-        """Count one of these."""
-        self._seconds[type(news)].observe(news.seconds)
-        if isinstance(news, Answer):
-            self._decisions.labels(news.decision.action.value, news.decision.reason.value).inc()
-        elif isinstance(news, Told):
-            self._reports.labels(str(news.success).lower(), str(news.repeated).lower()).inc()
-        else:
-            self._retrains.labels(str(news.accepted).lower()).inc()
+        """Count one of these, and how long it took."""
+        said = news.decision if isinstance(news, Answer) else news
+        labels = [str(getattr(said, name)).lower() for name in HEARD[type(news)][2]]
+        self._seconds[type(news)].labels(*labels).observe(news.seconds)
 
     def text(self) -> tuple[bytes, str]:
         """All of it, and its content type."""
@@ -56,6 +50,7 @@ class Metrics:
             ("safe_mode", "1 while everything is verified for what went wrong.", bool(engine.safe_mode)),
             ("shadow", "1 while everything is verified, and the model is only asked.", engine.shadow),
             ("store_fault", "1 while the store or its journal cannot be written.", bool(engine.store_fault)),
+            ("store_lag_seconds", "Age of the oldest record that the store has not taken; 0: none.", engine.store_lag),
             ("retraining", "1 while a retrain is under way.", engine.retraining),
             ("new_labels", "Labels since the last retrain began.", engine.new_labels),
             ("waiting", "Requests in line.", service.waiting),

@@ -14,7 +14,7 @@ import asyncio
 import hmac
 import logging
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import asynccontextmanager, suppress
 from functools import wraps
 from typing import Any
@@ -31,7 +31,7 @@ from asyncua.ua import VariantType
 from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError
+from ..errors import DengineError, SettingError, as_options
 from .auth import in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
@@ -43,14 +43,14 @@ USER = "dengine"
 
 
 class Users(UserManager):
-    """Who may read and call: everybody on this machine, or who knows the token. Nobody is an administrator.
+    """Who may read and call: everybody on this machine, or who knows a token. Nobody is an administrator.
 
     encrypted : only who shows a certificate, as whoever encrypts does: asyncua lets anyone open a channel without security,
     so that a client can ask what the endpoints are, and would let a session begin on it.
     """
 
-    def __init__(self, token: str | None, encrypted: bool = False) -> None:
-        self._token, self._encrypted = token, encrypted
+    def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:
+        self._tokens, self._encrypted = tokens, encrypted
 
     def get_user(
         self, iserver: InternalServer, username: str | None = None, password: Any = None, certificate: Any = None
@@ -58,10 +58,10 @@ class Users(UserManager):
         """The user of this name and password; None where there is none."""
         if self._encrypted and not certificate:
             return None
-        if self._token is None:
+        if self._tokens is None:
             return User(role=UserRole.User, name="anyone")
         given = password if isinstance(password, bytes) else str(password or "").encode("utf-8", "surrogateescape")
-        same = hmac.compare_digest(given, self._token.encode())
+        same = sum(hmac.compare_digest(given, each.encode()) for each in self._tokens)  # each is compared, whichever it is
         return User(role=UserRole.User, name=USER) if same and username == USER else None
 
 
@@ -117,24 +117,24 @@ async def opcua_server(
     service: CellService,
     port: int = 4840,
     host: str = "127.0.0.1",
-    token: str | None = None,
+    tokens: Collection[str] | None = None,
     cert: str | os.PathLike[str] | None = None,
     key: str | os.PathLike[str] | None = None,
 ) -> AsyncIterator[Server]:
     """Serve the cell over OPC UA in this loop, as long as the context lasts.
 
-    port : 0 takes a free one, `server.bserver.port`.  token : the password of the user `dengine`; None: anyone may ask.
+    port : 0 takes a free one, `server.bserver.port`.  tokens : passwords of the user `dengine`; None: anyone may ask.
     cert, key : PEM or DER files; with them only Basic256Sha256, signed and encrypted, is spoken.
     SettingError for an address other than this machine's without token, cert and key; OSError for a port in use.
     """
     secure = cert is not None and key is not None
-    if not (is_loopback(host) or (secure and token)):
+    if not (is_loopback(host) or (secure and tokens)):
         raise SettingError(f"Expected a token, a certificate and a key to serve OPC UA on {host}; or stay on 127.0.0.1.")
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # it writes tracebacks of whatever strangers send
-    server = Server(user_manager=Users(token, secure))
+    server = Server(user_manager=Users(tokens, secure))
     server.limits.max_message_size, server.limits.max_chunk_count = MOST, MOST // CHUNK + 1
     server.iserver.max_connections, server.iserver.max_subscriptions = CONNECTIONS, SUBSCRIPTIONS
-    server.set_identity_tokens([ua.AnonymousIdentityToken if token is None else ua.UserNameIdentityToken])
+    server.set_identity_tokens([ua.AnonymousIdentityToken if tokens is None else ua.UserNameIdentityToken])
     await server.init()
     server.allow_remote_admin(False)
     server.set_endpoint(f"opc.tcp://{in_url(host)}:{port}/dengine")
@@ -191,22 +191,13 @@ class AddressSpace:
         return [answer[name] for name in ("action", "id", "reason", "lower", "upper", "version")]
 
     async def report(self, decision_id: str, success: bool) -> list[Any]:
-        """Report what became of a part."""
         return [await self._calls.report(decision_id, success)]
 
     async def follow(self) -> None:
         """Bring the variables up to date whenever something has changed, and now and then, for ever."""
-        changes, following = aiter(self._service.changes()), None
-        try:
-            while True:
-                await self.refresh()
-                await asyncio.sleep(EVERY)  # what was decided just now is in the store by then
-                following = following or asyncio.ensure_future(anext(changes, None))
-                if following in (await asyncio.wait([following], timeout=SELDOM))[0]:
-                    following = None
-        finally:
-            if following is not None:
-                following.cancel()
+        async for _ in self._service.changes(SELDOM):
+            await self.refresh()
+            await asyncio.sleep(EVERY)  # what was decided just now is in the store by then
 
     async def refresh(self) -> None:
         """Bring the variables up to date; where that cannot be, the values stay, and say that they are old."""
@@ -244,7 +235,7 @@ class AddressSpace:
                     answer = await call(*(each.Value for each in arguments))
                     return [ua.Variant(value, type_) for value, (_, type_, _, _) in zip(answer, given, strict=True)]
                 except DengineError as error:
-                    wrong, said = StatusCodes.BadInvalidArgument, str(error)
+                    wrong, said = StatusCodes.BadInvalidArgument, as_options(str(error))
                 except Exception:  # ours: the log has it, the caller verifies
                     log.exception("a call over OPC UA failed")
                     wrong, said = StatusCodes.BadInternalError, "The server failed on this call."

@@ -73,6 +73,9 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
         if os.getppid() != parent.pid:  # it was killed before that
             os._exit(1)
+        cores = sorted(os.sched_getaffinity(0))
+        if len(cores) > 1:  # one is left to decisions alone, not the same one by every server of a machine
+            os.sched_setaffinity(0, {*cores} - {cores[parent.pid % len(cores)]})
     else:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
     os.nice(NICE)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 import logging
 import signal
@@ -13,7 +12,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -22,15 +20,14 @@ from typing import Any, TextIO
 
 import uvicorn
 
-from ..engine.engine import DataEngine
+from ..engine.engine import DataEngine, frozen_objects
 from ..errors import SettingError, without_password
-from ..records import RetrainReport
-from .auth import Access, in_url, is_loopback, read_token
+from .auth import Access, in_url, is_loopback, read_tokens
 from .connections import Places
-from .http import INTERFACES, Beside, create_app
+from .http import Beside, create_app
 from .retraining import RetrainingProcess
 from .robot_calls import Recorder
-from .service import DEADLINE, Answer, CellService, Told
+from .service import DEADLINE, CellService
 
 log = logging.getLogger("dengine")
 
@@ -39,7 +36,6 @@ class Lines(logging.Formatter):
     """A record as one line of time, level, logger and message, as JSON has a text, for a machine to read; no password."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Time, level, logger, message; and what was raised."""
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         said = f"message={json.dumps(without_password(record.getMessage()))}"
         if record.exc_info:
@@ -49,20 +45,17 @@ class Lines(logging.Formatter):
 
 @contextmanager
 def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Have every logger write such lines; uvicorn none, for what it refuses is answered, and what fails is told here."""
+    """Have every logger write such lines, ours what it is up to, too."""
     handler, root = logging.StreamHandler(stream), logging.getLogger()
     handler.setFormatter(Lines())
-    levels = {root: logging.WARNING, log: logging.INFO, logging.getLogger("uvicorn"): logging.CRITICAL}
-    handlers, before = root.handlers[:], {logger: logger.level for logger in levels}
+    handlers, level = root.handlers[:], log.level
     root.handlers[:] = [handler]
+    log.setLevel(logging.INFO)
     try:
-        for logger, level in levels.items():
-            logger.setLevel(level)
         yield
     finally:
         root.handlers[:] = handlers
-        for logger, level in before.items():
-            logger.setLevel(level)
+        log.setLevel(level)
 
 
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
@@ -70,80 +63,55 @@ GRACE = 5  # seconds in which requests under way are answered when the server en
 SWITCH = 0.0005  # seconds after which a thread gives Python's lock to one that waits: a robot waits for both of ours
 
 
-@dataclass(frozen=True, slots=True)
-class Serving:
-    """How a cell is served.
-
-    token_file : of the token; None only where no other machine reaches the server.
-    cert, key : PEM files; None: no TLS.
-    allow_hosts : names by which the server is called, beside localhost.
-    opcua : the port of OPC UA, at the same host, with the same token; None: it is not spoken.
-    opcua_cert, opcua_key : its PEM files, where they are not those of TLS, which URScript's XML-RPC does not speak.
-    check_seconds : that a verification takes, for the time that was saved.
-    recorder : makes what records for a robot's program that asks over XML-RPC; None: nothing does.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8000
-    token_file: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
-    allow_hosts: Sequence[str] = ()
-    deadline: float = DEADLINE
-    largest: int = Access().largest
-    rate: float = Access().rate
-    connections: int = 100
-    check_seconds: float = 5.0
-    interfaces: Sequence[str] = tuple(INTERFACES)
-    beside: Sequence[Beside] = ()
-    opcua: int | None = None
-    opcua_cert: Path | None = None
-    opcua_key: Path | None = None
-    recorder: Callable[[], AbstractContextManager[Recorder]] | None = None
-
-    def access(self) -> Access:
-        """Who may ask; SettingError where other machines reach the server and it has no token."""
-        if self.token_file is None and not is_loopback(self.host):
-            raise SettingError(
-                f"Expected --token-file FILE, for {self.host} is reached from other machines; or --host 127.0.0.1."
-            )
-        token = "" if self.token_file is None else read_token(self.token_file)
-        names = () if is_loopback(self.host) else (self.host, socket.gethostname())
-        return Access(token, (*names, *self.allow_hosts), self.largest, rate=self.rate, burst=max(1, int(2 * self.rate)))
-
-
 def serve(
-    make: Callable[[Executor], DataEngine], store: str | None, serving: Serving, say: Callable[[str], object]
+    make: Callable[[Executor], DataEngine],
+    store: str | None,
+    say: Callable[[str], object],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    token_file: Path | None = None,
+    cert: Path | None = None,
+    key: Path | None = None,
+    allow_hosts: Sequence[str] = (),
+    deadline: float = DEADLINE,
+    largest: int = Access().largest,
+    rate: float = Access().rate,
+    connections: int = 100,
+    check_seconds: float = 5.0,
+    opcua: int | None = None,
+    opcua_cert: Path | None = None,
+    opcua_key: Path | None = None,
+    beside: Sequence[Beside] = (),
+    recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
+    **interfaces: bool,
 ) -> None:
     """Serve a cell until SIGTERM or SIGINT; then what is in line is answered, and the engine closed.
 
     make : opens the engine, given the executor that it retrains in.  store : its name, for what only reads.
-    say : told where it listens, once it does.
-    SettingError for a port that is in use, and for files that cannot be used; what `make` raises.
+    say : told where it listens, once it does.  recorder : makes what records for a robot's program.
+    beside, xmlrpc, page : as of `create_app`.  The others are options of `dengine serve`, under their names.
+    SettingError for a port that is in use, for files that cannot be used, and for an address that other machines reach
+    without a token; what `make` raises.
     """
-    tls, access = _tls(serving.cert, serving.key), serving.access()
-    with (
-        bound(serving.host, serving.port) as listening,
-        log_lines_to(sys.stderr),
-        RetrainingProcess() as executor,
-        serving.recorder() if serving.recorder else nullcontext() as recorder,
-    ):
-        service = CellService(lambda: make(executor), store, serving.deadline, check_seconds=serving.check_seconds)
-        service.observers.append(tell)
+    if token_file is None and not is_loopback(host):
+        raise SettingError(f"Expected --token-file FILE, for {host} is reached from other machines; or --host 127.0.0.1.")
+    tls, tokens = _tls(cert, key), () if token_file is None else read_tokens(token_file)
+    own = () if is_loopback(host) else (host, socket.gethostname())
+    access = Access(tokens, (*own, *allow_hosts), largest, rate=rate)
+    with bound(host, port) as listening, log_lines_to(sys.stderr), RetrainingProcess() as executor, recorder() as recording:
+        service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         try:
-            beside = list(serving.beside)
-            if serving.opcua is not None:
+            if opcua is not None:
                 from .opcua import opcua_server
 
-                cert, key = serving.opcua_cert or serving.cert, serving.opcua_key or serving.key
-                how = partial(opcua_server, port=serving.opcua, host=serving.host, token=access.token or None)
-                beside.append(partial(how, cert=cert, key=key))
-            app = create_app(service, access, serving.interfaces, beside, recorder)
-            config = uvicorn.Config(app, **uvicorn_options(serving) | tls)
-            port = listening.getsockname()[1]
-            address = f"http{'s' if serving.cert else ''}://{in_url(serving.host)}:{port}"
-            alone = "" if access.token else ", to this machine alone"
-            line = f"{service.engine.store.cell_id} is served at {address}{alone}."
+                operators = [each.secret for each in tokens if each.operates] if tokens else None
+                spoken = partial(opcua_server, port=opcua, host=host, tokens=operators)
+                beside = [*beside, partial(spoken, cert=opcua_cert or cert, key=opcua_key or key)]
+            app = create_app(service, access, beside=beside, recorder=recording, **interfaces)
+            config = uvicorn.Config(app, **uvicorn_options(connections) | tls)
+            address = f"http{'s' if cert else ''}://{in_url(host)}:{listening.getsockname()[1]}"
+            line = f"{service.engine.store.cell_id} is served at {address}{'' if tokens else ', to this machine alone'}."
             server = CellServer(config, service, lambda: say(line))
             try:
                 with quick_switches():
@@ -155,11 +123,11 @@ def serve(
             service.close()
 
 
-def uvicorn_options(serving: Serving) -> dict[str, Any]:
-    """What uvicorn is told; its own words in the log are ours to say."""
-    limits = {"timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE, "ws": "none", "lifespan": "on"}
-    silent = {"log_config": None, "access_log": False, "server_header": False, "proxy_headers": False}
-    return {"http": Places(serving.connections).connection, "loop": "asyncio"} | limits | silent
+def uvicorn_options(connections: int = 100) -> dict[str, Any]:
+    """What uvicorn is told, whose loop is uvloop where that is installed; what it would log is answered, or told here."""
+    limits = {"http": Places(connections).connection, "timeout_keep_alive": KEEP_ALIVE, "timeout_graceful_shutdown": GRACE}
+    plain = {"loop": "auto", "ws": "none", "lifespan": "on", "server_header": False, "proxy_headers": False}
+    return limits | plain | {"log_config": None, "log_level": "critical", "access_log": False}
 
 
 class CellServer(uvicorn.Server):
@@ -170,7 +138,6 @@ class CellServer(uvicorn.Server):
         self._service, self._say = service, say
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and say so."""
         await super().startup(sockets)
         if not self.should_exit:
             self._say()
@@ -200,12 +167,10 @@ def quick_switches() -> Iterator[None]:
     """Have threads give each other Python's lock without delay, and Python's collector leave alone what is there now."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH)
-    gc.collect()
-    gc.freeze()
     try:
-        yield
+        with frozen_objects():
+            yield
     finally:
-        gc.unfreeze()
         sys.setswitchinterval(before)
 
 
@@ -239,12 +204,6 @@ def _tls(cert: Path | None, key: Path | None) -> dict[str, str]:
     except OSError as error:  # ssl.SSLError too
         raise SettingError(f"Cannot use {cert} and {key} for TLS: {error.strerror or error}.") from error
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
-
-
-def tell(news: Answer | Told | RetrainReport) -> None:
-    """Log a retrain; decisions and reports are in the store."""
-    if isinstance(news, RetrainReport):
-        log.info("version %d answers after a retrain of %.2f s: %s", news.version, news.seconds, news.reason)
 
 
 def tell_safe_mode(reason: str) -> None:

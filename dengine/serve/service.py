@@ -3,7 +3,7 @@
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     answer = await service.decide(trace, "order-7")
 
-What only reads does so by a second connection to the store (`read`, `look`), so that no decision waits for it.
+What only reads does so by a second connection to the store (`look`), so that no decision waits for it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
@@ -27,9 +27,11 @@ from ..engine.engine import DataEngine
 from ..errors import BusyError
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
-from ..store.base import Store
 from ..store.opening import open_store
 from ..store.records import StoredDecision
+
+if TYPE_CHECKING:
+    from ..store.sql import SqlStore
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
@@ -177,22 +179,16 @@ class CellService:
         """As `ask`, from any thread and without waiting."""
         return self._put(lambda engine, late: work(engine), looks)
 
-    async def read(self, work: Callable[[Store], T]) -> T:
-        """Read the store as the disk has it, in a thread of its own; in the engine's where it remembers in memory."""
+    async def look(self, work: Callable[[SqlStore], T]) -> T:
+        """Read a store that holds all that was decided so far, in a thread of its own; one in memory in the engine's."""
+        await self.ask(lambda engine: engine.flush(), looks=True)
         if self.reading is self.engine.store:
             return await self.ask(lambda engine: work(engine.store), looks=True)
         return await asyncio.to_thread(work, self.reading)
 
-    async def look(self, work: Callable[[Store], T]) -> T:
-        """Read a store that holds all that was decided so far."""
-        await self.ask(lambda engine: engine.flush(), looks=True)
-        return await self.read(work)
-
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """How the cell is doing, as `history.status`: by its store, and by what the running engine alone knows."""
-        found, engine = await self.look(lambda store: status(store, last, watching)), self.engine
-        live = ("version", "shadow", "safe_mode", "new_labels", "store_fault", "retraining")
-        return replace(found, **{name: getattr(engine, name) for name in live})
+        return self.engine.as_it_runs(await self.look(lambda store: status(store, last, watching)))
 
     @property
     def waiting(self) -> int:
@@ -256,6 +252,8 @@ class CellService:
         return job.future
 
     def _heard(self, news: T) -> T:
+        if isinstance(news, RetrainReport):  # decisions and reports are in the store
+            log.info("version %d answers after a retrain of %.2f s: %s", news.version, news.seconds, news.reason)
         for observe in self.observers:
             observe(news)  # type: ignore[arg-type]  # only what the list is of
         return news

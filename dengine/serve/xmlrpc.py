@@ -1,7 +1,7 @@
 """XML-RPC, as a robot's program speaks it: `rpc_factory("xmlrpc", "http://HOST:8000/RPC2")`.
 
 The calls are those of `RobotCalls`. Every answer is HTTP's 200 with a value or a fault, a code and one line; only what is
-no XML-RPC at all is a 405, 413 or 415. The XML is read by defusedxml: no document type, no entity, nothing from outside.
+no XML-RPC at all is a 405 or 415. The XML is read by defusedxml: no document type, no entity, nothing from outside.
 """
 
 from __future__ import annotations
@@ -17,32 +17,24 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
-from ..errors import DengineError, ReportError
-from .api import media_type, read_body
+from ..errors import DengineError, ReportError, as_options
+from .api import media_type
 from .auth import RPC
-from .robot_calls import PATIENCE, Call, Recorder, RobotCalls, one_line
+from .robot_calls import Call, Recorder, RobotCalls, one_line
 from .service import CellService
 
 log = logging.getLogger("dengine")
-MOST = 2 << 20  # bytes of a call: 40,000 samples, as robots write them
 SMALL = 1 << 16  # bytes of a call that is read at once; more is read in a thread
-TAGS = ("int", "i4", "double", "boolean", "string", "array", "value", "params", "methodName")
+TAGS = ("int", "i4", "double", "boolean", "string", "base64", "array", "value", "params", "methodName")
 
 NOT_XML, NO_METHOD, WRONG_ARGUMENTS, OURS = -32700, -32601, -32602, -32603  # as XML-RPC servers agreed on
 REFUSED, NO_REPORT = 1, 2  # a trace, or anything else, that breaks the contract; a report that does
 
 
-class Values(xmlrpc.client.Unmarshaller):
-    """Reads a call of numbers, booleans, texts and lists; anything else is a ResponseError."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.dispatch = {name: xmlrpc.client.Unmarshaller.dispatch[name] for name in TAGS}
-
-
 def parsed(body: bytes) -> tuple[str, tuple[Any, ...]]:
-    """A call's name and arguments; ValueError for what is none."""
-    values = Values()
+    """A call's name and arguments, numbers, booleans, texts, bytes and lists; ValueError for what is none."""
+    values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
+    values.dispatch = {name: values.dispatch[name] for name in TAGS}
     parser = DefusedExpatParser(values, forbid_dtd=True)
     try:
         parser.feed(body)
@@ -55,21 +47,16 @@ def parsed(body: bytes) -> tuple[str, tuple[Any, ...]]:
     return name, arguments
 
 
-def routes(
-    service: CellService, recorder: Recorder | None = None, patience: float = PATIENCE, most: int = MOST
-) -> list[Route]:
-    """POST /RPC2. recorder : of the traces of `decide_recorded`, whose owner closes it.  most : bytes of a call."""
-    calls = RobotCalls(service, recorder, patience).table()
+def routes(service: CellService, recorder: Recorder | None = None) -> list[Route]:
+    """POST /RPC2. recorder : of the traces of `decide_recorded`, whose owner closes it."""
+    calls = RobotCalls(service, recorder).table()
 
     async def rpc(request: Request) -> Response:
         if media_type(request) not in ("text/xml", "application/xml"):
             return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
-        body = await read_body(request, most)
-        if body is None:
-            return PlainTextResponse(f"Expected at most {most} bytes.\n", 413)
-        return Response(await answered(calls, body), media_type="text/xml")
+        return Response(await answered(calls, await request.body()), media_type="text/xml")
 
     return [Route(RPC, rpc, methods=["POST"])]
 
@@ -90,7 +77,7 @@ async def answered(calls: dict[str, Call], body: bytes) -> bytes:
     try:
         return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
     except DengineError as error:
-        return fault(NO_REPORT if isinstance(error, ReportError) else REFUSED, str(error))
+        return fault(NO_REPORT if isinstance(error, ReportError) else REFUSED, as_options(str(error)))
     except Exception:  # ours: the log has it, the caller verifies
         log.exception("a call failed")
         return fault(OURS, "The server failed on this call: verify the part.")

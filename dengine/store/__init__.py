@@ -1,4 +1,4 @@
-"""Where an engine remembers: the contract, a store in memory, and one in a database."""
+"""Where an engine remembers: a database: a file, a server, or one in memory."""
 
 import lazy_loader
 

@@ -1,7 +1,4 @@
-from .base import Store as Store
-from .memory import MemoryStore as MemoryStore
 from .opening import open_store as open_store
-from .records import AddedPoints as AddedPoints
 from .records import Change as Change
 from .records import Correction as Correction
 from .records import Event as Event

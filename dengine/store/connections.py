@@ -6,23 +6,23 @@ A deleted file, a fork, and a row that the database refuses are each met here.
 from __future__ import annotations
 
 import hashlib
-import json
+import itertools
 import logging
 import os
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, shortened
-from .journal import Record, TakenLabel, owned_by, owner
-from .ledger import LedgerEntry, chain_writes, held_settings, is_sound
+from .journal import Record, forked, owned_by, owner
+from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
 from .queries import Scope, held_query, join_product
-from .records import Event, StoredDecision, as_text, pack, to_row
+from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, pack, to_row
 from .schema import (
     CORRECTION,
     DECISION,
@@ -30,9 +30,9 @@ from .schema import (
     LABEL,
     LEDGER,
     TRACE,
+    check_schema,
     chunks,
     decision_row,
-    label_row,
     prepare_tables,
     trace_row,
 )
@@ -41,19 +41,17 @@ log = logging.getLogger("dengine")
 T = TypeVar("T")
 
 # Of a server that answers no more, libpq says so after some seconds, not hours.
-PATIENCE = {
-    "connect_timeout": 5,
-    "keepalives_idle": 5,
-    "keepalives_interval": 2,
-    "keepalives_count": 3,
-    "tcp_user_timeout": 10000,
-}
-IN_FORCE = 10_000  # newest labels that are held to their sums when an engine opens the store
+PATIENCE = {"connect_timeout": 5, "tcp_user_timeout": 10000}
+PATIENCE |= {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+READ = ("setting", "correction", "model_version", "label", "decision", "ledger")  # a damaged trace is noticed as it is read
 BUSY = 10.0  # seconds to wait for another process that writes to the same SQLite file
 
 
-def make_engine(url: str) -> sa.Engine:
-    """Return an engine for a file or URL; refuses what this store was never tested on."""
+def make_engine(url: str | None) -> sa.Engine:
+    """Return an engine for a file or URL, None: SQLite in memory; refuses what this store was never tested on."""
+    if url is None:
+        one = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
+        return _sqlite(sa.create_engine("sqlite://", **one))
     if as_text(url) != url:
         raise StoreError(
             f"Expected a file or a database URL of UTF-8 characters without a NUL, got {shortened(url)}; rename it."
@@ -71,7 +69,7 @@ def make_engine(url: str) -> sa.Engine:
             )
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
-        engine = sa.create_engine(parsed, connect_args={"timeout": BUSY})
+        return _sqlite(sa.create_engine(parsed, connect_args={"timeout": BUSY}))
     except (sa.exc.ArgumentError, ImportError) as error:
         raise _unusable(url, f"{error}") from error
     except ValueError as error:
@@ -79,30 +77,12 @@ def make_engine(url: str) -> sa.Engine:
             raise _unusable(url, f"{error}") from error
         # What it quotes, and takes for a port, may be half of a password.
         raise _unusable(url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F") from None
+
+
+def _sqlite(engine: sa.Engine) -> sa.Engine:
     sa.event.listen(engine, "connect", _set_pragmas)
     sa.event.listen(engine, "begin", _begin)
     return engine
-
-
-class WatchedFile:
-    """The file of an SQLite database, by device and inode: a deleted or replaced one still takes writes, for nobody."""
-
-    def __init__(self, url: sa.URL) -> None:
-        self.path = Path(str(url.database)) if url.get_backend_name() == "sqlite" else None
-        if self.path is not None and not self.path.is_file():
-            self.path = None  # named by an URI of SQLite's own
-        self._opened = None if self.path is None else self.path.stat()
-
-    def check(self) -> None:
-        """Raise an OSError where the file at the path is no longer the one that was opened."""
-        if self.path is None or self._opened is None:
-            return
-        try:
-            same = os.path.samestat(self.path.stat(), self._opened)
-        except OSError:
-            same = False
-        if not same:
-            raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
 
 def _unusable(url: str, said: str) -> StoreError:
@@ -129,54 +109,87 @@ def _begin(connection: sa.Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
 
 
-def advice(error: BaseException) -> str:
-    """Say what to do about a database error, as far as its text tells."""
-    said = str(error).lower()
-    for text, what_to_do in (
-        ("not a database", "The file is something else; name a new file, or a store that dengine wrote."),
-        ("unable to open", "Create the directory, or name one that can be written."),
-        ("readonly", "Make the file and its directory writable."),
-        ("full", "Free some space on the disk."),
-        ("locked", "Another process holds the database; close it, or wait."),
-        ("while it was open", "Put it back, or close this store and open the new one."),
-        ("malformed", "The file is damaged; restore it from a copy."),
-    ):
-        if text in said:
-            return what_to_do
-    return "Check that the database is there and can be written."
-
-
+ADVICE = {
+    "not a database": "The file is something else; name a new file, or a store that dengine wrote.",
+    "unable to open": "Create the directory, or name one that can be written.",
+    "readonly": "Make the file and its directory writable.",
+    "full": "Free some space on the disk.",
+    "locked": "Another process holds the database; close it, or wait.",
+    "while it was open": "Put it back, or close this store and open the new one.",
+    "malformed": "The file is damaged; restore it from a copy.",
+    "": "Check that the database is there and can be written.",
+}  # what to do, by what a database says
 OF_A_ROW = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError, TypeError)  # the database itself is well
+
+
+@contextmanager
+def _told(doing: str, name: str) -> Iterator[None]:
+    """Turn what a database of this name raises into a StoreError that says what to do."""
+    try:
+        yield
+    except DengineError:
+        raise
+    except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *OF_A_ROW) as error:
+        advice = next(do for text, do in ADVICE.items() if text in str(error).lower())
+        raise StoreError(f"Could not {doing} {name}: {getattr(error, 'orig', None) or error}. {advice}") from error
+
+
+@contextmanager
+def reading(url: str) -> Iterator[sa.Connection]:
+    """Connect to a store of the present schema, and see it as it is now. StoreError where there is none."""
+    engine = make_engine(url)
+    name = engine.url.render_as_string(hide_password=True)
+    sqlite = engine.dialect.name == "sqlite"
+    options = {} if sqlite else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
+    try:
+        file = str(engine.url.database)
+        if sqlite and not (Path(file).is_file() or file.startswith("file:")):  # the latter is an URI of SQLite's own
+            raise StoreError(
+                f"Expected a store that an engine has used, found no file {file}; "
+                "make a DataEngine with it, or let `dengine train` or `dengine run` make one."
+            )
+        with _told("read", name), engine.connect() as connection:  # rolled back at its end: there is nothing to commit
+            connection.execution_options(**options)
+            if sqlite:  # a text of which a byte was damaged is read too, so that it can be named
+                plain: Any = connection.connection.driver_connection
+                plain.text_factory = lambda text: text.decode("utf-8", "backslashreplace")
+            check_schema(connection, name)
+            yield connection
+    finally:
+        engine.dispose()
 
 
 class Database:
     """An open database, prepared for a cell; one thread writes at a time.
 
-    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
+    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL; None: SQLite in memory.
     clock : the time in seconds that entries of the ledger are stamped with.
-    scope : the cell and its product.  name : the URL without its password.  failures : how many writes failed so far.
+    scope : the cell and its product.  name : the URL without its password.
     before_use : called before each transaction, so that it sees what is on its way into the database.
+    newest : number and digest of the newest entry of the ledger, as far as this process knows; None: there is none.
+    on_entry : called once a transaction that added one is committed.
     """
 
     def __init__(
-        self, url: str, cell_id: str, clock: Callable[[], float], product: str | None, before_use: Callable[[], None]
+        self, url: str | None, cell_id: str, clock: Callable[[], float], product: str | None, before_use: Callable[[], None]
     ) -> None:
         self.cell_id = cell_id
-        self.failures = 0
-        self._newest: tuple[int, str] | None = None  # entry of the ledger
         self._before_use = before_use
         self._clock = clock
         self._closed = False
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._asked = threading.local()  # of each thread, what says whether its commit is wanted still
-        self._leasing = False  # a lease is taken on each new connection that writes
-        self._leased: sa.Connection | None = None
-        self._engine = make_engine(url)
+        self._key = b"" if url is None else ledger_key()
+        self.newest: tuple[int, str] | None = None
+        self.on_entry: Callable[[], object] = lambda: None
+        self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
         self.name = self._engine.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
-        self._file = WatchedFile(self._engine.url)
+        file = Path(str(self.url.database)) if self.url.get_backend_name() == "sqlite" else None
+        self._file = file if file is not None and file.is_file() else None  # None: an URI of SQLite's own, or a server
+        self._opened = None if self._file is None else self._file.stat()
 
     @property
     def url(self) -> sa.URL:
@@ -185,27 +198,17 @@ class Database:
 
     def _open(self, product: str | None) -> Scope:
         try:
-            with self._told("open"), self._engine.connect() as plain:
+            with _told("open", self.name), self._engine.connect() as plain:
                 connection = plain.execution_options(dengine_write=True)
                 with connection.begin():
                     prepare_tables(connection, self.cell_id, self.name)
+                    must_have_key(connection, self.cell_id, self._key, begin=True)
+                    if (last := newest_entry(connection, self.cell_id)) is not None:
+                        self.newest = last.number, last.digest.hex()
                     return Scope(self.cell_id, join_product(connection, self.cell_id, product))
         except StoreError:
             self._engine.dispose()
             raise
-
-    @contextmanager
-    def _told(self, doing: str, write: bool = False) -> Iterator[None]:
-        """Turn what a database raises into a StoreError that says what to do."""
-        try:
-            yield
-        except DengineError:
-            raise
-        except (sa.exc.SQLAlchemyError, sqlite3.Error, OSError, *OF_A_ROW) as error:
-            self.failures += write
-            raise StoreError(
-                f"Could not {doing} {self.name}: {getattr(error, 'orig', None) or error}. {advice(error)}"
-            ) from error
 
     @contextmanager
     def transaction(self, write: bool) -> Iterator[sa.Connection]:
@@ -213,19 +216,32 @@ class Database:
         self.check_open()
         if not write:
             self._before_use()
-        with self._told("write to" if write else "read", write), self._connected(write) as plain:
-            entry = LedgerEntry(self.scope, self._clock) if write else None
+        engine = self._writer if write else self._engine
+        with _told("write to" if write else "read", self.name), engine.connect() as plain:
+            entry = LedgerEntry(self.scope, self._clock, self._key) if write else None
             connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
             with connection.begin():
                 if write:
-                    self._file.check()
+                    self._check_file()
                 yield connection
-                newest = None if entry is None else entry.append(connection)  # chains what the transaction added
+                if entry is not None:
+                    entry.append(connection)  # chains what the transaction added
                 if write and not getattr(self._asked, "wanted", lambda: True)():
                     raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
-            self._newest = newest or self._newest
             if write:
-                self._file.check()  # nobody is told that a file holds what went into another one
+                self._check_file()  # nobody is told that a file holds what went into another one
+            if entry is not None and entry.written is not None:
+                self.newest = entry.written
+                self.on_entry()
+
+    def _check_file(self) -> None:
+        """Raise an OSError where the file is not the one that was opened, which still takes writes, for nobody."""
+        if self._file is None or self._opened is None:
+            return
+        with suppress(OSError):
+            if os.path.samestat(self._file.stat(), self._opened):
+                return
+        raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
     @contextmanager
     def committing(self, wanted: Callable[[], bool]) -> Iterator[None]:
@@ -235,103 +251,83 @@ class Database:
         finally:
             del self._asked.wanted
 
-    @contextmanager
-    def _connected(self, write: bool) -> Iterator[sa.Connection]:
-        """A connection of the pool; a leased cell writes through the one connection that holds its lease."""
-        if not write or not self._leasing:
-            with self._engine.connect() as connection:
-                yield connection
-            return
-        if self._leased is None:
-            self._leased = self._engine.connect()
-        try:
-            if not self._leased.info.get("leased"):
-                self._take_lease(self._leased)
-                self._leased.commit()
-                self._leased.info["leased"] = True
-            yield self._leased
-        except (sa.exc.SQLAlchemyError, StoreError):
-            self._let_lease_go()
-            raise
-        if self._closed:  # meanwhile: `close` did not wait
-            self._disconnect()
-
-    def newest_entry(self) -> tuple[int, str] | None:
-        """Number and digest of the newest entry of the ledger that is known here; None where there is none."""
-        if self._newest is None:
-            mine = sa.select(LEDGER.c.number, LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
-            for row in self.read(mine.order_by(LEDGER.c.number.desc()).limit(1)):
-                self._newest = row.number, row.digest.hex()
-        return self._newest
-
     def holds_entry(self, number: int, digest: str) -> bool:
         """Whether the ledger has that entry."""
         mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
         return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
 
-    def doubt(self) -> str:
-        """What of settings, labels and corrections is not as the ledger has it, in words; "" where nothing is."""
-        newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == self.cell_id, LEDGER.c.settings.is_not(None))
-        chained = self.read(newest.order_by(LEDGER.c.number.desc()).limit(1))
+    def doubt(self, window: int, since: int | None = None) -> str:
+        """What is read of this cell and its product that is not as the ledgers have it, in words; "" where all is.
+
+        window : so many of the newest labels are read.  since : those after that number alone; None: the window.
+        """
         with self.transaction(write=False) as connection:
-            held = held_settings(connection, self.cell_id)
-        if chained and json.loads(chained[0].settings) != held:
-            return "the settings are not those of the ledger"
-        labels = sa.select(LABEL).where(LABEL.c.cell_id == self.cell_id).order_by(LABEL.c.seq.desc()).limit(IN_FORCE)
-        corrections = sa.select(CORRECTION).where(CORRECTION.c.cell_id == self.cell_id)
-        for table, query in ((LABEL, labels), (CORRECTION, corrections)):
-            for row in self.read(query):
-                if not is_sound(table.name, dict(zip(table.c.keys(), row, strict=True))):
-                    return f"the {table.name} of decision {row.decision_id!r} is not as it was written"
+            first = self.scope.first_label(connection, window) if since is None else since + 1
+            for cell in self.scope.cells(connection):
+                if said := doubt_of(connection, cell, self._key, first):
+                    return said if cell == self.cell_id else f"of cell {cell!r} {said}"
+        return ""
+
+    def damage(self) -> str:
+        """What SQLite finds wrong in a table that is read, or in its indexes, in words; "" where nothing is."""
+        for name in READ if self._file is not None else ():
+            try:
+                with self.transaction(write=False) as connection:
+                    said = connection.execute(sa.text(f"PRAGMA integrity_check({name})")).scalar()
+            except StoreError as error:
+                return f"{error}"
+            if said != "ok":
+                return f"of the table {name} SQLite says: {said}"
         return ""
 
     def lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
-        self._leasing = True
+        said = PATIENCE | {"application_name": f"dengine {owner()}"[:63]}  # so that others are told who it is
+        writer = sa.create_engine(self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=said)
+        chain_writes(writer)
+        sa.event.listen(writer, "connect", self._take_lease)
+        self._writer = writer
         try:
             self.write(lambda connection: None)
         except StoreError:
-            self._leasing = False
+            self._writer = self._engine
+            writer.dispose()
             raise
 
-    def _take_lease(self, connection: sa.Connection) -> None:
+    def _take_lease(self, connection: Any, record: Any) -> None:
         """Lock the cell for as long as this PostgreSQL connection lives."""
-        connection.execute(
-            sa.text("SELECT set_config('application_name', :who, false)"), {"who": f"dengine {owner()}"[:63]}
-        )
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
-        key = {"key": int.from_bytes(digest[:8], "big", signed=True)}
-        if connection.execute(sa.text("SELECT pg_try_advisory_lock(:key)"), key).scalar():
-            return
-        asked = sa.text(
+        key = int.from_bytes(digest[:8], "big", signed=True)
+        taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
+        asked = (
             "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE l.locktype = 'advisory' "
-            "AND (l.classid::bigint << 32) + l.objid::bigint = :key AND l.objsubid = 1 AND l.granted"
+            "AND (l.classid::bigint << 32) + l.objid::bigint = %s AND l.objsubid = 1 AND l.granted"
         )
-        holder = connection.execute(asked, key).scalar()
-        raise owned_by(str(holder or "another engine"), f"cell {self.cell_id!r} of {self.name}")
-
-    def _let_lease_go(self) -> None:
-        connection, self._leased = self._leased, None
-        if connection is not None:
-            connection.invalidate()  # back in the pool its session would keep the lease
+        holder = None if taken else connection.execute(asked, [key]).fetchone()
+        connection.commit()
+        if not taken:
             connection.close()
+            raise owned_by(holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}")
 
     def check_open(self) -> None:
         """StoreError after closing, and in a fork."""
         if self._closed:
             raise StoreError(f"Expected an open store, got {self.name} after close(); open it again.")
         if os.getpid() != self._pid:
-            raise StoreError(
-                f"Expected the process that opened {self.name}, {self._pid}, got its fork {os.getpid()}; "
-                "open the store after the fork, in the process that uses it."
-            )
+            raise forked(self._pid, self.name)
 
-    def write(self, work: Callable[[sa.Connection], T]) -> T:
-        """Commit what `work` adds, in one transaction."""
+    def write(self, work: Callable[[sa.Connection], T], settled: bool = True) -> T:
+        """Commit what `work` adds, in one transaction; settled : after what is on its way into the database."""
         self.check_open()
-        self._before_use()  # not while others are kept from writing
-        with self._writing, self.transaction(write=True) as connection:
-            return work(connection)
+        if settled:
+            self._before_use()  # not while others are kept from writing
+        with self._writing:
+            try:
+                with self.transaction(write=True) as connection:
+                    return work(connection)
+            finally:
+                if self._closed:  # meanwhile: `close` did not wait
+                    self._disconnect()
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
         """Return the rows of a query."""
@@ -350,7 +346,7 @@ class Database:
                 self._writing.release()
 
     def _disconnect(self) -> None:
-        self._let_lease_go()
+        self._writer.dispose()
         self._engine.dispose()
 
     # What goes in
@@ -362,20 +358,23 @@ class Database:
 
     def insert(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> None:
         """Add decisions and their traces."""
+        number = itertools.count(self.scope.next_number(connection, DECISION.c.number) if decisions else 1)
         for part in chunks(decisions):
-            connection.execute(sa.insert(DECISION), [decision_row(self.cell_id, item) for item in part])
+            rows = [decision_row(self.cell_id, item) | {"number": next(number)} for item in part]
+            connection.execute(sa.insert(DECISION), rows)
             connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
 
-    def insert_labels(self, connection: sa.Connection, labels: Sequence[TakenLabel], held: Mapping[str, Any]) -> list[int]:
+    def insert_labels(self, connection: sa.Connection, labels: Sequence[NewLabel], held: Mapping[str, Any]) -> list[int]:
         """Add labels of held decisions; returns their numbers."""
         first = self.scope.next_number(connection, LABEL.c.seq)
         for part in chunks(range(len(labels))):
-            rows = [label_row(self.cell_id, labels[i], first + i, held[labels[i].label.decision_id]) for i in part]
+            rows: list[dict[str, Any]] = [{"cell_id": self.cell_id, "seq": first + i} | to_row(labels[i]) for i in part]
+            rows = [row | {"quarantined": held[row["decision_id"]].quarantined} for row in rows]
             connection.execute(sa.insert(LABEL), rows)
         return list(range(first, first + len(labels)))
 
     def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit what a journal held, as `Store.take`."""
+        """Commit what a journal held, as `SqlStore.take`."""
         try:
             return self.write(lambda connection: self._take(connection, records))
         except StoreError as error:
@@ -394,28 +393,54 @@ class Database:
         if events:
             events = self._new_events(connection, events)
         events += self._take_decisions(connection, [each for each in records if isinstance(each, StoredDecision)])
-        labels = [each for each in records if isinstance(each, TakenLabel)]
-        held = self.held(connection, [each.label.decision_id for each in labels])
+        labels = [each for each in records if isinstance(each, NewLabel)]
+        held = self.held(connection, [each.decision_id for each in labels])
         numbers = {name: row.seq for name, row in held.items() if row.seq is not None}
         said = {name: (held[name].success, held[name].source) for name in numbers}
-        fresh: dict[str, TakenLabel] = {}
+        fresh: dict[str, NewLabel] = {}
         well: list[str] = []
+        late: list[str] = []
         for each in labels:
-            name, now = each.label.decision_id, (each.label.success, each.label.source.value)
+            name, now = each.decision_id, (each.success, each.source.value)
             if name not in held:
                 events.append(self._set_aside(f"{_named(each)}, which the store does not hold"))
             elif (held[name].content_hash, held[name].time) != (each.content_hash, each.decided):
                 events.append(self._set_aside(f"{_named(each)}, of which the store holds another decision"))
-            elif said.setdefault(name, now) != now:
-                events.append(self._set_aside(f"a second label: {_named(each)}, which has one"))
-            else:
+            elif said.setdefault(name, now) == now:
                 well.append(name)
                 if name not in numbers:
                     fresh.setdefault(name, each)
+            elif (said[name], now) == LATE_STOP and held[name].counted != FORGOTTEN:
+                well.append(name)
+                late += [name] * (held[name].counted != 0)  # else the store has it
+            else:
+                events.append(self._set_aside(f"a second label: {_named(each)}, which has one"))
         if fresh:
             numbers |= zip(fresh, self.insert_labels(connection, list(fresh.values()), held), strict=True)
         self._insert_events(connection, events)
+        if late:
+            self._take_back(connection, list(dict.fromkeys(late)))
         return [(name, numbers[name]) for name in dict.fromkeys(well)]
+
+    def _take_back(self, connection: sa.Connection, names: Sequence[str]) -> None:
+        """Parts that were confirmed stopped the system: their labels are corrected, with an event each."""
+        first, now = self.scope.next_number(connection, EVENT.c.number), self._clock()
+        text = "counts as a failure, was a success: its stop came after its confirmation"
+        self._insert_events(connection, [Event(0, now, "late stop", f"decision {as_text(name)} {text}") for name in names])
+        for event, name in enumerate(names, first):
+            said = {"author": "", "event": event, "time": now, "success": False}
+            self.insert_corrections(connection, said, {name: True})
+
+    def insert_corrections(
+        self, connection: sa.Connection, said: Mapping[str, Any], was: Mapping[str, bool | None]
+    ) -> None:
+        """Add corrections of the labels of these decisions, which counted as `was`; said : what the rows have in common."""
+        first = self.scope.next_number(connection, CORRECTION.c.number)
+        newest = self.scope.next_number(connection, LABEL.c.seq) - 1
+        row = {**said, "cell_id": self.cell_id, "newest_seq": newest}
+        rows = [row | {"number": i, "decision_id": name, "was": was[name]} for i, name in enumerate(was, first)]
+        for part in chunks(rows):
+            connection.execute(sa.insert(CORRECTION), part)
 
     def _take_decisions(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> list[Event]:
         """Insert the new ones; returns what is to be said of those whose id has another decision."""
@@ -455,5 +480,5 @@ def _named(record: Record) -> str:
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):
         return f"a decision, {record.decision.id!r}"
-    said = "success" if record.label.success else "failure"
-    return f"a label, {said} from {record.label.source.value}, on {record.label.decision_id!r}"
+    said = "success" if record.success else "failure"
+    return f"a label, {said} from {record.source.value}, on {record.decision_id!r}"

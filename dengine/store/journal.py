@@ -2,7 +2,8 @@
 
 A locked file of records behind a header. Each record has its length, its CRC-32, and a digest over the record before it, so
 that a changed and a missing one are both noticed. The header says who owns the cell, up to where the store holds the
-records, and the newest entry of its ledger: a store that was cut off, or put back from a copy, does not hold that one.
+records, and the newest entry of its ledger: a store that was cut off, or put back from a copy, does not hold that one. A
+small file beside it, its head, knows that entry too, for where the journal went with the store.
 """
 
 from __future__ import annotations
@@ -17,8 +18,7 @@ import urllib.parse
 import weakref
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -36,17 +36,7 @@ FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, dige
 SYNC = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
 
 
-@dataclass(frozen=True, slots=True)
-class TakenLabel:
-    """A label as it was reported.  time : when, in seconds.  content_hash, decided : of its decision, and when that was."""
-
-    label: NewLabel
-    time: float
-    content_hash: int
-    decided: float
-
-
-Record = StoredDecision | TakenLabel | Event
+Record = StoredDecision | NewLabel | Event
 
 
 def to_bytes(record: Record) -> bytes:
@@ -55,12 +45,9 @@ def to_bytes(record: Record) -> bytes:
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
         rest = pack(record.trace)
-    elif isinstance(record, TakenLabel):
-        row = to_row(record.label) | {name: getattr(record, name) for name in ("time", "content_hash", "decided")}
-        rest = row.pop("point")
-        row["dim"] = None if rest is None else len(rest)
     else:
         row = to_row(record)
+        rest = row.pop("point", None)
     text = json.dumps([type(record).__name__, row]).encode()
     return LENGTH.pack(len(text)) + text + (rest or b"")
 
@@ -74,9 +61,8 @@ def from_bytes(blob: bytes) -> Record:
         if kind == StoredDecision.__name__:
             trace = unpack(rest).reshape(row["shape"])
             return from_row(StoredDecision, row, decision=from_row(Decision, row), trace=trace)
-        if kind == TakenLabel.__name__:
-            label = from_row(NewLabel, row, point=None if row["dim"] is None else unpack(rest))
-            return TakenLabel(label, row["time"], row["content_hash"], row["decided"])
+        if kind == NewLabel.__name__:
+            return from_row(NewLabel, row, point=unpack(rest) if rest else None)
         return from_row(Event, row)
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
         raise StoreError(
@@ -87,8 +73,8 @@ def from_bytes(blob: bytes) -> Record:
 
 def labelled(item: StoredDecision, success: Any, source: Source = Source.VERIFICATION) -> list[Record]:
     """A decision that was labelled when it was made, as a recording is that is imported."""
-    label = NewLabel(item.decision.id, as_success(success), source, item.decision.model_version, None)
-    return [item, TakenLabel(label, item.time, item.content_hash, item.time)]
+    of = item.decision.id, as_success(success), source, item.decision.model_version, None, 0
+    return [item, NewLabel(*of, item.time, item.content_hash, item.time)]
 
 
 class Journal:
@@ -96,7 +82,7 @@ class Journal:
 
     path : of the file, which is made; a link is refused.  end : offset behind the last record.
     drained : offset up to which the store holds the records.
-    newest : number and digest of the newest entry of the ledger that was known; None: none yet.
+    newest : number and digest of the newest entry of the ledger that was known; None: none yet.  head : as the head has it.
     dropped : bytes of an unfinished record at the end, which a killed process left; they were never acknowledged.
     damaged : records that are not as they were written, or are missing; the others are read all the same.
 
@@ -107,6 +93,7 @@ class Journal:
         self.path = path
         self.drained, self.end, self.dropped, self.damaged = HEADER, HEADER, 0, 0
         self.newest: tuple[int, str] | None = None
+        self.head = _head(path)
         self._digest = bytes(16)
         self._fd = _locked(path)
         try:
@@ -159,18 +146,32 @@ class Journal:
         return record
 
     def records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Return the records that are not drained: where each begins and ends, and the record."""
+        """Yield the whole records that are not drained: where each begins and ends, and the record."""
         begin = self.drained
-        while (found := self._next(begin, self.end)) is not None:
-            at, record = found
-            begin = at + FRAME.size + len(record)
-            yield at, begin, record
+        while begin < self.end:
+            if (record := self._record(begin)) is not None:
+                at, begin = begin, begin + FRAME.size + len(record)
+                yield at, begin, record
+                continue
+            block = os.pread(self._fd, 1 << 20, begin + 1)  # the next one stands behind the damaged one
+            at = block.find(MARK)
+            if at < 0 and len(block) < 1 << 20:
+                return
+            begin += 1 + (at if at >= 0 else len(block) - len(MARK))
 
     def mark(self, drained: int, newest: tuple[int, str] | None) -> None:
         """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
         self.drained, self.newest = drained, newest
         with self._told():
             os.pwrite(self._fd, self._header(), 0)
+        if newest is None:
+            return
+        with suppress(OSError):  # an older head is no harm
+            fd = os.open(head_path(self.path), os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+            try:
+                os.pwrite(fd, json.dumps(newest).ljust(HEADER).encode(), 0)
+            finally:
+                os.close(fd)
 
     def clear(self) -> None:
         """Forget all records; the store holds them now."""
@@ -239,26 +240,14 @@ class Journal:
             self.damaged += 1
         before: bytes | None = None  # of the first nothing is known: those before it may be gone
         begin = self.drained = min(max(self.drained, HEADER), size)
-        while (found := self._next(begin, size)) is not None:
-            at, record = found
-            digest = self._digest_at(at)
+        self.end = size
+        for at, end, record in self.records():
+            digest: bytes = FRAME.unpack(os.pread(self._fd, FRAME.size, at))[3]
             follows = before is None or digest == _digest(before, record)
             self.damaged += at > begin or not follows
-            before, begin = digest, at + FRAME.size + len(record)
+            before, begin = digest, end
         left = os.pread(self._fd, size - begin, begin)
         self.end, self.dropped, self._digest = begin, len(left.rstrip(b"\0")), before or bytes(16)
-
-    def _next(self, begin: int, end: int) -> tuple[int, bytes] | None:
-        """The first whole record from an offset on, and where it begins; None where there is none before the end."""
-        while begin < end:
-            if (record := self._record(begin)) is not None:
-                return begin, record
-            block = os.pread(self._fd, 1 << 20, begin + 1)
-            at = block.find(MARK)
-            if at < 0 and len(block) < 1 << 20:
-                return None
-            begin += 1 + (at if at >= 0 else len(block) - len(MARK))
-        return None
 
     def _record(self, offset: int) -> bytes | None:
         """The record at an offset; None where it is not as it was written."""
@@ -270,10 +259,6 @@ class Journal:
             return None
         record = os.pread(self._fd, length, offset + FRAME.size)
         return record if zlib.crc32(record) == crc else None
-
-    def _digest_at(self, offset: int) -> bytes:
-        digest: bytes = FRAME.unpack(os.pread(self._fd, FRAME.size, offset))[3]
-        return digest
 
 
 class LostJournalError(StoreError):
@@ -330,13 +315,24 @@ def journal_path(url: Any, cell_id: str) -> Path:
     return state / f"{name[:60]}.{where}.journal"
 
 
-def newest_known(path: Path) -> tuple[int, str] | None:
-    """Number and digest of the ledger's newest entry that a journal knows, whoever owns it; None where it knows none."""
-    try:
-        with path.open("rb") as file:
-            return _known(file.read(HEADER))[1]
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def head_path(journal: Path) -> Path:
+    """Where a journal's head lies."""
+    return journal.with_name(f"{journal.name}.head")
+
+
+def newest_known(path: Path) -> set[tuple[int, str]]:
+    """Numbers and digests of the ledger's newest entry that a journal and its head know, whoever owns them."""
+    found = {_head(path)}
+    with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
+        found.add(_known(file.read(HEADER))[1])
+    return {each for each in found if each is not None}
+
+
+def _head(journal: Path) -> tuple[int, str] | None:
+    with suppress(OSError, ValueError, TypeError):
+        number, digest = json.loads(head_path(journal).read_bytes())
+        return int(number), str(digest)
+    return None
 
 
 def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
@@ -344,6 +340,14 @@ def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
     known = json.loads(head[len(MAGIC) :].rstrip(b"\0"))
     newest = known["newest"]
     return int(known["drained"]), None if newest is None else (int(newest[0]), str(newest[1])), str(known["owner"])
+
+
+def forked(pid: int, name: str) -> StoreError:
+    """Return the error for a fork of the process that opened what this names."""
+    return StoreError(
+        f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; "
+        "open it after the fork, in the process that uses it."
+    )
 
 
 def owner() -> str:

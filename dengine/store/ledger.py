@@ -3,6 +3,12 @@
 A statement that inserts into a table of CHAINED is met on its way to the database: its rows get the number of the entry
 and a sum of their own, whoever sends it. So no writer has to remember the ledger, and none can go around it.
 
+An entry also holds, of each table that an engine learns from or answers by, one digest over all its rows so far: what an
+engine reads is held to the ledger by these rows alone, from any of them on, and by the newest entry.
+
+Where the environment names a key's file, the entries of a ledger that is begun are keyed: who has no key can change a
+store, and make its chain anew, but not so that it fits.
+
 What a row's sum is must never change. So a column without a value is not in it, and columns are taken by name: a later
 schema may add columns that are empty in earlier rows.
 """
@@ -10,18 +16,25 @@ schema may add columns that are empty in earlier rows.
 from __future__ import annotations
 
 import hashlib
+import hmac
 import json
+import os
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
+from itertools import groupby
 from typing import Any
 
 import sqlalchemy as sa
 
 from ..errors import StoreError
+from ..files import read_key
 from .queries import Scope
-from .schema import CHAINED, LEDGER, RESERVED, SETTING
+from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
 
+KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
+IN_FORCE = {LABEL.name: LABEL.c.seq, CORRECTION.name: CORRECTION.c.number, VERSION.name: VERSION.c.retrain}
 START = bytes(32)  # what the first entry of a cell follows
 APART = {"sum", "state"}  # columns that a row's sum leaves out: itself, and a state, which may go: `state_sum` covers it
 
@@ -70,16 +83,64 @@ def state_sum(state: bytes | None) -> bytes | None:
     return None if state is None else hashlib.sha256(state).digest()
 
 
-def entry_digest(previous: bytes, head: Mapping[str, Any], sums: Mapping[str, Iterable[bytes]]) -> bytes:
-    """Return the digest of a ledger entry, 32 bytes: over the one before, the entry's own columns, and its rows.
+def ledger_key() -> bytes:
+    """The key that the environment names, b"" where it names none; StoreError for a file that holds none."""
+    file = os.environ.get(KEY_VARIABLE)
+    return read_key(file, StoreError) if file else b""
 
-    head : cell_id, number, time, added and settings of the entry.  sums : of its rows, by table, in any order.
-    """
-    digest = hashlib.sha256(b"dengine ledger 1\n" + previous + row_sum("ledger", head))
+
+def must_have_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool = False) -> None:
+    """StoreError unless a cell's ledger was begun with this key, or, for b"", without.  begin : note it in a new cell."""
+    tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
+    mine = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
+    held = connection.execute(sa.select(SETTING.c.value).where(mine)).scalar()
+    if begin and held is None and tag and newest_entry(connection, cell_id) is None:
+        connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": LEDGER_KEY, "value": tag})
+    elif held != tag:
+        begun = "without a key" if held is None else "with a key" if tag is None else "with another key"
+        raise StoreError(
+            f"Expected a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} names{'' if key else ', none'}; it "
+            f"was begun, or made anew, {begun}: have it name the file of the ledger's own key, or none."
+        )
+
+
+def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
+    """Number, digest and what is held of a cell's newest entry; None where there is none."""
+    query = sa.select(*LEDGER.c["number", "digest", "held"]).where(LEDGER.c.cell_id == cell_id)
+    return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
+
+
+def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
+    """Return the SHA-256 over the sums of rows, by table, in any order."""
+    digest = hashlib.sha256()
     for table in sorted(sums):
         ordered = sorted(sums[table])
         digest.update(b"%s=%d;%s" % (table.encode(), len(ordered), b"".join(ordered)))
     return digest.digest()
+
+
+def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> bytes:
+    """Return the digest of a ledger entry, 32 bytes: over the one before, and all columns of the entry but its digest.
+
+    key : of a keyed ledger: then it is the HMAC-SHA-256 (RFC 2104).
+    """
+    begin = b"dengine ledger 2\n" + previous + row_sum("ledger", head)
+    return hmac.digest(key, begin, "sha256") if key else hashlib.sha256(begin).digest()
+
+
+def _onward(chained: str, sums: Iterable[bytes]) -> str:
+    """The chain of a table's rows, with those of another entry."""
+    return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
+
+
+def _of_settings(settings: Mapping[str, str]) -> str:
+    return _onward("", [json.dumps(settings, sort_keys=True).encode()])
+
+
+def _loaded(held: str) -> dict[str, str]:
+    with suppress(ValueError, TypeError):  # damaged: it fits no rows
+        return dict(json.loads(held))
+    return {}
 
 
 DOUBLES = {
@@ -91,16 +152,19 @@ Row = Mapping[str, Any]
 class LedgerEntry:
     """The entry that a transaction under way will end with; nothing is asked or written where it adds no row.
 
-    scope : whose ledger.  clock : the time in seconds that the entry is stamped with.
+    scope : whose ledger.  clock : the time in seconds that the entry is stamped with.  key : of a keyed ledger.
+    written : its number and digest, in hexadecimal, once it is; None before, and where there is none.
     """
 
-    def __init__(self, scope: Scope, clock: Callable[[], float]) -> None:
-        self._scope, self.cell_id = scope, scope.cell_id
+    def __init__(self, scope: Scope, clock: Callable[[], float], key: bytes = b"") -> None:
+        self._scope, self.cell_id, self._key = scope, scope.cell_id, key
+        self.written: tuple[int, str] | None = None
         self._clock = clock
         self._number = 0  # 0: not begun
         self._previous = START
         self._sums: dict[str, list[bytes]] = {}
         self._settings = False
+        self._held: dict[str, str] = {}
 
     def take(self, connection: sa.Connection, table: str, rows: Sequence[Row]) -> list[dict[str, Any]]:
         """Return rows on their way into a table with the number of the entry, and each with its sum."""
@@ -128,31 +192,97 @@ class LedgerEntry:
         if self._number:
             return
         self._scope.lock_cell(connection)
-        newest = sa.select(LEDGER.c.number, LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
-        last = connection.execute(newest.order_by(LEDGER.c.number.desc()).limit(1)).first()
-        self._number, self._previous = (1, START) if last is None else (last.number + 1, last.digest)
+        last = newest_entry(connection, self.cell_id)
+        if last is None:
+            self._number = 1
+        else:
+            self._number, self._previous, self._held = last.number + 1, last.digest, _loaded(last.held)
 
-    def append(self, connection: sa.Connection) -> tuple[int, str] | None:
-        """Write the entry, as the last of the transaction; returns its number and digest, None where there is none."""
+    def append(self, connection: sa.Connection) -> None:
+        """Write the entry, as the last of the transaction, where there is one."""
         if not self._number:
-            return None
-        held = held_settings(connection, self.cell_id) if self._settings else None
+            return
+        settings = held_settings(connection, self.cell_id) if self._settings else None
+        held = {name: _onward(self._held.get(name, ""), self._sums[name]) for name in IN_FORCE if name in self._sums}
+        held |= {} if settings is None else {SETTING.name: _of_settings(settings)}
         head = {
             "cell_id": self.cell_id,
             "number": self._number,
             "time": float(self._clock()),
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
-            "settings": None if held is None else json.dumps(held, sort_keys=True),
+            "rows": rows_digest(self._sums),
+            "held": json.dumps(self._held | held, sort_keys=True),
+            "settings": None if settings is None else json.dumps(settings, sort_keys=True),
         }
-        digest = entry_digest(self._previous, head, self._sums)
+        digest = entry_digest(self._previous, head, self._key)
         connection.execute(sa.insert(LEDGER), head | {"digest": digest})
-        return self._number, digest.hex()
+        self.written = self._number, digest.hex()
 
 
 def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     """Return a cell's settings, without the store's own."""
     query = sa.select(SETTING.c.key, SETTING.c.value).where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
     return {row.key: row.value for row in connection.execute(query)}
+
+
+def settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
+    """What of a cell's settings is not as the newest entry that changed them has it: by key, in words."""
+    held, chained = held_settings(connection, cell_id), dict[str, str]()
+    newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == cell_id, LEDGER.c.settings.is_not(None))
+    with suppress(ValueError, TypeError):  # the entry itself was changed: of that the chain tells
+        chained = dict(json.loads(connection.execute(newest.order_by(LEDGER.c.number.desc()).limit(1)).scalar() or "{}"))
+    other = [key for key in sorted(held.keys() | chained.keys(), key=str) if held.get(key) != chained.get(key)]
+    return {
+        key: "is not chained" if key not in chained else "is missing" if key not in held else "was changed" for key in other
+    }
+
+
+def doubt_of(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
+    """What a cell's engine reads that is not as its ledger has it, in words; "" where all is.
+
+    first : number of the oldest label that is read.  Settings, corrections and versions are held to it from the first on.
+    """
+    try:
+        must_have_key(connection, cell_id, key)
+    except StoreError as error:
+        return f"{error}"
+    entries = sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id).order_by(LEDGER.c.number.desc()).limit(2)
+    head, before = [*(dict(row._mapping) for row in connection.execute(entries)), {}, {}][:2]
+    if head and entry_digest(before.get("digest", START), head | {"digest": None}, key) != head["digest"]:
+        return "the newest entry of the ledger is not as it was written"
+    held = _loaded(head.get("held", ""))
+    if held.get(SETTING.name, _of_settings({})) != _of_settings(held_settings(connection, cell_id)):
+        return "the settings are not those of the ledger"
+    newest = head.get("number", 0)
+    for name in IN_FORCE:
+        begin = first if name == LABEL.name else 1
+        if said := _table_doubt(connection, cell_id, name, begin, newest, held.get(name, "")):
+            return said
+    return ""
+
+
+def _table_doubt(connection: sa.Connection, cell_id: str, name: str, first: int, newest: int, chained: str) -> str:
+    """What of a table in force is not as its ledger has it, in words, from row `first` on, or from the first of its entry.
+
+    newest : entry up to which rows count; others may write meanwhile.  chained : what it holds of this table.
+    """
+    number = IN_FORCE[name]
+    table, mine = number.table, number.table.c.cell_id == cell_id
+    entry = sa.select(table.c.entry).where(mine, number >= first).order_by(number).limit(1).scalar_subquery()
+    earlier = sa.select(table.c.entry, number).where(mine, number < first, table.c.entry < sa.func.coalesce(entry, 2**62))
+    before = connection.execute(earlier.order_by(number.desc()).limit(1)).first()
+    chain = ""
+    if before is not None:
+        held = sa.select(LEDGER.c.held).where(LEDGER.c.cell_id == cell_id, LEDGER.c.number == before.entry)
+        chain, mine = _loaded(connection.execute(held).scalar() or "").get(name, ""), mine & (number > before[1])
+    mine &= table.c.entry.is_(None) | (table.c.entry <= newest)
+    rows = connection.execute(sa.select(*(c for c in table.c if c.name != "state")).where(mine).order_by(number))
+    for _, some in groupby(rows, lambda row: row.entry):
+        each = [dict(zip(rows.keys(), row, strict=True)) for row in some]
+        if other := [row for row in each if not is_sound(name, row)]:
+            return f"the {name} {other[0][number.name]} is not as it was written"
+        chain = _onward(chain, [row["sum"] for row in each])
+    return "" if chain == chained else f"the rows of {name} are not those of the ledger"
 
 
 def chain_writes(engine: sa.Engine) -> None:

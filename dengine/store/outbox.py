@@ -18,20 +18,24 @@ from contextlib import suppress
 from dataclasses import replace
 from hashlib import blake2b
 from itertools import islice
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import NotTakenError, StoreError
 from ..records import RetrainReport
-from .base import Store
-from .journal import LostJournalError, Record, TakenLabel, from_bytes, to_bytes
-from .records import Event, NewLabel, StoredDecision, already_reported, as_text, checked_decision, checked_label
+from .journal import HEADER, LostJournalError, Record, forked, from_bytes, to_bytes
+from .records import LATE_STOP, Event, NewLabel, StoredDecision, already_reported, as_text
+
+if TYPE_CHECKING:
+    from .sql import SqlStore
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
 LINGER = 0.05  # seconds that a decision waits for company before it is written, and before the store takes it
 BEAT = 1.0  # seconds between two tries of what failed
+CHECK = 0.1  # seconds that opening waits for SQLite's own check; of a larger store, that is done while the cell runs
 LATE = 1.0  # seconds of lag that are a fault of the store
 COMMIT = 2.0  # seconds beyond `wait` for a commit that is under way by then, for it may succeed
 CLOSE = 5.0  # seconds that closing may take
@@ -47,40 +51,41 @@ class TakenIds:
     Source: Bloom (1970), CACM 13(7).
     """
 
-    BITS, HASHES = 2**24, 4
-
     def __init__(self, ids: Iterable[str] = ()) -> None:
-        self._bits = bytearray(self.BITS // 8)
-        for each in ids:
-            self.add(each)
+        self._bytes = np.zeros(2**21, dtype=np.uint8)
+        self.add(*ids)
 
-    def add(self, decision_id: str) -> None:
-        """One more is taken."""
-        for place in self._places(decision_id):
-            self._bits[place >> 3] |= 1 << (place & 7)
+    def add(self, *ids: str) -> None:
+        """These are taken."""
+        byte, bit = self._places(ids)
+        np.bitwise_or.at(self._bytes, byte, bit)
 
     def may_hold(self, decision_id: str) -> bool:
         """False: it is not taken."""
-        return all(self._bits[place >> 3] >> (place & 7) & 1 for place in self._places(decision_id))
+        byte, bit = self._places([decision_id])
+        return bool((self._bytes[byte] & bit).all())
 
-    def _places(self, decision_id: str) -> list[int]:
-        digest = blake2b(decision_id.encode("utf-8", "surrogatepass"), digest_size=4 * self.HASHES).digest()
-        return [int.from_bytes(digest[i : i + 4], "little") % self.BITS for i in range(0, len(digest), 4)]
+    def _places(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
+        digests = (blake2b(each.encode("utf-8", "surrogatepass"), digest_size=16).digest() for each in ids)
+        places = np.frombuffer(b"".join(digests), dtype="<u4") % (8 * len(self._bytes))  # four of each
+        return places >> 3, np.left_shift(1, places & 7, dtype=np.uint8, casting="unsafe")
 
 
 class Outbox:
     """What an engine tells and asks its store while the cell runs.
 
+    window : newest labels that are read, and so held to the ledger.
     owning : claim the cell; else the store is read and nothing more.
     patient : wait as long as it takes: a replay that repeats exactly never looks at the clock.
     """
 
-    def __init__(self, store: Store, owning: bool = True, patient: bool = False) -> None:
-        self.store = store
+    def __init__(self, store: SqlStore, window: int, owning: bool = True, patient: bool = False) -> None:
+        self.store, self._window = store, window
         self.limit = None if patient else store.wait
         self._reading, self._pid, self._closed, self._ending = not owning, os.getpid(), False, False
         self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
         self._taken: TakenIds | None = None
+        self._made: TakenIds | None = None  # the same, not complete until it is that one
         self._learning = False  # which ids are taken
         self._unrecorded: set[str] = set()  # ids that were answered, and are recorded under no decision of theirs
         self._arrived: list[tuple[str, int]] = []
@@ -91,23 +96,32 @@ class Outbox:
         self._labels: dict[str, tuple[NewLabel, int]] = {}  # not drained, with their places
         self._times: deque[float] = deque()  # when each record that is not drained was appended
         self._appended = self._synced = self._drained = 0  # how many records so far
-        self._wanted = self._asked = self._tries = 0  # place that somebody waits for to be synced; questions; failures
+        self._wanted = self._tries = 0  # place that somebody waits for to be synced; tries that failed
         self._drains = 0  # callers that wait for the store to have everything
         self._jobs: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._sync_began: float | None = None
-        self._stuck = self._away = self._doubt = ""  # why the journal, why the store, took nothing; what is not as written
+        self._stuck = self._away = self.doubt = ""  # why the journal, why the store, took nothing; what is not as written
         self._journal = store.own() if owning else None
         if self._journal is not None:
             self._begin()
+        elif store.wait is not None:
+            self._doubt_it(store.database.damage())
+            self.hold_to_ledger()
 
     def _begin(self) -> None:
         """Have the store take what an earlier process left, and begin."""
         journal = self._journal
         assert journal is not None
         try:
-            if journal.newest is not None and not self.store.holds_entry(*journal.newest):  # before it takes anything
-                text = f"the ledger lacks entry {journal.newest[0]}, which this cell's journal knows: the store was cut off"
+            # Before the store takes anything.
+            known, database = [each for each in (journal.newest, journal.head) if each is not None], self.store.database
+            if lacking := [each for each in known if not database.holds_entry(*each)]:
+                text = f"the ledger lacks entry {lacking[0][0]}, which this cell's journal knows: the store was cut off"
                 self._note("lost", f"{text}, or put back from a copy; labels may be missing")
+                journal.drained = HEADER  # it may hold some of them still
+            elif len(known) < 2 and database.newest is not None:
+                text = f"the journal {journal.path}, or its head beside it, is new here, and the store is not"
+                self._note("journal", f"{text}: whether the store was cut off, or labels wait elsewhere, is not known")
             for at, _, blob in journal.records():
                 self._appended, self._synced = self._appended + 1, self._synced + 1
                 self._times.append(time.monotonic())
@@ -120,11 +134,14 @@ class Outbox:
                 self._note("journal", text)
             if journal.damaged:
                 self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
-            journal.mark(journal.drained, self.store.newest_entry())
+            journal.newest = self.store.database.newest
             journal.clear()
-            if doubt := self.store.doubt():
-                self._doubt = f"{doubt}; see `dengine verify`, and restore the store from a copy."
-                log.error("every part is verified: %s", self._doubt)
+            self.store.database.on_entry = self._mark
+            self._mark()
+            check = threading.Thread(target=lambda: self._doubt_it(self.store.database.damage()), daemon=True)
+            check.start()
+            self.hold_to_ledger()
+            check.join(CHECK)
         except BaseException:
             journal.close()
             raise
@@ -137,16 +154,35 @@ class Outbox:
         for thread in self._threads:
             thread.start()
 
+    def hold_to_ledger(self, since: int | None = None) -> None:
+        """Look whether what is read from the store is as its ledger has it; where it is not, everything is verified.
+
+        since : labels after that number are read; None: the newest `window`.
+        """
+        if self.store.wait is not None:
+            self._doubt_it(self.store.database.doubt(self._window, since))
+
+    def _doubt_it(self, said: str) -> None:
+        if said and not self.doubt:
+            self.doubt = f"{said}; see `dengine verify`, and restore the store from a copy."
+            log.error("every part is verified: %s", self.doubt)
+
     def _note(self, kind: str, text: str) -> None:
         log.error("%s: %s", kind, text)
         self.store.put_event(kind, text)
+
+    def _mark(self) -> None:
+        """Note the ledger's newest entry in the journal, a drained one or not: a store that was cut off is told by that."""
+        with self._changed, suppress(StoreError):  # what is wrong with the journal, its next record tells
+            if self._journal is not None:
+                self._journal.mark(self._journal.drained, self.store.database.newest)
 
     # How it is doing
 
     @property
     def away(self) -> str:
         """Why the cell verifies everything: what is in force was changed, or the journal takes nothing; "" else."""
-        return self._doubt or self._hung
+        return self.doubt or self._hung
 
     @property
     def _hung(self) -> str:
@@ -164,7 +200,7 @@ class Outbox:
     @property
     def fault(self) -> str:
         """What is wrong with the store, or with the journal, at present; "" where nothing is."""
-        return self._doubt or self._blocked
+        return self.doubt or self._blocked
 
     @property
     def _blocked(self) -> str:
@@ -180,10 +216,7 @@ class Outbox:
     def check(self) -> None:
         """Raise a StoreError after closing, for reading, and in a fork, whose ids would mix with its parent's."""
         if os.getpid() != self._pid:
-            raise StoreError(
-                f"Expected the process that opened the engine, {self._pid}, got its fork {os.getpid()}; "
-                "open the engine after the fork, in the process that uses it."
-            )
+            raise forked(self._pid, "the engine")
         if self._closed:
             raise StoreError("Expected an open engine, got one after close(); open it again.")
         if self._reading:
@@ -191,10 +224,8 @@ class Outbox:
 
     # What the engine tells
 
-    def decided(self, item: StoredDecision) -> StoredDecision:
-        """Record a decision without waiting, in any thread; returns the one that has its id: of two the first."""
-        self.check()
-        made = checked_decision(item.decision, item.trace, item.content_hash, item.quarantined, self.store.clock())
+    def decided(self, made: StoredDecision) -> StoredDecision:
+        """Record a decision, as the engine makes it, without waiting, in any thread; returns the first one of its id."""
         id_ = made.decision.id
         with self._changed:
             if (first := self._recent.get(id_)) is not None:
@@ -220,8 +251,8 @@ class Outbox:
 
     def _remember(self, made: StoredDecision) -> None:
         self._recent[made.decision.id] = made
-        if self._taken is not None:
-            self._taken.add(made.decision.id)
+        if self._made is not None:
+            self._made.add(made.decision.id)
         if len(self._recent) > MOST:
             self._recent.popitem(last=False)
 
@@ -237,8 +268,8 @@ class Outbox:
     def labels(self, labels: Sequence[tuple[StoredDecision, NewLabel]], secure: bool = True) -> None:
         """Record labels of decisions; where secure, they are on the disk when this returns. Numbers come with `arrived`.
 
-        ReportError for a second label of a decision. StoreError where they are not known to be taken: the same again is
-        harmless, the opposite is a ReportError.
+        ReportError for a second label of a decision, but for the stop of a part that was confirmed. StoreError where they
+        are not known to be taken: the same again is harmless, the opposite is a ReportError.
         """
         with self._changed:
             fresh: list[Record] = []
@@ -246,12 +277,15 @@ class Outbox:
             for known, label in labels:
                 id_, now = known.decision.id, (label.success, label.source)
                 first, at = self._labels.get(id_, (None, 0))
-                if known.source is not None:
-                    raise already_reported(id_, (bool(known.success), known.source), now)
-                if first is not None and first.success != label.success:
-                    raise already_reported(id_, (first.success, first.source), now)
-                if first is None:
-                    fresh.append(TakenLabel(checked_label(label), self.store.clock(), known.content_hash, known.time))
+                stands = None if known.source is None else (bool(known.success), known.source)
+                if stands is None and first is not None and first.success != label.success:
+                    stands = first.success, first.source
+                late = (stands, now) == LATE_STOP
+                if stands is not None and not late:
+                    raise already_reported(id_, stands, now)
+                if first is None or (late and first.success):
+                    hash_, when = known.content_hash, self.store.clock()
+                    fresh.append(replace(label, time=when, content_hash=hash_, decided=known.time))
                 place = max(place, at)
             if fresh:
                 place = self._append(fresh)
@@ -285,8 +319,8 @@ class Outbox:
             if isinstance(record, StoredDecision):
                 self._open[record.decision.id] = record
                 self._where.pop(record.decision.id, None)
-            elif isinstance(record, TakenLabel):
-                self._labels[record.label.decision_id] = record.label, place
+            elif isinstance(record, NewLabel):
+                self._labels[record.decision_id] = record, place
         self._unwritten.extend(records)
         self._changed.notify_all()
         return self._appended
@@ -298,7 +332,7 @@ class Outbox:
         """
         limit = self.limit if wait is None else wait
         with self._changed:
-            self._wanted, self._asked, tries = max(self._wanted, place), self._asked + 1, self._tries
+            self._wanted, tries = max(self._wanted, place), self._tries
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, limit)
             if self._synced < place:
@@ -312,8 +346,6 @@ class Outbox:
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
-        if self._journal is None:
-            return self.store.get_decision(decision_id)
         with self._changed:
             if decision_id in self._unrecorded:
                 raise StoreError(
@@ -321,12 +353,12 @@ class Outbox:
                     "verified unrecorded; decide on the part again."
                 )
             known = self._recent.get(decision_id) or self._open.get(decision_id)
-            if known is None and decision_id in self._where:
+            if known is None and self._journal is not None and decision_id in self._where:
                 record = from_bytes(self._journal.read(self._where[decision_id]))
                 known = record if isinstance(record, StoredDecision) else None
             label, place = self._labels.get(decision_id, (None, 0))
         if known is None and not self._is_new(decision_id):
-            known = self.ask(lambda: self.store.get_decision(decision_id))
+            known = self.ask(lambda: self.store.get_decision(decision_id), commit=0.0)
         if known is not None and known.source is None and label is not None and place <= self._synced:
             known = replace(known, success=label.success, source=label.source)
         return known
@@ -336,21 +368,30 @@ class Outbox:
         with self._changed:
             self._unrecorded.discard(decision_id)
             if self._taken is None and self._journal is not None and not self._learning and not self._blocked:
-                self._learning = True
-                self._put(self.know)
+                self._learning = True  # in a thread of its own: meanwhile ids are looked up one by one
+                threading.Thread(target=self._keep_learning, name="dengine-ids", daemon=True).start()
         try:
             return None if self._is_new(decision_id) else self.find(decision_id)
         except StoreError:
             self._unrecorded.add(decision_id)
             raise
 
+    def _keep_learning(self) -> None:
+        try:
+            self.know()
+        except StoreError:  # the next id tries it again
+            self._learning = False
+
     def know(self) -> None:
         """Learn which ids are taken by now, a second for a million, so that in an outage new ones are known to be new."""
-        taken = TakenIds(self.store.decision_ids())
+        if self._taken is not None:
+            return
         with self._changed:
-            for id_ in (*self._recent, *self._open, *self._where):
-                taken.add(id_)
-            self._taken = taken
+            self._made = made = TakenIds([*self._recent, *self._open, *self._where])
+        for ids in self.store.decision_ids():
+            with self._changed:
+                made.add(*ids)
+        self._taken = made
 
     def _is_new(self, decision_id: str) -> bool:
         """Whether an id is taken for certain by no decision; False where that is not known."""
@@ -379,7 +420,7 @@ class Outbox:
             if self.drained:
                 return
             place = self._appended
-            self._wanted, self._asked, self._drains = max(self._wanted, place), self._asked + 1, self._drains + 1
+            self._wanted, self._drains = max(self._wanted, place), self._drains + 1
             self._changed.notify_all()
             try:
                 if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
@@ -402,13 +443,13 @@ class Outbox:
             with suppress(StoreError):
                 self.drain()
 
-    def ask(self, work: Callable[[], T]) -> T:
-        """Call the store with the time limit; StoreError where it is away."""
-        return work() if self._journal is None else self.result(self._put(work))
+    def ask(self, work: Callable[[], T], commit: float = COMMIT) -> T:
+        """Call the store with the time limit; StoreError where it is away.  commit : seconds more that it may run."""
+        return work() if self._journal is None else self.result(self._put(work), commit)
 
-    def result(self, future: Future[T]) -> T:
+    def result(self, future: Future[T], commit: float = COMMIT) -> T:
         """What a call to the store returned. StoreError where it takes too long: it is given up, unless it commits."""
-        for wait in (self.limit, COMMIT):
+        for wait in (self.limit, commit):
             try:
                 return future.result(wait)
             except TimeoutError:
@@ -465,8 +506,7 @@ class Outbox:
             with self._changed:
                 self._changed.wait_for(lambda: self._unwritten or self._ending)
                 self._changed.wait_for(lambda: self._wanted > self._synced or self._ending, LINGER)
-                batch, asked = list(self._unwritten), self._asked
-                if not batch:
+                if not (batch := list(self._unwritten)):
                     return
                 self._sync_began = time.monotonic()
             try:
@@ -477,8 +517,7 @@ class Outbox:
                     self._changed.notify_all()
                     if self._ending:
                         return
-                    if self._asked == asked:
-                        self._changed.wait(BEAT)
+                    self._changed.wait(BEAT)
 
     def _write(self, batch: Sequence[Record]) -> None:
         journal = self._journal
@@ -545,16 +584,16 @@ class Outbox:
                 for at, _, record in found
                 if not isinstance(record, StoredDecision) or self._where.get(record.decision.id) == at
             ]
-        arrived, newest = self.store.take(records), self.store.newest_entry()
+        arrived, newest = self.store.take(records), self.store.database.newest
         with self._changed:
             journal.mark(found[-1][1], newest)
             self._arrived += arrived
             for record in records:
                 if isinstance(record, StoredDecision):
                     self._where.pop(record.decision.id, None)
-                elif isinstance(record, TakenLabel):
-                    self._labels.pop(record.label.decision_id, None)
-                    self._say(record.label)
+                elif isinstance(record, NewLabel):
+                    self._labels.pop(record.decision_id, None)
+                    self._say(record)
             for _ in range(min(n, len(self._times))):
                 self._times.popleft()
             self._drained += n
@@ -569,7 +608,7 @@ class Outbox:
         if future.cancelled():
             return
         try:
-            with self.store.committing(wanted):
+            with self.store.database.committing(wanted):
                 result = work()
         except BaseException as error:
             if wanted():

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import SettingError, StoreError, without_password
+from ..errors import SettingError, StoreError
 from ..recipe import Recipe
-from .connections import advice, make_engine
-from .schema import DECISION, LABEL, OWNER_KEY, PRODUCT_KEY, SETTING, VERSION
+from .connections import reading
+from .schema import DECISION, LABEL, PRODUCT_KEY, SETTING, VERSION
 
 EMBEDDING = ("reducer", "params", "folds", "window", "novelty")  # of a recipe: what a version's arrays were made by
 
@@ -23,7 +22,6 @@ class CellSummary:
 
     version : number of the newest accepted version that it may answer by, its product's or its own; None before the first.
     last_seen : time of its newest decision or label, in seconds.
-    owner : the engine that drives it, where the store knows one.
     """
 
     cell_id: str
@@ -32,11 +30,10 @@ class CellSummary:
     labels: int
     version: int | None
     last_seen: float | None
-    owner: str | None
 
 
 def must_agree(mine: Mapping[str, str], peer: Mapping[str, str], name: str, product: str) -> None:
-    """SettingError where two cells of a product, by what `Store.settings` gives of each, would embed a trace differently.
+    """SettingError where two cells of a product, by their settings, would embed a trace differently.
 
     name : of the peer.  A policy, a radius, a schedule or a budget may differ: a version's arrays do not depend on them.
     """
@@ -59,72 +56,37 @@ def _embedding(settings: Mapping[str, str]) -> dict[str, Any]:
     return own | {key: settings.get(key) for key in ("seed", "trace", "model", "described")}
 
 
-@contextmanager
-def _reading(url: str) -> Iterator[sa.Connection]:
-    engine = make_engine(url)
-    try:
-        with engine.connect() as connection:
-            yield connection
-    except (sa.exc.SQLAlchemyError, OSError) as error:
-        raise StoreError(
-            f"Could not read {without_password(url)}: {getattr(error, 'orig', None) or error}. {advice(error)}"
-        ) from error
-    finally:
-        engine.dispose()
-
-
-def cell_names(url: str) -> list[str]:
-    """The cells of a database, none where it holds no store; it is read and never made."""
-    with _reading(url) as connection:
-        found = sa.inspect(connection)
-        columns = found.get_columns(SETTING.name) if found.has_table(SETTING.name) else []
-        if {column["name"] for column in columns} != set(SETTING.c.keys()):
-            return []
-        return list(connection.execute(sa.select(SETTING.c.cell_id).distinct().order_by(SETTING.c.cell_id)).scalars())
-
-
 def must_have_cell(url: str, cell_id: str) -> None:
-    """StoreError for a cell that a database does not hold; a database without cells says what it is when it is opened."""
-    names: list[str] = []
-    with suppress(StoreError):
-        names = cell_names(url)
-    if names and cell_id not in names:
-        held = ", ".join(map(str, names))
+    """StoreError for a cell that a database does not hold, and for what is no store."""
+    with reading(url) as connection:
+        names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
+    if cell_id not in names:
+        held = ", ".join(names)
         raise StoreError(f"Expected a cell of this store, got {cell_id!r}; it holds {held}. Name one of them: --cell NAME.")
 
 
 def list_cells(url: str) -> list[CellSummary]:
-    """Every cell of a database, by name. StoreError where it holds none."""
-    names = cell_names(url)
-    if not names:
-        raise StoreError(
-            f"Expected a store that engines have used, {make_engine(url).url.render_as_string()} holds no cell."
-        )
-    with _reading(url) as connection:
-        settings = {(row.cell_id, row.key): row.value for row in connection.execute(sa.select(SETTING))}
-        decisions = _counts(connection, DECISION)
-        labels = _counts(connection, LABEL)
-        accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(VERSION.c.accepted == sa.true())
+    """Every cell of a database, by name. StoreError for what is no store."""
+    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(VERSION.c.accepted == sa.true())
+    with reading(url) as connection:
+        settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
+        decisions, labels = (_counts(connection, table) for table in (DECISION, LABEL))
         versions = {row[0]: row[1] for row in connection.execute(accepted.group_by(VERSION.c.cell_id))}
-    products = {name: settings.get((name, PRODUCT_KEY)) for name in names}
+    products = {cell_id: value for cell_id, key, value in settings if key == PRODUCT_KEY}
+    shared = dict[str | None, int]()  # by product, its newest version
+    for name, version in versions.items():
+        shared[products.get(name)] = max(version, shared.get(products.get(name), 0))
+    none = (0, None)
     return [
         CellSummary(
             cell_id=name,
-            product=products[name],
-            decisions=decisions.get(name, (0, None))[0],
-            labels=labels.get(name, (0, None))[0],
-            version=max(
-                (
-                    number
-                    for other, number in versions.items()
-                    if other == name or (products[name] is not None and products[name] == products.get(other))
-                ),
-                default=None,
-            ),
+            product=products.get(name),
+            decisions=decisions.get(name, none)[0],
+            labels=labels.get(name, none)[0],
+            version=(shared if name in products else versions).get(products.get(name, name)),
             last_seen=max((row[name][1] for row in (decisions, labels) if name in row), default=None),
-            owner=settings.get((name, OWNER_KEY)),
         )
-        for name in names
+        for name in sorted({row.cell_id for row in settings})
     ]
 
 

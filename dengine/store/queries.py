@@ -10,12 +10,11 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from ..records import Action, Reason
-from .records import FORGOTTEN, Key
+from ..records import ACTIONS, Action, Reason
+from .records import FORGOTTEN
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT_KEY, RESERVED, SCHEMA_KEY, SETTING, VERSION
 from .views import LABELS, HistoryFilter
 
-IN_TIME = (DECISION.c.time, DECISION.c.id)
 PRODUCT_LOCKS = 7236482515  # seed of the locks' numbers, so that they are nobody else's
 
 
@@ -34,10 +33,23 @@ class Scope:
         """Whether a row belongs to what this cell shares, by the row's cell_id; without a product its own rows."""
         return column == self.cell_id if self.product is None else column.in_(cells_of(self.product))
 
+    def cells(self, connection: sa.Connection) -> list[str]:
+        """The cells whose rows it shares, its own first."""
+        peers = connection.execute(cells_of(self.product or "")).scalars()
+        return [self.cell_id, *(cell for cell in peers if cell != self.cell_id)]
+
+    def first_label(self, connection: sa.Connection, window: int) -> int:
+        """Number of a label; the newest `window` labels that train are that one and later ones."""
+        if self.product is not None:  # by their numbers, or all would be read to be sorted
+            return (connection.execute(newest_of(self.product, LABEL.c.seq)).scalar() or 0) + 1 - 2 * window
+        train = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
+        query = sa.select(LABEL.c.seq).where(train).order_by(LABEL.c.seq.desc()).limit(1).offset(window - 1)
+        return connection.execute(query).scalar() or 1
+
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Lock the product or the cell, then number the next row of a table."""
         self.lock_cell(connection)  # always before the product, as the ledger does: else two would wait for each other
-        if self.product is None or column.table is EVENT:
+        if self.product is None or column.table in (DECISION, EVENT):
             newest: Any = sa.select(sa.func.max(column)).where(column.table.c.cell_id == self.cell_id)
         else:
             lock_product(connection, self.product)
@@ -128,9 +140,21 @@ def counted(corrected_to: int | None = None) -> sa.ColumnElement[int | None]:
     return sa.func.coalesce(_corrected(corrected_to), sa.cast(LABEL.c.success, sa.Integer))
 
 
+def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
+    """What the model alone would have done, as a position in `ACTIONS`, and `Decision.looked`."""
+    positions = {action.value: position for position, action in enumerate(ACTIONS)}
+    asked = sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0)
+    return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("looked")
+
+
 def remembered(corrected_to: int | None = None) -> sa.ColumnElement[bool]:
     """Whether a label was not forgotten."""
     return sa.func.coalesce(_corrected(corrected_to), 0) != FORGOTTEN
+
+
+def since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
+    """Rows by model versions from this one on."""
+    return sa.true() if version <= 0 else table.c.model_version >= int(version)
 
 
 SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten
@@ -155,8 +179,9 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
     return query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), remembered(corrected_to))
 
 
-def decisions_query(cell_id: str, where: HistoryFilter, beyond: Key | None, newest: bool) -> sa.Select[Any]:
-    """Decisions that are meant, the newest or the oldest first; beyond : only those before, or after, this one."""
+def decisions_query(cell_id: str, where: HistoryFilter, beyond: str | None, newest: bool) -> sa.Select[Any]:
+    """Decisions that are meant, the newest or the oldest first; beyond : only those before, or after, that id."""
+    number = DECISION.c.number
     of = ((DECISION.c.action, where.action), (DECISION.c.predicted, where.predicted), (DECISION.c.reason, where.reason))
     meant = [column == wanted.value for column, wanted in of if wanted is not None]
     if where.part is not None:
@@ -169,27 +194,40 @@ def decisions_query(cell_id: str, where: HistoryFilter, beyond: Key | None, newe
     if where.until is not None:
         meant.append(DECISION.c.time < where.until)
     if beyond is not None:
-        here, there = sa.tuple_(*IN_TIME), sa.tuple_(sa.literal(beyond[0], sa.Double), sa.literal(beyond[1]))
-        meant.append(here < there if newest else here > there)
-    return past_query(cell_id).where(*meant).order_by(*(column.desc() if newest else column for column in IN_TIME))
+        one = DECISION.alias("beyond")
+        there = sa.select(one.c.number).where(one.c.cell_id == cell_id, one.c.id == beyond).scalar_subquery()
+        meant.append(number < there if newest else number > there)
+    return past_query(cell_id).where(*meant).order_by(number.desc() if newest else number)
 
 
-def tally_query(cell_id: str, last: int | None) -> sa.Select[Any]:
-    """The newest decisions, all where it is None, counted by their kinds."""
+def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
+    """Number of a cell's newest decision."""
+    every = DECISION.alias("every")
+    return sa.select(sa.func.max(every.c.number)).where(every.c.cell_id == cell_id).scalar_subquery()
+
+
+def tally_query(cell_id: str, last: int | None, since_version: int, within: int | None) -> sa.Select[Any]:
+    """The newest decisions, all where it is None, by versions from that one on, counted by their kinds.
+
+    within : `aged` are those after which as many came.
+    """
     columns = ("cell_id", "id", "time", "action", "predicted", "reason", "audit", "quarantined")
-    newest = sa.select(*DECISION.c[columns]).where(DECISION.c.cell_id == cell_id)
+    aged = sa.false() if within is None else n_decisions(cell_id) - DECISION.c.number >= within
+    newest = sa.select(*DECISION.c[columns], aged.label("aged"))
+    newest = newest.where(DECISION.c.cell_id == cell_id, since(DECISION, since_version))
     if last is not None:
-        newest = newest.order_by(*(column.desc() for column in IN_TIME)).limit(last)
+        newest = newest.order_by(DECISION.c.number.desc()).limit(last)
     some = newest.subquery("newest")
     of = (LABEL.c.cell_id == some.c.cell_id) & (LABEL.c.decision_id == some.c.id)
-    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined"], SAID.label("success"))
-    times = (sa.func.min(some.c.time).label("first"), sa.func.max(some.c.time).label("last"))
+    kind = (*some.c["action", "predicted", "reason", "audit", "quarantined", "aged"], SAID.label("success"), LABEL.c.source)
+    least, most = sa.func.min, sa.func.max
+    times = least(some.c.time).label("first"), most(some.c.time).label("last"), most(LABEL.c.time).label("last_label")
     return sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of)).group_by(*kind)
 
 
 def stretches_query(cell_id: str, length: int) -> sa.Select[Any]:
     """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`."""
-    number = sa.func.row_number().over(order_by=IN_TIME) - 1
+    number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
     of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)

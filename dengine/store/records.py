@@ -1,16 +1,12 @@
-"""What stores take and hand back: decisions, labels, traces, versions, events; and what each checks before it takes one.
-
-A row that a database refuses is found by its writer, long after `put_decision` returned. So all that any of them refuses is
-found here, in every store alike: a replay in memory takes nothing that a cell's database would not.
-"""
+"""What stores take and hand back: decisions, labels, traces, versions, events; and how a row holds each."""
 
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from enum import StrEnum
 from functools import lru_cache
 from types import UnionType
@@ -21,28 +17,30 @@ from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
 from ..errors import ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
-from ..records import LONGEST, Action, Decision, Reason, RetrainReport, Source, as_id, as_success, is_name
+from ..records import Decision, RetrainReport, Source
 
 SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
 T = TypeVar("T")
 STATUS_EVENTS = 5  # newest ones that a status shows
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)  # what stands, and what comes: silence was no success after all
 FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
 KEEP = 5  # newest versions that keep their states
-WHOLE = ("n_success", "n_failure", "model_version")
-SHARES = ("lower", "upper", "propensity")
-NUMBER = int | float | np.integer | np.floating
-KINDS = {"action": Action, "predicted": Action, "reason": Reason}
-RULE = ("rule.", "untold", "told_to")  # beginnings of names in a version's state: what its maker's parts taught its rule
+# Beginnings of names in a version's state: what its maker's parts taught its rule.
+RULE = ("rule.", "untold", "told_to", "owed")
 OF_DECISION = ("content_hash", "quarantined", "time")  # of a `StoredDecision`, beside the decision itself
-Key = tuple[float, str]  # of a decision in its history: time and id
 
 
-def unknown_decision(decision_id: str, hint: str = "") -> ReportError:
+def _when(record: Any) -> datetime:
+    """`time` as a datetime in UTC."""
+    return datetime.fromtimestamp(record.time, UTC)
+
+
+def unknown_decision(decision_id: str) -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
     return UnknownDecisionError(
         f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's store does not hold; "
-        f"report the `Decision.id` that `decide` returned, to the same store and cell_id.{hint}"
+        f"report the `Decision.id` that `decide` returned, to the same store and cell_id."
     )
 
 
@@ -79,14 +77,6 @@ def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     return plain
 
 
-def as_hash(content_hash: int) -> int:
-    """Return a content hash as a signed 64-bit integer, which is what a database holds."""
-    value = int(content_hash)
-    if not -(2**63) <= value < 2**63:
-        raise StoreError(f"Expected a content hash of signed 64 bits, got {value}; view it as int64.")
-    return value
-
-
 def as_text(text: str) -> str:
     """Return a text for people, with escapes for what a database refuses: NUL, and half a surrogate pair."""
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
@@ -105,27 +95,13 @@ def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None)
     return copies
 
 
-def duplicate_id(decision_id: str) -> StoreError:
-    """Return the error for two decisions of one id; the first stands."""
-    return StoreError(
-        f"Expected a new decision id, got {decision_id!r}, which this cell's store holds already; "
-        "the first decision stands, give every decision an id of its own."
-    )
-
-
-def mixed_shapes(shapes: set[tuple[int, ...]]) -> StoreError:
-    """Return the error for traces or points that do not fit together."""
-    return StoreError(
-        f"Expected one shape in a cell's store, found {sorted(shapes)}; give each kind of trace a cell_id of its own."
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class NewLabel:
     """A label on its way into a store.
 
     point : (d,) where the trace joined the references of `model_version`; None where it did not.
     silent : accepted parts that went on since the previous label, and of which nothing was heard.
+    time : when it was reported, in seconds.  content_hash, decided : of its decision, and when that was.
     """
 
     decision_id: str
@@ -134,6 +110,9 @@ class NewLabel:
     model_version: int
     point: NDArray[np.float32] | None
     silent: int = 0
+    time: float = 0.0
+    content_hash: int = 0
+    decided: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +139,7 @@ class StoredDecision:
     label_seq: int | None = None
     label_time: float | None = None
 
-    @property
-    def key(self) -> Key:
-        """Its place in the history."""
-        return self.time, self.decision.id
+    when = property(_when)
 
     @property
     def label(self) -> str:
@@ -201,23 +177,6 @@ class News:
 
 
 @dataclass(frozen=True, slots=True)
-class AddedPoints:
-    """References added to a model version after its swap, in label order; points : (n, d), (0, 0) if there is none."""
-
-    seq: NDArray[np.int64]
-    points: NDArray[np.float32]
-
-    @classmethod
-    def of(cls, rows: Iterable[tuple[int, NDArray[np.float32]]]) -> AddedPoints:
-        """Stack pairs of a number and a point, (d,)."""
-        each = list(rows)
-        if len(shapes := {point.shape for _, point in each}) > 1:
-            raise mixed_shapes(shapes)
-        points = np.stack([point for _, point in each]) if each else np.zeros((0, 0), dtype=np.float32)
-        return cls(np.array([seq for seq, _ in each], dtype=np.int64), points)
-
-
-@dataclass(frozen=True, slots=True)
 class Evidence:
     """What became of decisions, in label order.
 
@@ -225,6 +184,7 @@ class Evidence:
     success : (n,) its label.
     novel : (n,) whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
     silent : (n,) accepted parts of which nothing was heard between the previous label and this one.
+    predicted : (n,) position in `Action` of what the model alone would have done.  looked : (n,) as `Decision.looked`.
     """
 
     seq: NDArray[np.int64]
@@ -233,12 +193,14 @@ class Evidence:
     success: NDArray[np.bool_]
     novel: NDArray[np.bool_]
     silent: NDArray[np.int64]
+    predicted: NDArray[np.int64]
+    looked: NDArray[np.float64]
 
     @classmethod
     def of(cls, rows: Iterable[tuple[Any, ...]]) -> Evidence:
-        """Stack rows of (seq, lower, upper, success, novel, silent)."""
+        """Stack rows of (seq, lower, upper, success, novel, silent, predicted, looked)."""
         columns = zip(*rows, strict=True)
-        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64)
+        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64, np.int64, np.float64)
         arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
         return cls(*arrays)
 
@@ -256,6 +218,8 @@ class Event:
     text: str
     data: dict[str, Any] | None = None
     author: str = ""
+
+    when = property(_when)
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,14 +321,23 @@ def to_row(record: Any, *names: str) -> dict[str, Any]:
 
 
 def from_row(kind: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
-    """The record that `to_row` wrote; a row may hold more, and lack what is given or has a default."""
-    said = {name: _read(row[name], each) for name, (each, _) in columns(kind).items() if name in row and name not in given}
-    return kind(**said, **given)
+    """The record that `to_row` wrote; a row may hold more, and lack what is given or has a default.
+
+    Raises StoreError for what was not written so.
+    """
+    wanted = {name: each for name, (each, _) in columns(kind).items() if name in row and name not in given}
+    try:
+        return kind(**{name: _read(row[name], each) for name, each in wanted.items()}, **given)
+    except (ValueError, TypeError) as error:
+        raise StoreError(
+            f"Expected a row of {getattr(kind, '__name__', kind)} as it was written, got another: {error}; "
+            "see `dengine verify`, and restore the store from a copy."
+        ) from error
 
 
 def _written(value: Any, kind: type) -> Any:
-    if value is None or kind is str:
-        return value
+    if value is None:
+        return None
     if issubclass(kind, StrEnum):
         return kind(value).value
     writers: dict[type, Callable[[Any], Any]] = {tuple: _as_json, dict: _as_json, np.ndarray: pack}
@@ -394,31 +367,6 @@ def unpack(blob: bytes) -> NDArray[np.float32]:
     return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 
-def checked_label(label: NewLabel) -> NewLabel:
-    """Return a label in the store's own types, with a point of its own."""
-    name, success, silent = as_id(label.decision_id), as_success(label.success), int(label.silent)
-    point = None if label.point is None else np.array(label.point, dtype=np.float32, order="C")
-    if point is not None and point.ndim != 1:
-        raise StoreError(f"Expected a point of shape (d,), got {point.shape}; flatten it before it is stored.")
-    if silent < -1:  # -1: the label is of one of them
-        raise StoreError(f"Expected a count of parts that went on in silence, -1 or more, got {silent}; count from 0.")
-    return NewLabel(name, success, label.source, int(label.model_version), point, silent)
-
-
-def refuse_repeats(
-    labels: Sequence[NewLabel], known: Collection[str], said: Mapping[str, tuple[bool, Source]], hint: str = ""
-) -> None:
-    """Raise a ReportError for the first label whose decision is not `known`, or was reported: in `said`, or before it."""
-    reported = dict(said)
-    for label in labels:
-        if label.decision_id not in known:
-            raise unknown_decision(label.decision_id, hint)
-        first, now = reported.get(label.decision_id), (label.success, label.source)
-        if first is not None:
-            raise already_reported(label.decision_id, first, now)
-        reported[label.decision_id] = now
-
-
 def as_label(counted: int | None) -> bool | None:
     """Return a label as it counts; None where there is none, or where it is forgotten."""
     return None if counted in (None, FORGOTTEN) else bool(counted)
@@ -443,6 +391,8 @@ class StoredVersion:
     n_bytes: int = 0
     kept: bool = False
 
+    when = property(_when)
+
 
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     """Say whether a version keeps its state: the first, the `keep` newest (None: all), and of older ones ever fewer.
@@ -465,46 +415,3 @@ def not_kept(version: int, kept: Collection[int]) -> VersionError:
     return VersionError(
         f"Expected a version whose state is held, got {version}, which is not kept; load one of these: {others}."
     )
-
-
-def checked_decision(
-    decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool, time: float
-) -> StoredDecision:
-    """A decision on its way into a store, with a copy of its trace. StoreError for what no database can hold."""
-    check_decision(decision)
-    if not math.isfinite(time):
-        raise StoreError(f"Expected the time of a decision in seconds, got {time}; look at the store's clock.")
-    copy = np.array(trace, dtype=np.float32, order="C", ndmin=2)  # the caller's buffer may change afterwards
-    if copy.ndim != 2:
-        raise StoreError(f"Expected a trace of shape (C, T), got {copy.shape}; store one trace at a time.")
-    return StoredDecision(decision, copy, as_hash(content_hash), bool(quarantined), time)
-
-
-def check_decision(decision: Decision) -> None:
-    """StoreError for the first field of a decision that a database could not hold, or hand back as it was."""
-    _must(is_name(decision.id), f"an id of 1 to {LONGEST} characters that print", decision.id)
-    for name, kind in KINDS.items():
-        _must(isinstance(getattr(decision, name), kind), f"{name} as {kind.__name__}", getattr(decision, name))
-    for name in WHOLE:
-        count = getattr(decision, name)
-        whole = isinstance(count, int | np.integer) and not isinstance(count, bool) and bool(0 <= count < 2**63)
-        _must(whole, f"{name} as a whole number from 0 to below 2**63", count)
-    for name in SHARES:
-        share = getattr(decision, name)
-        _must(isinstance(share, NUMBER) and bool(0.0 <= share <= 1.0), f"{name} as a number from 0 to 1", share)  # no NaN
-    part = decision.part
-    if part is not None and (not isinstance(part, str) or len(part) > LONGEST or part != as_text(part)):
-        raise StoreError(
-            f"Expected a part's number as plain text of at most {LONGEST} characters, or None, got {shortened(part)}; "
-            "strip what a scanner added."
-        )
-    _must(isinstance(decision.audit, bool | np.bool_), "audit as True or False", decision.audit)
-    points: Any = () if decision.embedding is None else decision.embedding
-    rows = isinstance(points, tuple | list) and all(isinstance(point, tuple | list) for point in points)
-    plain = rows and all(isinstance(each, NUMBER) and not isinstance(each, bool) for point in points for each in point)
-    _must(plain, "an embedding of numbers, (K, d), or None", decision.embedding)
-
-
-def _must(fits: bool, what: str, found: Any) -> None:
-    if not fits:
-        raise StoreError(f"Expected a decision with {what}, got {shortened(found)}; nothing was stored.")

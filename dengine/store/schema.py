@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..errors import DataError, StoreError
 from ..files import read_archive
 from ..records import Decision, RetrainReport
-from .journal import TakenLabel
 from .records import (
     NO_TRACE,
     OF_DECISION,
@@ -33,8 +32,8 @@ from .records import (
 SCHEMA = "1"
 SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
 PRODUCT_KEY = "product"  # a row of `setting` for every cell that shares what it learns
-OWNER_KEY = "owner"  # a row of `setting` for every cell that an engine drives, where the store keeps one
-RESERVED = (SCHEMA_KEY, PRODUCT_KEY, OWNER_KEY)  # rows of `setting` that are the store's own
+LEDGER_KEY = "ledger_key"  # a row of `setting` for every cell whose ledger is keyed: what tells its key from others
+RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)  # rows of `setting` that are the store's own
 CHUNK = 500  # rows sent or fetched at a time
 
 METADATA = sa.MetaData()
@@ -82,7 +81,9 @@ DECISION = _table(
     "decision",
     *_columns(Decision, key="id"),
     *_columns(StoredDecision, *OF_DECISION),
-    sa.Index("decision_time", "cell_id", "time", "id"),
+    sa.Column("number", sa.BigInteger, nullable=False),  # 1, 2, ... in each cell, in their order: a clock may be set back
+    sa.Index("decision_number", "cell_id", "number", unique=True),
+    sa.Index("decision_time", "cell_id", "time"),
 )
 TRACE = _table(  # apart from `decision`, so that counting decisions does not read traces
     "trace",
@@ -95,7 +96,7 @@ LABEL = _table(
     "label",
     *_columns(NewLabel, key="decision_id"),
     sa.Column("seq", sa.BigInteger, nullable=False),
-    *_columns(StoredDecision, *OF_DECISION),  # the time is the label's; the others repeat `decision`, for the index
+    *_columns(StoredDecision, "quarantined"),  # as of `decision`, for the index
     sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
     sa.Index("label_training", "cell_id", "quarantined", "seq"),
 )
@@ -123,8 +124,10 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
     sa.Column("number", sa.BigInteger, primary_key=True, autoincrement=False),  # 1, 2, ... in each cell
     sa.Column("time", sa.Double, nullable=False),
     sa.Column("added", sa.Text, nullable=False),  # JSON: how many rows of each table
+    sa.Column("rows", sa.LargeBinary, nullable=False),  # of these rows' sums: `rows_digest`
+    sa.Column("held", sa.Text, nullable=False),  # JSON: the chain of all rows so far of each table that is in force
     sa.Column("settings", sa.Text),  # JSON: all settings, where they changed
-    sa.Column("digest", sa.LargeBinary, nullable=False),  # SHA-256 over the one before and this entry's rows
+    sa.Column("digest", sa.LargeBinary, nullable=False),  # over the entry before and this one: `entry_digest`
 )
 
 
@@ -154,7 +157,7 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         for table in inspector.get_table_names()
     }
     if found.get(SETTING.name) != set(SETTING.c.keys()):
-        held = "tables of another program: " + ", ".join(sorted(found))
+        held = f"tables of another program: {', '.join(sorted(found)) or 'none'}"
     else:
         query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
         held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
@@ -208,9 +211,3 @@ def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
         return read_archive(blob, name=f"a version in {name}")[0]
     except DataError as error:
         raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error
-
-
-def label_row(cell_id: str, taken: TakenLabel, seq: int, of: Any) -> dict[str, Any]:
-    """The row of the table `label`; of : the row of its decision, of which some columns are repeated."""
-    repeated = {"content_hash": of.content_hash, "quarantined": of.quarantined}
-    return {"cell_id": cell_id, "seq": seq, "time": taken.time, **repeated, **to_row(taken.label)}

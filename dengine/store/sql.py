@@ -9,23 +9,23 @@ what it decides: that goes into a journal first, and from there, by `take`, into
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from ..errors import StoreError, shortened
-from ..records import Action, Decision, Reason, RetrainReport, Source
-from .base import Store
+from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
-from .journal import Journal, Record, TakenLabel, journal_path
-from .ledger import is_sound, state_sum
+from .journal import Journal, Record, journal_path
+from .ledger import held_settings, is_sound, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
@@ -34,10 +34,13 @@ from .queries import (
     cells_of,
     counted,
     decisions_query,
+    how_looked,
     lock_product,
+    n_decisions,
     newest_of,
     past_query,
     remembered,
+    since,
     stretches_query,
     tally_query,
     training_query,
@@ -45,12 +48,10 @@ from .queries import (
 from .records import (
     KEEP,
     STATUS_EVENTS,
-    AddedPoints,
     Change,
     Correction,
     Event,
     Evidence,
-    Key,
     Labelled,
     ModelVersion,
     NewLabel,
@@ -63,15 +64,10 @@ from .records import (
     as_label,
     as_text,
     check_state,
-    checked_decision,
-    checked_label,
-    duplicate_id,
     from_row,
     keeps_state,
-    mixed_shapes,
     not_kept,
     nothing_to_correct,
-    refuse_repeats,
     to_row,
     unknown_decision,
     unpack,
@@ -87,12 +83,11 @@ from .schema import (
     SETTING,
     TRACE,
     VERSION,
-    chunks,
     from_npz,
     read_decision,
     to_npz,
 )
-from .views import HistoryFilter, Kind, PastLabel, Stretch, Tally, count_outcomes, summary
+from .views import HistoryFilter, Kind, PastLabel, Stretch, Tally
 
 if TYPE_CHECKING:
     from .verification import HistoryReport
@@ -103,14 +98,15 @@ NAMED = 20  # decisions that an event names
 REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
 
-class SqlStore(Store):
-    """The contract of `Store` in a database.
+class SqlStore:
+    """What an engine needs of its memory, in a database. Everything belongs to one cell.
 
-    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL.
+    url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for replays and trials.
     cell_id : whose rows these are; several cells share one database without seeing each other.
     clock : the time in seconds that rows are stamped with.
-    product : what the cell makes; cells of one product share labels and versions. None: as a known cell has it, or
-        nothing is shared.
+    product : what the cell makes. None: as a known cell has it, or it shares nothing. Else labels as traces to train on,
+        and versions, are those of all its cells: `labelled`, `last_version`, `versions`, `retrains`, `corrections`,
+        and the numbers of both. What became of decisions stays the cell's own.
     wait : seconds that a cell's engine waits for its disk, and for the database, at most. None: as the environment's
         DENGINE_STORE_WAIT says, or 0.4.
     keep_versions : newest model versions that keep their states, beside the first and a few older ones (`keeps_state`);
@@ -118,11 +114,13 @@ class SqlStore(Store):
 
     SQLite runs in WAL mode with synchronous=FULL; WAL needs a local disk, not a network drive. Two processes may open one
     cell: label numbers stay unique and increasing. Engines own their cell (`own`): a second one is refused.
+    before_use : called before each use of it but `take`, so that it sees what is on its way into it.
+    In memory it has no journal, nobody owns it, `close` leaves it as it is, and one thread at a time may use it.
     """
 
     def __init__(
         self,
-        url: str,
+        url: str | None = None,
         cell_id: str = "cell",
         clock: Callable[[], float] = time.time,
         *,
@@ -139,23 +137,28 @@ class SqlStore(Store):
                 f"Expected keep_versions of 2 or more, or None for all, got {keep_versions!r}; leave it at {KEEP}."
             )
         self.keep_versions = keep_versions
-        self.wait: float | None = _checked_wait(wait)
+        self.wait = None if url is None else _checked_wait(wait)
         self.clock = clock
-        self.before_use: Callable[[], None] = lambda: None
-        self._database = Database(str(url), cell_id, clock, product, lambda: self.before_use())
-        self._read, self._scope = self._database.read, self._database.scope
+        self.before_use: Callable[[], None] = self._write_waiting
+        self._waiting: list[Record] = []  # in memory: taken, and not written yet
+        self._held: dict[str, bool] = {}  # in memory: all decisions, and whether they have labels
+        self._labels = 0  # in memory: number of the newest one
+        self.database = Database(url if url is None else str(url), cell_id, clock, product, lambda: self.before_use())
+        self._read, self._scope = self.database.read, self.database.scope
         self.product = self._scope.product
-        self._remote = self._database.url.get_backend_name() != "sqlite"
+        self._remote = self.database.url.get_backend_name() != "sqlite"
         self._journal: Journal | None = None
 
     # Settings
 
     def settings(self) -> dict[str, str]:
-        query = sa.select(SETTING).where(SETTING.c.cell_id == self.cell_id, SETTING.c.key.not_in(RESERVED))
-        return {row.key: row.value for row in self._read(query)}
+        """What `save_settings` was given; {} for a new store."""
+        with self.database.transaction(write=False) as connection:
+            return held_settings(connection, self.cell_id)
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
-        self._database.write(lambda connection: self._settle(connection, settings))
+        """Replace the settings by these."""
+        self.database.write(lambda connection: self._settle(connection, settings))
 
     def _settle(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
         """Replace the settings. SettingError where a peer embeds otherwise: the product stays locked until the commit."""
@@ -173,69 +176,52 @@ class SqlStore(Store):
             connection.execute(sa.insert(SETTING), rows)
 
     def peers_settings(self) -> dict[str, dict[str, str]]:
+        """Return the settings of the product's other cells, by cell."""
         if self.product is None:
             return {}
-        with self._database.transaction(write=False) as connection:
+        with self.database.transaction(write=False) as connection:
             return self._peers_of(connection, self.product)
 
     def _peers_of(self, connection: sa.Connection, product: str) -> dict[str, dict[str, str]]:
-        query = sa.select(SETTING).where(SETTING.c.cell_id.in_(cells_of(product)), SETTING.c.cell_id != self.cell_id)
-        found: dict[str, dict[str, str]] = {}
-        for row in connection.execute(query.where(SETTING.c.key.not_in(RESERVED)).order_by(SETTING.c.cell_id)):
-            found.setdefault(row.cell_id, {})[row.key] = row.value
-        return found
+        query = cells_of(product).where(SETTING.c.cell_id != self.cell_id).order_by(SETTING.c.cell_id)
+        names = connection.execute(query).scalars().all()
+        return {name: held for name in names if (held := held_settings(connection, name))}
 
     # Decisions
 
-    def put_decision(self, decision: Decision, trace: NDArray[np.float32], content_hash: int, quarantined: bool) -> None:
-        item = checked_decision(decision, trace, content_hash, quarantined, self.clock())
-
-        def add(connection: sa.Connection) -> None:
-            if self._database.held(connection, [decision.id]):
-                raise duplicate_id(decision.id)
-            self._database.insert(connection, [item])
-
-        self._database.write(add)
-
     def flush(self) -> None:
-        self._database.check_open()
+        """Return when all that is on its way into it is there, as far as it comes in time."""
+        self.database.check_open()
         self.before_use()
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
+        """Return the decision; None where it is unknown.
+
+        trace : with it; StoreError where it is not as it was stored.
+        """
         if not trace:
             rows = self._read(past_query(self.cell_id).where(DECISION.c.id == decision_id))
             return read_decision(rows[0]) if rows else None
         same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
         stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
         query = past_query(self.cell_id).add_columns(*TRACE.c["channels", "samples", "data"], *stored)
-        rows = self._read(query.join(TRACE, same).where(DECISION.c.id == decision_id))
+        rows = self._read(query.outerjoin(TRACE, same).where(DECISION.c.id == decision_id))
         if not rows:
             return None
         row = rows[0]
         values = {"cell_id": row.cell_id, "decision_id": row.id, "channels": row.channels, "samples": row.samples}
         if not is_sound(TRACE.name, values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
             raise StoreError(
-                f"Expected the trace of decision {row.id!r} as it was stored in {self._database.name}, its bytes have "
+                f"Expected the trace of decision {row.id!r} as it was stored in {self.database.name}, its bytes have "
                 "changed; see `dengine verify`, and restore the store from a copy."
             )
         return read_decision(row)
 
-    def decision_ids(self) -> list[str]:
-        return [row.id for row in self._read(sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id))]
-
-    # Labels
-
-    def put_labels(self, labels: Sequence[NewLabel]) -> NDArray[np.int64]:
-        given, now = [checked_label(label) for label in labels], self.clock()
-
-        def add(connection: sa.Connection) -> list[int]:
-            held = self._database.held(connection, [label.decision_id for label in given])
-            said = {name: (row.success, Source(row.source)) for name, row in held.items() if row.source is not None}
-            refuse_repeats(given, held, said)
-            taken = [TakenLabel(each, now, 0, 0.0) for each in given]
-            return self._database.insert_labels(connection, taken, held)
-
-        return np.array(self._database.write(add), dtype=np.int64)
+    def decision_ids(self) -> Iterator[Sequence[str]]:
+        """Yield the ids of every decision, in any order and in pieces, so that others have their turns."""
+        query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
+        with self.database.transaction(write=False) as connection:
+            yield from connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
 
     # Training
 
@@ -248,11 +234,18 @@ class SqlStore(Store):
         corrected_to: int | None = None,
         own: bool = False,
     ) -> Labelled:
+        """Return the newest `limit` labelled traces, all where it is None, with their labels as they count.
+
+        first, last : sequence numbers between which they lie.
+        corrected_to : number of the last correction that counts, for labels as they stood then; None: all do.
+        own : of this cell alone, where others share its product.
+        A trace that is not as it was stored is left out; an event names its decision.
+        """
         scope = Scope(self.cell_id) if own else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
         query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
         query = query if last is None else query.where(LABEL.c.seq <= last)
-        with self._database.transaction(write=False) as connection:
+        with self.database.transaction(write=False) as connection:
             rows = self._newest(connection, query, limit, last)[::-1]
             found, damaged = self._with_traces(connection, rows, scope)
         return self._told_of(damaged, found)
@@ -270,8 +263,9 @@ class SqlStore(Store):
         return connection.execute(query).all()  # more than every second is quarantined or forgotten
 
     def news_since(self, seq: int, limit: int) -> News:
+        """Return the labels after `seq`, at most `limit`, and the numbers of the newest version and correction."""
         query = training_query(self._scope).where(LABEL.c.seq > int(seq)).order_by(LABEL.c.seq).limit(limit)
-        with self._database.transaction(write=False) as connection:
+        with self.database.transaction(write=False) as connection:
             found, damaged = self._with_traces(connection, connection.execute(query).all(), self._scope)
             version = correction = 0
             if self.product is not None:
@@ -294,7 +288,10 @@ class SqlStore(Store):
             if not kept.any():
                 traces = np.empty((len(rows), row.channels, row.samples), dtype=np.float32)
             if (row.channels, row.samples) != traces.shape[1:]:
-                raise mixed_shapes({traces.shape[1:], (row.channels, row.samples)})
+                shapes = sorted({traces.shape[1:], (row.channels, row.samples)})
+                raise StoreError(
+                    f"Expected one shape in a cell's store, found {shapes}; give each kind a cell_id of its own."
+                )
             traces[at[row.seq]], kept[at[row.seq]] = unpack(row.data).reshape(row.channels, row.samples), True
         labels = [row.success for row in rows]
         if not all(label in (0, 1) for label in labels):
@@ -315,11 +312,6 @@ class SqlStore(Store):
             self._note("damaged", f"left out of training, since the trace is not as it was stored: {what}")
         return found
 
-    def points_since(self, seq: int, model_version: int) -> AddedPoints:
-        mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.seq > int(seq)) & LABEL.c.point.is_not(None)
-        query = sa.select(*LABEL.c["seq", "point"]).where(mine, LABEL.c.model_version == int(model_version))
-        return AddedPoints.of((row.seq, unpack(row.point)) for row in self._read(query.order_by(LABEL.c.seq)))
-
     # What became of decisions
 
     def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
@@ -328,63 +320,80 @@ class SqlStore(Store):
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], counted(), DECISION.c.reason, LABEL.c.silent)
+        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], counted(), DECISION.c.reason, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
         query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, remembered())
-        rows = self._read(query.where(_since(DECISION, since_version)).order_by(LABEL.c.seq))
-        return Evidence.of((*row[:4], row.reason == Reason.NOVEL, row.silent) for row in rows)
+        rows = self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq))
+        return Evidence.of((*row[:4], row.reason == Reason.NOVEL, *row[5:]) for row in rows)
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
+        """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
         mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
         query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        # In the order of insertion, whatever the clock said: rows never change. PostgreSQL may fill an earlier page again.
-        names = ("decision.entry", "decision.ctid") if self._remote else ("decision.rowid",)
-        inserted = query.where(_since(DECISION, since_version)).order_by(*map(sa.literal_column, names))
-        return [row.id for row in self._read(inserted)]
+        return [row.id for row in self._read(query.where(since(DECISION, since_version)).order_by(DECISION.c.number))]
+
+    def _owed(self) -> sa.ColumnElement[bool]:
+        """Whether a decision asked for a check of which nothing was reported."""
+        return (DECISION.c.action == Action.VERIFY.value) & LABEL.c.seq.is_(None) & (DECISION.c.quarantined == sa.false())
+
+    def owed(self, since_version: int = 0) -> list[tuple[StoredDecision, int]]:
+        """Return the decisions whose checks were not reported, oldest first, and how many came since each."""
+        newer = (n_decisions(self.cell_id) - DECISION.c.number).label("newer")
+        query = past_query(self.cell_id).add_columns(newer).where(self._owed(), since(DECISION, since_version))
+        return [(read_decision(row), int(row.newer)) for row in self._read(query.order_by(DECISION.c.number))]
 
     def silent_total(self, since_version: int = 0) -> int:
+        """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(self._read(query.where(mine, _since(LABEL, since_version)))[0][0])
+        return int(self._read(query.where(mine, since(LABEL, since_version)))[0][0])
 
-    def outcomes(self, since_version: int = 0) -> Outcomes:
-        kind = (*DECISION.c["action", "predicted", "audit"], counted().label("success"))
-        certain = ((DECISION.c.action != Action.VERIFY.value) | DECISION.c.audit) & _since(DECISION, since_version)
-        mine = DECISION.c.cell_id == self.cell_id
-        each = sa.select(*kind).select_from(WITH_LABELS).where(mine, certain).subquery()
-        rows = self._read(sa.select(*each.c, sa.func.count()).group_by(*each.c))
-        return count_outcomes(tuple(row) for row in rows)
+    def outcomes(self, since_version: int = 0, within: int | None = None) -> Outcomes:
+        """Count what became of what the model was certain of.
+
+        within : decisions after which an audit that was not reported is overdue; None: none is.
+        """
+        return self.tally(since_version=since_version, within=within).outcomes
 
     def status(self) -> dict[str, Any]:
-        kind = DECISION.c["action", "reason", "quarantined"]
-        times = (sa.func.min(DECISION.c.time).label("first"), sa.func.max(DECISION.c.time).label("last"))
-        query = sa.select(*kind, sa.func.count(), *times).where(DECISION.c.cell_id == self.cell_id)
-        kinds = self._read(query.group_by(*kind))
-        query = sa.select(LABEL.c.source, sa.func.count().label("n"), sa.func.max(LABEL.c.time).label("last"))
-        sources = self._read(query.where(LABEL.c.cell_id == self.cell_id, remembered()).group_by(LABEL.c.source))
-        later = CORRECTION.alias("later")
-        newer = (later.c.cell_id == CORRECTION.c.cell_id) & (later.c.decision_id == CORRECTION.c.decision_id)
-        newest = ~sa.exists().where(newer, later.c.number > CORRECTION.c.number)
-        query = sa.select(CORRECTION.c.success, sa.func.count()).where(CORRECTION.c.cell_id == self.cell_id, newest)
-        said = self._read(query.group_by(CORRECTION.c.success))
-        return summary(
-            self.cell_id,
-            [(row[0], row[1], row[2], row[3]) for row in kinds],
-            {row.source: row.n for row in sources},
-            self.retrains(),
-            (min((row.first for row in kinds), default=None), max((row.last for row in kinds), default=None)),
-            max((row.last for row in sources), default=None),
-            self.events(STATUS_EVENTS),
-            self._database.failures,
-            corrected=sum(n for success, n in said if success is not None),
-            forgotten=sum(n for success, n in said if success is None),
-        ) | ({} if self.product is None else {"product": self.product})
+        """Count decisions, labels and versions; show the newest events."""
+        every, retrains = self.tally(), self.retrains()
+        actions, reasons = every.by("action"), every.by("reason")
+        sources: Counter[Any] = Counter()
+        for kind in every.kinds:
+            sources[kind.source] += kind.n if kind.success is not None else 0
+        versions, forgotten = [report.version for report in retrains if report.accepted], every.by("label")["forgotten"]
+        corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct())).where(
+            CORRECTION.c.cell_id == self.cell_id
+        )
+        return {
+            "cell_id": self.cell_id,
+            "decisions": every.count(),
+            "actions": {action.value: actions[action] for action in Action},
+            "reasons": {reason.value: reasons[reason] for reason in Reason},
+            "quarantined": every.by("quarantined")[True],
+            "labels": sources.total(),
+            "sources": {source.value: sources[source] for source in Source},
+            "corrected": self._read(corrected)[0][0] - forgotten,
+            "forgotten": forgotten,
+            "retrains": len(retrains),
+            "versions": len(versions),
+            "last_version": versions[-1] if versions else None,
+            "first_time": every.first,
+            "last_time": every.last,
+            "last_label_time": every.last_label,
+            "events": [{"kind": each.kind, "text": each.text, "time": each.time} for each in self.events(STATUS_EVENTS)],
+        } | ({} if self.product is None else {"product": self.product})
 
     # Model versions
 
     def put_version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> int:
+        """Record a retrain; a dropped candidate has no state. Returns the version's number.
+
+        That is the report's, but where cells share versions and a peer's was stored meanwhile: then the next.
+        """
         row = self._version_row(report, last_seq, state, self.clock())
-        return self._database.write(lambda connection: self._add_version(connection, row))
+        return self.database.write(lambda connection: self._add_version(connection, row), settled=False)
 
     def _version_row(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None, now: float
@@ -413,6 +422,7 @@ class SqlStore(Store):
         return query.order_by(VERSION.c.retrain.desc())
 
     def last_version(self) -> ModelVersion | None:
+        """Return the newest accepted version; of a damaged one an event tells, and the one before it is returned."""
         for i, row in enumerate(self._read(self._accepted())):
             if not row.kept and i > 0:
                 continue  # thinned out, which the newest never is
@@ -423,6 +433,7 @@ class SqlStore(Store):
         return None
 
     def load_version(self, version: int) -> ModelVersion:
+        """Return an accepted version by its number. VersionError, naming those that can be loaded, where it cannot."""
         held = {row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept}
         if version not in held:
             raise not_kept(version, held)
@@ -434,11 +445,11 @@ class SqlStore(Store):
         row = self._read(query.where(mine))[0]
         if row.state is None or (row.state_sum is not None and state_sum(row.state) != row.state_sum):
             raise VersionError(
-                f"Expected the state of version {row.version} as it was stored in {self._database.name}, "
+                f"Expected the state of version {row.version} as it was stored in {self.database.name}, "
                 "its bytes have changed; restore the store from a copy."
             )
         try:
-            state = from_npz(row.state, self._database.name)
+            state = from_npz(row.state, self.database.name)
         except StoreError as error:
             raise VersionError(str(error)) from error
         if row.cell_id != self.cell_id:  # what a peer's parts taught its rule says nothing certain of this cell
@@ -446,6 +457,10 @@ class SqlStore(Store):
         return ModelVersion(row.version, row.last_seq, state)
 
     def versions(self, own: bool = False) -> list[StoredVersion]:
+        """Return every retrain, oldest first: its number, time, report, and whether its state is kept.
+
+        own : this cell's alone.
+        """
         size = sa.func.length(VERSION.c.state).label("size")
         columns = (*VERSION.c["retrain", "time", "last_seq"], size, *VERSION.c[REPORT])
         mine = VERSION.c.cell_id == self.cell_id if own else self._scope.shared(VERSION.c.cell_id)
@@ -455,7 +470,18 @@ class SqlStore(Store):
             for row in rows
         ]
 
+    def retrains(self) -> list[RetrainReport]:
+        """Return every retrain, oldest first."""
+        return [each.report for each in self.versions()]
+
     # Events and corrections
+
+    def put_event(self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = "") -> None:
+        """Commit what happened, in a word and for people to read, to the cell's log.
+
+        data : the same for machines, as JSON has it.  author : who did it; "" for the engine itself.
+        """
+        self.record(Change(kind, text, data, author))
 
     def _note(self, kind: str, text: str) -> None:
         """Commit an event, unless one of these very words is there."""
@@ -464,10 +490,15 @@ class SqlStore(Store):
             self.put_event(kind, text)
 
     def events(self, limit: int | None = None) -> list[Event]:
+        """Return the newest `limit` events, all where it is None; oldest first."""
         query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number.desc()).limit(limit)
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def record(self, change: Change) -> int:
+        """Commit what a person changed, all or none, together with its event; returns the event's number.
+
+        Raises ReportError for a decision that is unknown or has no label.
+        """
         now, author = self.clock(), as_text(change.author)
         said = Event(0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         version = None if change.version is None else self._version_row(*change.version, now)
@@ -486,26 +517,20 @@ class SqlStore(Store):
                 self._settle(connection, change.settings)
             return number
 
-        return self._database.write(add)
+        return self.database.write(add)
 
     def _correct(self, connection: sa.Connection, change: Change, event: Mapping[str, Any]) -> None:
-        held = self._database.held(connection, change.decisions)
+        held = self.database.held(connection, change.decisions)
         for name in change.decisions:
             if name not in held:
                 raise unknown_decision(name)
             if held[name].counted is None:
                 raise nothing_to_correct(name)
-        first = self._scope.next_number(connection, CORRECTION.c.number)
-        newest = self._scope.next_number(connection, LABEL.c.seq) - 1
-        said = {**event, "cell_id": self.cell_id, "success": change.success, "newest_seq": newest}
-        rows = [
-            said | {"number": number, "decision_id": name, "was": as_label(held[name].counted)}
-            for number, name in enumerate(change.decisions, first)
-        ]
-        for part in chunks(rows):
-            connection.execute(sa.insert(CORRECTION), part)
+        was = {name: as_label(held[name].counted) for name in change.decisions}
+        self.database.insert_corrections(connection, {**event, "success": change.success}, was)
 
     def corrections(self, after: int = 0) -> list[Correction]:
+        """Return the corrections after number `after`, oldest first."""
         own = ("number", "time", "decision_id", "success", "was", "author", "event", "newest_seq")
         same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
         query = sa.select(*CORRECTION.c[own], LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
@@ -515,26 +540,37 @@ class SqlStore(Store):
     # Looking back
 
     def decisions(
-        self, where: HistoryFilter, limit: int, beyond: Key | None = None, newest: bool = True
+        self, where: HistoryFilter, limit: int, beyond: str | None = None, newest: bool = True
     ) -> list[StoredDecision]:
+        """Return the newest (or oldest) `limit` decisions that are meant, oldest first.
+
+        beyond : only those before (or after) the one of this id: the next page. Their order is that of the decisions,
+        whatever the clock said.
+        """
         rows = self._read(decisions_query(self.cell_id, where, beyond, newest).limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
-        of_label = [column for column in LABEL.c if column.name != "point"]
-        point = LABEL.c.point if points else sa.null().label("point")
-        decided = (DECISION.c.time.label("decided"), *DECISION.c["lower", "upper", "reason"])
-        query = sa.select(*of_label, point, *decided).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+        """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
+        columns: list[Any] = [column for column in LABEL.c if points or column.name != "point"]
+        columns += [*DECISION.c["lower", "upper", "reason"], *how_looked(), *([] if points else [sa.null().label("point")])]
+        query = sa.select(*columns).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 
-    def tally(self, last: int | None = None) -> Tally:
-        rows = self._read(tally_query(self.cell_id, last))
+    def tally(self, last: int | None = None, since_version: int = 0, within: int | None = None) -> Tally:
+        """Count the newest `last` decisions, all where it is None; since_version : by versions from that one on.
+
+        within : decisions after which one that asked for a check, and got none, is overdue; None: none is.
+        """
+        rows = self._read(tally_query(self.cell_id, last, since_version, within))
+        first, newest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
-        return Tally(kinds, min((r.first for r in rows), default=None), max((r.last for r in rows), default=None))
+        return Tally(kinds, min(first, default=None), max(newest, default=None), max(label, default=None))
 
     def stretches(self, n: int) -> list[Stretch]:
+        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
         every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
         rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n))))
         return [Stretch(int(row[0]), float(row[1]), *(int(each) for each in row[2:])) for row in rows]
@@ -543,43 +579,73 @@ class SqlStore(Store):
         """Check this cell's history against its ledger. See `verify_history`."""
         from .verification import verify_history
 
-        return verify_history(self._database.url.render_as_string(hide_password=False), self.cell_id, expect)
+        return verify_history(self.database.url.render_as_string(hide_password=False), self.cell_id, expect)
 
     # The one engine that owns the cell
 
-    def own(self) -> Journal:
-        journal = Journal(journal_path(self._database.url, self.cell_id))
+    def own(self) -> Journal | None:
+        """Claim the cell for one engine; its journal, None where there is none. StoreError where another engine has it."""
+        if self.wait is None:
+            return None
+        journal = Journal(journal_path(self.database.url, self.cell_id))
         try:
             if self._remote:
-                self._database.lease()
+                self.database.lease()
         except StoreError:
             journal.close()
             raise
         self._journal = journal
         return journal
 
-    def newest_entry(self) -> tuple[int, str] | None:
-        return self._database.newest_entry()
-
-    def holds_entry(self, number: int, digest: str) -> bool:
-        return self._database.holds_entry(number, digest)
-
-    def doubt(self) -> str:
-        return self._database.doubt()
-
     def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        return self._database.take(records)
+        """Commit what a journal holds, all or none; returns the numbers of its labels by their decisions.
 
-    def committing(self, wanted: Callable[[], bool]) -> AbstractContextManager[None]:
-        return self._database.committing(wanted)
+        What is there already, and is the same, counts as taken. Another decision of the same id, a label on that, or a
+        second label becomes an event, "dead letter": it is never guessed which one is right.
+        """
+        if self.wait is not None:
+            return self.database.take(records)
+        if len(records) == 1 and isinstance(one := records[0], StoredDecision) and one.decision.id not in self._held:
+            self._held[one.decision.id] = False  # as at each decision
+            self._waiting.append(one)
+            return []
+        made = dict.fromkeys((each.decision.id for each in records if isinstance(each, StoredDecision)), False)
+        labelled = dict.fromkeys((each.decision_id for each in records if isinstance(each, NewLabel)), True)
+        once = len(made) + len(labelled) == sum(not isinstance(each, Event) for each in records)
+        known = [name for name in labelled if made.get(name, self._held.get(name, True))]  # or of no decision
+        if once and not known and self._held.keys().isdisjoint(made):
+            numbers = list(zip(labelled, itertools.count(self._labels + 1)))  # nobody else gives any
+            self._waiting += records
+        else:
+            numbers = self.database.take(records)
+        for name in made:
+            self._held.setdefault(name, False)
+        for name, number in numbers:
+            self._held[name], self._labels = True, max(self._labels, number)
+        return numbers
+
+    def _write_waiting(self) -> None:
+        """Write what was taken in memory: a replay, which reads nothing, never does."""
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            self.database.take(waiting)
 
     def let_go(self) -> None:
-        self._database.close(waiting=False)
+        """Disconnect without waiting: the journal holds what is missing."""
+        self.database.close(waiting=False)
 
     def close(self) -> None:
-        self._database.close()
+        """Disconnect."""
+        if self.wait is not None:  # what is in memory lives as long as its store
+            self.database.close()
         if self._journal is not None:
             self._journal.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 def _checked_wait(wait: float | None) -> float:
@@ -592,8 +658,3 @@ def _checked_wait(wait: float | None) -> float:
     if not 0.0 < seconds < math.inf:
         raise StoreError(f"Expected {name} above 0 seconds, got {shortened(said or wait)}; {WAIT} is the default.")
     return seconds
-
-
-def _since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
-    """Rows by model versions from this one on."""
-    return sa.true() if version <= 0 else table.c.model_version >= int(version)

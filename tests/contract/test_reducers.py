@@ -8,7 +8,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import REDUCERS, ModelPrediction, make_reducer
+from dengine import REDUCERS, ModelPrediction, make_reducer, replay
 from dengine.errors import SettingError
 from dengine.reducers import Reducer
 from dengine.testing import REDUCER_CHECKS, check_reducer, toy_traces
@@ -61,14 +61,6 @@ def test_an_unknown_setting_is_an_error_that_lists_the_known(name: str) -> None:
         make_reducer(name, dimm=2)
 
 
-def test_an_unknown_reducer_lists_the_known() -> None:
-    with pytest.raises(SettingError, match="conv, umap, pca"):
-        make_reducer("pac")
-
-
-# ------------------------------------------------------------------------------------------- caught when it is broken
-
-
 class Means(Reducer):
     """A reducer of somebody else's, the least that is needed: means of the halves of a trace."""
 
@@ -89,7 +81,7 @@ class Peeking(Means):
 
     uses_labels, n_spaces = True, 2
 
-    def train(self, X: Any, y: Any, folds: Any, stop: Any = None) -> np.ndarray:
+    def train(self, X: Any, y: Any, folds: Any, stop: Any = None, numbers: Any = None) -> np.ndarray:
         self.rate_ = float(np.mean(y * np.arange(len(y))))
         return self.fit(X).embed_own(X, folds)
 
@@ -118,6 +110,13 @@ class Overwriting(Means):
         return out
 
 
+class Unsaid(Means):
+    """Needs labels, and does not say so."""
+
+    def fit(self, X: Any, y: Any = None) -> "Unsaid":
+        return super().fit(X + 0 * y.mean())
+
+
 class Unbounded(TransformerMixin, BaseEstimator):
     """A transformer that gives infinities."""
 
@@ -135,9 +134,10 @@ def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
 @pytest.mark.parametrize(
     ("reducer", "clause"),
     [
+        (Unsaid(), "labels_come_only_where_it_says_that_it_uses_them"),
         (Peeking(), "labels_of_a_fold_move_nothing_in_its_space"),
         (Forgetful(), "fit_starts_afresh"),
-        (Overwriting(), "embedding_leaves_the_traces_as_they_are"),
+        (Overwriting(), "it_embeds_every_trace_in_every_space"),
         (Unbounded(), "it_embeds_every_trace_in_every_space"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseEstimator) else "",
@@ -145,3 +145,9 @@ def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
 def test_a_broken_reducer_is_told_which_clause_it_breaks(reducer: Any, clause: str) -> None:
     with pytest.raises(AssertionError, match=clause):
         check_reducer(reducer)
+
+
+def test_a_reducer_that_fails_at_every_retrain_is_told_with_its_reason(make_data: Any) -> None:
+    log = replay(make_data(120), Unsaid())
+    assert "retrains dropped, the last dropped: AttributeError" in repr(log)
+    assert log.summary()["retrains_dropped"] == len(log.retrains) > 0

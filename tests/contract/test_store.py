@@ -2,11 +2,9 @@
 
 import hashlib
 import sqlite3
-import subprocess
-import sys
-import threading
 import uuid
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,85 +15,31 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from dengine.errors import ReportError, StoreError
-from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import Event, MemoryStore, NewLabel, Outcomes, SqlStore, Store, StoredDecision, open_store
+from dengine.errors import StoreError
+from dengine.records import Action, Decision, Reason, Source
+from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision
 from dengine.store.journal import labelled
-from dengine.store.records import checked_decision
 from tests.support.plans import plans
-
-C, T = 2, 30
-
-
-def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
-    return Decision(name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0)
+from tests.support.stores import decision, execute, label, put_decision, put_label, put_labels, report, trace
 
 
-def trace(seed: int = 0, shape: tuple[int, ...] = (C, T)) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-
-
-def put(store: Store, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:
+def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:
     values = trace(seed)
-    store.put_decision(decision(name), values, content_hash, quarantined)
+    put_decision(store, decision(name), values, content_hash, quarantined)
     return values
 
 
-def label(name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION) -> NewLabel:
-    return NewLabel(name, success, source, 0, None, silent)
-
-
-def report(version: int, accepted: bool = True) -> RetrainReport:
-    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
-
-
-# Decisions
-
-
-def test_a_decision_is_found_as_it_was_put(store: Store) -> None:
+def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
     assert store.get_decision("a") is None
     values = trace()
     given = Decision("a", Action.VERIFY, Action.ACCEPT, 0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02, "Stück 7\\0")
-    store.put_decision(given, values, -(2**63), False)
-    store.put_decision(decision("flat"), values[0], 1, False)
+    put_decision(store, given, values, -(2**63), False)
+    put_decision(store, decision("flat"), values[0], 1, False)
     found = store.get_decision("a")
     assert (found.decision, found.content_hash, found.quarantined) == (given, -(2**63), False)
     assert (found.success, found.source) == (None, None)
     np.testing.assert_array_equal(found.trace, values)
-    assert store.get_decision("flat").trace.shape == (1, T)
-
-
-@pytest.mark.parametrize(
-    ("part", "content_hash", "error"),
-    [
-        ("SN\0", 1, "part's number"),
-        ("\ud800", 1, "part's number"),
-        (42, 1, "part's number"),
-        (None, 2**63, "signed 64 bits"),
-    ],
-)
-def test_what_no_database_holds_is_refused_and_not_stored(
-    store: Store, part: object, content_hash: int, error: str
-) -> None:
-    with pytest.raises(StoreError, match=error):
-        store.put_decision(replace(decision("a"), part=part), trace(), content_hash, False)
-    assert store.status()["decisions"] == 0
-
-
-def test_the_callers_buffer_may_change_after_put_decision(store: Store) -> None:
-    values = put(store, "a")
-    expected = values.copy()
-    values[:] = 0
-    store.flush()
-    np.testing.assert_array_equal(store.get_decision("a").trace, expected)
-
-
-def test_a_second_decision_of_one_id_is_refused_and_the_first_stands(store: Store) -> None:
-    first = put(store, "a", seed=1)
-    with pytest.raises(StoreError, match="'a'"):
-        put(store, "a", seed=2)
-    np.testing.assert_array_equal(store.get_decision("a").trace, first)
-    assert store.status()["decisions"] == 1
+    assert store.get_decision("flat").trace.shape == (1, 30)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -104,9 +48,9 @@ def test_a_second_decision_of_one_id_is_refused_and_the_first_stands(store: Stor
     content_hash=st.integers(-(2**63), 2**63 - 1),
     quarantined=st.booleans(),
 )
-def test_any_trace_returns_bit_for_bit(store: Store, values: np.ndarray, content_hash: int, quarantined: bool) -> None:
+def test_any_trace_returns_bit_for_bit(store: SqlStore, values: np.ndarray, content_hash: int, quarantined: bool) -> None:
     name = uuid.uuid4().hex
-    store.put_decision(decision(name), values, content_hash, quarantined)
+    put_decision(store, decision(name), values, content_hash, quarantined)
     store.flush()
     found = store.get_decision(name)
     assert found.trace.tobytes() == values.tobytes()
@@ -114,76 +58,31 @@ def test_any_trace_returns_bit_for_bit(store: Store, values: np.ndarray, content
     assert (found.content_hash, found.quarantined) == (content_hash, quarantined)
 
 
-# Labels
-
-
-def test_a_report_on_an_unknown_decision_names_the_id(store: Store) -> None:
-    with pytest.raises(ReportError, match="'nobody'"):
-        store.put_label("nobody", True, Source.VERIFICATION, 0, None)
-
-
-@pytest.mark.parametrize("success", [True, False])
-def test_a_second_report_names_id_first_label_and_source_and_the_first_stands(store: Store, success: bool) -> None:
-    put(store, "a")
-    store.put_label("a", True, Source.CONFIRMED, 0, None)
-    with pytest.raises(ReportError, match="'a': success from confirmed was reported first"):
-        store.put_label("a", success, Source.STOP, 0, None)
-    found = store.get_decision("a")
-    assert (found.success, found.source) == (True, Source.CONFIRMED)
-    put(store, "b")
-    assert store.put_label("b", True, Source.VERIFICATION, 0, None) == 2
-
-
-def test_labels_in_one_batch_are_numbered_in_the_order_given(store: Store) -> None:
+def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) -> None:
     for name in "abcd":
         put(store, name)
-    assert store.put_label("d", True, Source.VERIFICATION, 0, None) == 1
+    assert put_label(store, "d", True, Source.VERIFICATION, 0, None) == 1
     point = np.array([0.5, 1.5], dtype=np.float32)
     batch = [NewLabel("c", False, Source.STOP, 3, point, 4), label("a"), label("b", False)]
-    seqs = store.put_labels(batch)
-    assert (seqs.tolist(), seqs.dtype) == ([2, 3, 4], np.int64)
+    assert put_labels(store, *batch) == [2, 3, 4]
     assert store.labelled().labels.tolist() == [1, 0, 1, 0]
     assert (store.get_decision("c").success, store.get_decision("c").source) == (False, Source.STOP)
-    added = store.points_since(0, 3)
-    assert (added.seq.tolist(), added.points.tolist()) == ([2], [[0.5, 1.5]])
-    assert store.put_labels([]).tolist() == []
+    (added,) = (each for each in store.past_labels(0, points=True) if each.point is not None)
+    assert (added.seq, added.model_version, added.point.tolist()) == (2, 3, [0.5, 1.5])
 
 
-@pytest.mark.parametrize(
-    ("last", "error"),
-    [("nobody", "'nobody'"), ("done", "'done': success from confirmed was"), ("a", "'a': success from verification was")],
-)
-def test_a_batch_with_one_bad_report_takes_none_of_its_labels(store: Store, last: str, error: str) -> None:
-    for name in ("done", "a", "b"):
-        put(store, name)
-    store.put_label("done", True, Source.CONFIRMED, 0, None)
-    with pytest.raises(ReportError, match=error):
-        store.put_labels([label("a", silent=5), label("b"), label(last, False)])
-    assert store.labelled().seq.tolist() == [1]
-    assert store.get_decision("a").success is None
-    assert store.silent_total() == 0
-    assert store.put_labels([label("b"), label("a")]).tolist() == [2, 3]
-
-
-def test_a_silence_below_minus_one_is_refused(store: Store) -> None:
-    put(store, "a")
-    with pytest.raises(StoreError, match="-1 or more, got -2"):
-        store.put_label("a", True, Source.VERIFICATION, 0, None, silent=-2)
-    assert store.get_decision("a").success is None
-
-
-def test_a_batch_longer_than_a_chunk_is_taken_whole(store: Store) -> None:
+def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
     names = [str(i) for i in range(1203)]
     store.take([StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0) for name in names])
-    assert store.put_labels([label(name, silent=1) for name in names]).tolist() == list(range(1, 1204))
+    assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
     assert store.labelled().hashes.tolist() == list(range(1203))
     assert store.silent_total() == 1203
 
 
-def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: Store) -> None:
+def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: SqlStore) -> None:
     traces = {name: put(store, name, seed, 100 + seed, name == "c") for seed, name in enumerate("abcde")}
     for name in "ecbad":
-        store.put_label(name, name != "b", Source.VERIFICATION, 0, None)
+        put_label(store, name, name != "b", Source.VERIFICATION, 0, None)
     every = store.labelled()
     assert every.seq.tolist() == [1, 3, 4, 5]
     assert every.labels.tolist() == [1, 0, 1, 1]
@@ -197,56 +96,40 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
 
 
 @pytest.mark.parametrize("limit", [None, 0, 5])
-def test_an_empty_store_has_empty_arrays(store: Store, limit: int | None) -> None:
+def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> None:
     found = store.labelled(limit)
     assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
-    assert store.points_since(0, 1).points.shape == (0, 0)
     assert (store.last_version(), store.retrains()) == (None, [])
     assert (store.unreported_accepts(), store.silent_total(), store.outcomes()) == ([], 0, Outcomes())
 
 
-def test_traces_of_two_shapes_are_an_error_that_names_both(store: Store) -> None:
+def test_traces_of_two_shapes_are_an_error_that_names_both(store: SqlStore) -> None:
     for name, samples in (("a", 10), ("b", 20)):
-        store.put_decision(decision(name), trace(0, (1, samples)), 1, False)
-        store.put_label(name, True, Source.VERIFICATION, 0, None)
+        put_decision(store, decision(name), trace(0, (1, samples)), 1, False)
+        put_label(store, name, True, Source.VERIFICATION, 0, None)
     with pytest.raises(StoreError, match=r"\(1, 10\), \(1, 20\)"):
         store.labelled()
     assert store.labelled(1).traces.shape == (1, 1, 20)
 
 
-def test_points_since_a_swap_are_those_of_that_version(store: Store) -> None:
-    point = np.array([0.1, 0.2, 0.3, 0.4], dtype=np.float32)
-    for i, (version, added) in enumerate([(1, point), (2, point + 1), (2, None), (1, point + 2), (2, point + 3)]):
-        put(store, str(i), content_hash=i)
-        store.put_label(str(i), i % 2 == 0, Source.AUDIT, version, added)
-    added = store.points_since(2, 2)
-    assert added.seq.tolist() == [5]
-    np.testing.assert_array_equal(added.points, (point + 3)[None])
-    np.testing.assert_array_equal(store.points_since(0, 2).points, np.stack([point + 1, point + 3]))
-    assert store.points_since(5, 2).points.shape == (0, 0)
-
-
-# Import
-
-
-def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: Store) -> None:
+def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: SqlStore) -> None:
     put(store, "a")
-    store.put_label("a", True, Source.VERIFICATION, 0, None)
-    traces, hashes, labels = trace(1, (3, C, T)), [5, -5, 6], [1, 0, 1]
+    put_label(store, "a", True, Source.VERIFICATION, 0, None)
+    traces, hashes, labels = trace(1, (3, 2, 30)), [5, -5, 6], [1, 0, 1]
     decisions = [replace(decision(name), part=part) for name, part in zip("bcd", ["x", None, "z"], strict=True)]
     for made, x, hash_, good in zip(decisions, traces, hashes, labels, strict=True):
-        assert len(store.take(labelled(checked_decision(made, x, hash_, False, 1.0), good))) == 1
+        assert len(store.take(labelled(StoredDecision(made, x, hash_, False, 1.0), good))) == 1
     assert [store.get_decision(name).decision for name in "bcd"] == decisions
     found = store.labelled(3)
     np.testing.assert_array_equal(found.traces, traces)
     assert (found.seq.tolist(), found.hashes.tolist(), found.labels.tolist()) == ([2, 3, 4], hashes, labels)
 
 
-def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quarantined(store: Store) -> None:
+def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quarantined(store: SqlStore) -> None:
     for i, quarantined in enumerate([False, True, False, False]):
         bounded = replace(decision(str(i)), lower=0.1 * i, upper=0.2 * i)
-        store.put_decision(bounded, trace(i), i, quarantined)
-        store.put_label(str(i), i % 2 == 0, Source.VERIFICATION, 1, None)
+        put_decision(store, bounded, trace(i), i, quarantined)
+        put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None)
     found = store.evidence_since(1)
     assert (found.seq.tolist(), found.success.tolist()) == ([3, 4], [True, False])
     np.testing.assert_array_equal(found.lower, [0.2, 0.1 * 3])
@@ -254,11 +137,11 @@ def test_evidence_is_the_bound_of_each_decision_and_its_label_without_the_quaran
     assert len(store.evidence_since(4).seq) == 0
 
 
-def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Store) -> None:
+def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: SqlStore) -> None:
     for name, reason in (("a", Reason.NOVEL), ("b", Reason.CERTAIN), ("c", Reason.NOVEL)):
-        store.put_decision(decision(name, reason=reason), trace(), 1, False)
-    store.put_label("c", True, Source.VERIFICATION, 0, None, silent=2)
-    store.put_labels([label("b", silent=3), label("a")])
+        put_decision(store, decision(name, reason=reason), trace(), 1, False)
+    put_label(store, "c", True, Source.VERIFICATION, 0, None, silent=2)
+    put_labels(store, label("b", silent=3), label("a"))
     found = store.evidence_since(0)
     assert (found.novel.tolist(), found.silent.tolist()) == ([True, False, True], [2, 3, 0])
     assert (found.novel.dtype, found.silent.dtype) == (np.bool_, np.int64)
@@ -267,23 +150,20 @@ def test_evidence_says_what_was_novel_and_how_many_went_on_in_silence(store: Sto
     assert (empty.novel.dtype, empty.silent.dtype, empty.novel.shape) == (np.bool_, np.int64, (0,))
 
 
-# What became of decisions
-
-
-def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(store: Store) -> None:
+def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(store: SqlStore) -> None:
     names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
     store.clock = iter([5.0, 5.0, 5.0, 2.0, 2.0, 1.0, *range(8, 20)]).__next__
     for name in names:
-        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
-    store.put_decision(decision("verified"), trace(), 1, False)
-    store.put_decision(decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
+        put_decision(store, decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, name == "eve")
+    put_decision(store, decision("verified"), trace(), 1, False)
+    put_decision(store, decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
     assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
-    store.put_labels([label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)])
+    put_labels(store, label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED))
     assert store.unreported_accepts() == ["amy", "kim", "ann"]
-    assert sorted(store.decision_ids()) == sorted([*names, "verified", "rejected"])
+    assert sorted(name for some in store.decision_ids() for name in some) == sorted([*names, "verified", "rejected"])
 
 
-def test_outcomes_count_what_became_of_what_was_certain(store: Store) -> None:
+def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None:
     for i, (action, predicted, success) in enumerate(
         [(Action.ACCEPT, Action.ACCEPT, success) for success in (None, None, None, False, False, True)]
         + [(Action.REJECT, Action.REJECT, None)] * 2
@@ -292,9 +172,9 @@ def test_outcomes_count_what_became_of_what_was_certain(store: Store) -> None:
         + [(Action.VERIFY, Action.VERIFY, success) for success in (True, False, None)]
     ):
         audit = action != predicted
-        store.put_decision(replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
+        put_decision(store, replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
         if success is not None:
-            store.put_label(str(i), success, Source.AUDIT, 0, None)
+            put_label(store, str(i), success, Source.AUDIT, 0, None)
     assert store.outcomes() == Outcomes(
         accepted=6,
         stops=2,
@@ -317,18 +197,16 @@ LIVES = st.lists(
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(lives=LIVES)
-def test_counts_grow_by_what_was_put_and_agree_with_each_other(
-    store: Store, lives: list[tuple[Action, bool, bool | None, int, bool]]
-) -> None:
+def test_counts_grow_by_what_was_put_and_agree_with_each_other(store: SqlStore, lives) -> None:
     """lives : what the model predicted, audited or not, label or None, silent before it, quarantined or not."""
     before, silent, waiting = store.outcomes(), store.silent_total(), store.unreported_accepts()
     names, labels = [uuid.uuid4().hex for _ in lives], []
     for name, (predicted, audit, success, quiet, quarantined) in zip(names, lives, strict=True):
         action, audit = (Action.VERIFY, predicted is not Action.VERIFY) if audit else (predicted, False)
         given = replace(decision(name, action), predicted=predicted, audit=audit)
-        store.put_decision(given, trace(), 1, quarantined)
+        put_decision(store, given, trace(), 1, quarantined)
         labels += [] if success is None else [label(name, success, quiet)]
-    store.put_labels(labels)
+    put_labels(store, *labels)
     accepts = [(name, life) for name, life in zip(names, lives, strict=True) if life[0] is Action.ACCEPT and not life[1]]
     after = store.outcomes()
     assert after.accepted - before.accepted == len(accepts)
@@ -341,10 +219,7 @@ def test_counts_grow_by_what_was_put_and_agree_with_each_other(
     assert 0 <= after.audited_rejects_good <= after.audited_rejects
 
 
-# Events
-
-
-def test_events_are_numbered_from_one_and_returned_oldest_first(store: Store) -> None:
+def test_events_are_numbered_from_one_and_returned_oldest_first(store: SqlStore) -> None:
     store.clock = iter([1.5, 2.5, 3.5]).__next__
     for kind in ("started", "safe_mode", "left"):
         store.put_event(kind, f"was {kind}: ±")
@@ -355,14 +230,14 @@ def test_events_are_numbered_from_one_and_returned_oldest_first(store: Store) ->
     assert (store.events(0), store.events(9)) == ([], every)
 
 
-def test_an_event_writes_what_every_database_refuses_with_escapes(store: Store) -> None:
+def test_an_event_writes_what_every_database_refuses_with_escapes(store: SqlStore) -> None:
     store.put_event(Reason.MODEL_ERROR, "read \0 and \ud800")
     (event,) = store.events()
     assert (event.kind, event.text) == ("model_error", "read \\0 and \\ud800")
     assert type(event.kind) is str
 
 
-def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store: Store) -> None:
+def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store: SqlStore) -> None:
     assert (store.status()["events"], store.status()["last_label_time"]) == ([], None)
     store.clock = iter(float(i) for i in range(20)).__next__
     for i in range(7):
@@ -370,14 +245,11 @@ def test_status_shows_the_newest_five_events_and_when_the_last_label_came(store:
     assert store.status()["events"] == [{"kind": "note", "text": str(i), "time": float(i)} for i in range(2, 7)]
     put(store, "a")
     put(store, "b")
-    store.put_label("a", True, Source.VERIFICATION, 0, None)
+    put_label(store, "a", True, Source.VERIFICATION, 0, None)
     assert store.status()["last_label_time"] == 9.0
 
 
-# Versions and settings
-
-
-def test_the_newest_accepted_version_returns_bit_for_bit(store: Store) -> None:
+def test_the_newest_accepted_version_returns_bit_for_bit(store: SqlStore) -> None:
     state = {
         "encoder.stem.weight": trace(3, (4, 1, 5)),
         "references/0": np.asfortranarray(trace(4, (6, 2))),
@@ -397,29 +269,25 @@ def test_the_newest_accepted_version_returns_bit_for_bit(store: Store) -> None:
     assert store.retrains() == [report(1), report(2), report(2, accepted=False)]
 
 
-def test_a_state_with_python_objects_is_refused(store: Store) -> None:
-    with pytest.raises(StoreError, match="'w'"):
-        store.put_version(report(1), 0, {"w": np.array([{}], dtype=object)})
+@pytest.mark.parametrize(("state", "named"), [({"w": np.array([{}], dtype=object)}, "'w'"), (None, "version 1")])
+def test_an_accepted_version_needs_a_state_of_plain_arrays(store: SqlStore, state: dict | None, named: str) -> None:
+    with pytest.raises(StoreError, match=named):
+        store.put_version(report(1), 0, state)
 
 
-def test_an_accepted_version_needs_its_state(store: Store) -> None:
-    with pytest.raises(StoreError, match="version 1"):
-        store.put_version(report(1), 0, None)
-
-
-def test_settings_are_replaced_as_a_whole(store: Store) -> None:
+def test_settings_are_replaced_as_a_whole(store: SqlStore) -> None:
     assert store.settings() == {}
     store.save_settings({"recipe": "a = 1\n", "spec": "é"})
     store.save_settings({"recipe": "a = 2"})
     assert store.settings() == {"recipe": "a = 2"}
 
 
-def test_status_counts_what_was_put(store: Store) -> None:
-    store.put_decision(decision("a", Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
-    store.put_decision(decision("b"), trace(), 2, False)
-    store.put_decision(decision("c", Action.VERIFY, Reason.CONSTANT), trace(), 3, True)
-    store.put_label("a", False, Source.STOP, 0, None)
-    store.put_label("c", True, Source.VERIFICATION, 0, None)
+def test_status_counts_what_was_put(store: SqlStore) -> None:
+    put_decision(store, decision("a", Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
+    put_decision(store, decision("b"), trace(), 2, False)
+    put_decision(store, decision("c", Action.VERIFY, Reason.CONSTANT), trace(), 3, True)
+    put_label(store, "a", False, Source.STOP, 0, None)
+    put_label(store, "c", True, Source.VERIFICATION, 0, None)
     store.put_version(report(1), 2, {"w": np.zeros(1)})
     store.put_version(report(1, accepted=False), 2, None)
     status = store.status()
@@ -431,69 +299,42 @@ def test_status_counts_what_was_put(store: Store) -> None:
     assert status["first_time"] <= status["last_time"]
 
 
-# Memory
-
-
-def test_memory_forgets_old_unreported_decisions_says_so_and_counts_them() -> None:
-    class Small(MemoryStore):
-        KEEP_UNLABELLED = 3
-
-    store = Small()
-    for i in range(5):
-        store.take(labelled(StoredDecision(decision(str(i)), trace(), i, False, 1.0), True))
-    for name in "abcde":
-        store.put_decision(decision(name, Action.ACCEPT, Reason.CERTAIN), trace(), 1, False)
-    assert [store.get_decision(name) is None for name in ("0", "a", "b", "c")] == [False, True, True, False]
-    assert store.status()["decisions"] == 10
-    with pytest.raises(ReportError, match="newest 3"):
-        store.put_label("a", True, Source.VERIFICATION, 0, None)
-    store.put_label("e", False, Source.STOP, 0, None)
-    assert store.unreported_accepts() == ["c", "d"]
-    assert (store.outcomes().accepted, store.outcomes().stops) == (5, 1)
-    assert len(store.labelled().seq) == 6
-
-
-def test_open_store_takes_nothing_a_file_or_a_store(tmp_path: Path) -> None:
-    assert isinstance(open_store(None), MemoryStore)
-    memory = MemoryStore()
-    assert open_store(memory) is memory
-    with open_store(str(tmp_path / "a.db")) as store:
-        assert isinstance(store, SqlStore)
-    with pytest.raises(StoreError, match="got int"):
-        open_store(3)  # type: ignore[arg-type]
-
-
-def test_importing_the_store_does_not_import_sqlalchemy() -> None:
-    code = "import sys, dengine.store; sys.exit('sqlalchemy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-# Databases
+def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
+    store = SqlStore()
+    made = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
+    store.take(labelled(made[0], True)[:1])
+    assert store.take(labelled(made[0], True)[1:]) == [("a", 1)]
+    assert store.take(labelled(made[1], False) + labelled(made[2], True)) == [("b", 2), ("c", 3)]
+    assert store.labelled().labels.tolist() == [1, 0, 1]
+    assert store.take([*labelled(made[3], True), *labelled(made[1], False)]) == [("d", 4), ("b", 2)]
+    assert store.take(labelled(made[3], False)) == []  # a second label, which is set aside
+    assert store.labelled().seq.tolist() == [1, 2, 3, 4]
+    assert [event.kind for event in store.events()] == ["dead letter"]
 
 
 def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None:
     with SqlStore(*place) as store:
         values = put(store, "a")
         store.save_settings({"k": "v"})
-        store.put_label("a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
+        put_label(store, "a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
         store.put_version(report(1), 1, {"w": values})
-        store.put_decision(replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False)
-        store.put_decision(decision("silent"), trace(), 1, False)
-        store.put_label("silent", True, Source.VERIFICATION, 0, None, silent=4)
+        put_decision(store, replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False)
+        put_decision(store, decision("silent"), trace(), 1, False)
+        put_label(store, "silent", True, Source.VERIFICATION, 0, None, silent=4)
         store.put_event("started", "for the first time")
         put(store, "unreported")
     with SqlStore(*place) as store:
         assert store.settings() == {"k": "v"}
         np.testing.assert_array_equal(store.get_decision("a").trace, values)
         np.testing.assert_array_equal(store.last_version().state["w"], values)
-        assert store.points_since(0, 1).points.tolist() == [[0.5]]
+        assert store.past_labels(0, 1, points=True)[0].point.tolist() == [0.5]
         assert store.get_decision("unreported") is not None
         assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
         assert store.get_decision("accepted").decision.part == "SN-1"
         assert [event.text for event in store.events()] == ["for the first time"]
         store.put_event("started", "again")
         assert [event.number for event in store.events()] == [1, 2]
-        assert store.put_label("unreported", True, Source.VERIFICATION, 0, None) == 3
+        assert put_label(store, "unreported", True, Source.VERIFICATION, 0, None) == 3
 
 
 def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str]) -> None:
@@ -501,45 +342,42 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
     with SqlStore(url, cell_id) as ours, SqlStore(url, cell_id + "-other") as other:
         put(ours, "a", seed=1)
         put(other, "a", seed=2)
-        assert ours.put_label("a", True, Source.VERIFICATION, 1, np.zeros(2, np.float32)) == 1
-        assert other.put_label("a", False, Source.STOP, 1, np.ones(2, np.float32)) == 1
+        assert put_label(ours, "a", True, Source.VERIFICATION, 1, np.zeros(2, np.float32)) == 1
+        assert put_label(other, "a", False, Source.STOP, 1, np.ones(2, np.float32)) == 1
         ours.put_version(report(1), 1, {"w": np.zeros(1)})
         ours.save_settings({"k": "v"})
         ours.put_event("note", "ours")
-        ours.put_decision(decision("b", Action.ACCEPT), trace(), 1, False)
-        ours.put_decision(decision("c"), trace(), 1, False)
-        ours.put_label("c", True, Source.VERIFICATION, 0, None, silent=3)
+        put_decision(ours, decision("b", Action.ACCEPT), trace(), 1, False)
+        put_decision(ours, decision("c"), trace(), 1, False)
+        put_label(ours, "c", True, Source.VERIFICATION, 0, None, silent=3)
         assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
         assert other.outcomes().accepted == 0
         other.put_event("note", "other's")
         assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
         assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
         assert other.labelled().labels.tolist() == [0]
-        assert other.points_since(0, 1).points.tolist() == [[1.0, 1.0]]
+        assert [each.point.tolist() for each in other.past_labels(0, points=True)] == [[1.0, 1.0]]
         assert other.status()["labels"] == 1
         np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
 
 
-def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(
-    place: tuple[str, str],
-) -> None:
+def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(place) -> None:
     seqs: list[int] = []
 
     def label(store: SqlStore, prefix: str) -> None:
         for i in range(15):
             put(store, f"{prefix}{i}")
-            seqs.append(store.put_label(f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
+            seqs.append(put_label(store, f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
             store.put_event("note", f"{prefix}{i}")
 
     with SqlStore(*place) as one, SqlStore(*place) as two:
-        threads = [threading.Thread(target=label, args=pair) for pair in ((one, "x"), (two, "y"))]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(label, (one, two), "xy"))
         assert sorted(seqs) == list(range(1, 31))
         assert one.labelled().seq.tolist() == list(range(1, 31))
         assert [event.number for event in two.events()] == list(range(1, 31))
+        assert one.verify().ok  # one chain
+        assert one.verify().cells[0].rows == 120
 
 
 def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:
@@ -554,15 +392,14 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
 def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db")) as store:
         put(store, "a")
-        store.put_label("a", True, Source.VERIFICATION, 0, None)
+        put_label(store, "a", True, Source.VERIFICATION, 0, None)
         with plans(tmp_path / "a.db") as found:
             store.labelled(100)
             store.get_decision("a")
             store.evidence_since(0)
             store.silent_total()
             store.events(5)
-            with pytest.raises(ReportError):
-                store.put_label("a", True, Source.VERIFICATION, 0, None)
+            put_label(store, "a", True, Source.VERIFICATION, 0, None)
     assert len(found) >= 7
     for statement, plan in found:
         assert plan
@@ -585,9 +422,6 @@ def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path: Path) -> None:
     assert set(asked) == {("wal", 2)}
 
 
-# What cannot be opened
-
-
 def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     SqlStore(str(file)).close()
@@ -603,8 +437,7 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
 def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, table: str) -> None:
     file = tmp_path / "a.db"
-    with sqlite3.connect(file) as connection:
-        connection.execute(f"CREATE TABLE {table}")
+    execute(file, f"CREATE TABLE {table}")
     before = file.read_bytes()
     with pytest.raises(StoreError, match="schema 1, found tables of another program"):
         SqlStore(str(file))
@@ -624,13 +457,6 @@ def test_a_file_that_is_no_database_is_refused_and_left_alone(tmp_path: Path) ->
 def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path: Path, name: str) -> None:
     with pytest.raises(StoreError, match="Create the directory"):
         SqlStore(str(tmp_path / name))
-
-
-@pytest.mark.parametrize("url", ["sqlite://", "sqlite:///:memory:", "mysql://u:secret@host/db", "nonsense://x", "a://:b:c"])
-def test_a_url_that_is_not_served_is_refused_without_its_password(url: str) -> None:
-    with pytest.raises(StoreError) as caught:
-        SqlStore(url)
-    assert "secret" not in str(caught.value)
 
 
 def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:

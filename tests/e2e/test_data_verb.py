@@ -1,6 +1,7 @@
 """`dengine data`, and the other verbs on recordings as people have them."""
 
-import runpy
+import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,52 +10,36 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dengine import DataEngine, Dataset
-from dengine.cli.output import WIDE
+from dengine import DataEngine, Dataset, load_dataset
 from dengine.experiments.figures import data_picture
 from dengine.experiments.survey import survey
 from tests.support.command_line import dengine, document, well
+from training.make_recordings import write_plants, write_recordings
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, repo: Path) -> Path:
-    """80 recordings as UR cells make them, three of them broken."""
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """80 recordings as UR cells make them, three of them broken; beside them those of five plants."""
     path = tmp_path_factory.mktemp("recordings") / "cell_3"
-    runpy.run_path(str(repo / "training" / "make_recordings.py"))["write_recordings"](path, 80, 3, 0)
+    write_recordings(path, 80, 3, 0)
+    write_plants(path.parent, 60, 0)
     return path
 
 
 def test_data_says_what_a_folder_is_and_what_is_wrong_with_it(folder: Path, tmp_path: Path) -> None:
     result = well("data", folder, "--channel", "FZ_Base,FX_Base", "--out", tmp_path / "out")
-    said = " ".join(result.stdout.replace("│", " ").split())
-    for words in (
-        "77, 3 left out",
-        "2 channels (FZ_Base, FX_Base)",
-        "500 Hz each, by the timestamps",
-        "FX_Base by tenths",
-        "Expected 13 columns, got 12",
-    ):
-        assert words in said, words
-    assert max(map(len, result.stdout.splitlines())) <= max(WIDE, len(f"Wrote {tmp_path / 'out' / 'data.png'}"))
+    words = " ".join(result.stdout.replace("│", " ").split())
+    said = "traces 77|names FZ_Base, FX_Base|rates low 500,|Left out 3 of 80|Expected 13 columns, got 12"
+    assert [word for word in said.split("|") if word not in words] == []
     assert (tmp_path / "out" / "data.png").stat().st_size > 10_000
-
-
-def test_data_as_json_is_one_document_and_replay_says_once_what_was_left_out(folder: Path) -> None:
-    found = document("data", folder)["survey"]
-    assert (found["traces"], len(found["faults"]), found["rate_hz"], found["fit"]) == (77, 3, 500.0, "pad")
-    assert found["good"] + found["bad"] == 77
-    assert found["lengths"]["low"] < found["lengths"]["high"]
     played = well("replay", "--data", folder, "--channel", "FZ_Base", "--reducer", "pca", "--cycles", 60, "--repeats", 1)
-    assert "pca on cell_3" in played.stdout
     assert played.stderr.count("Left out 3 of 80 recordings of cell_3:") == 1
 
 
 def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_length(folder: Path, tmp_path: Path) -> None:
     store = tmp_path / "engine.db"
-    result = well("train", "--data", folder, "--store", store, "--reducer", "pca")
-    assert "Imported 77 labelled traces" in result.stdout
-    again = well("train", "--data", folder, "--store", store)
-    assert "all 77 traces were there from an earlier import" in again.stdout
+    assert document("train", "--data", folder, "--store", store, "--reducer", "pca")["import"]["imported"] == 77
+    assert document("train", "--data", folder, "--store", store)["import"]["known"] == 77
     with DataEngine.open(store) as engine:
         assert (engine.trace.fit, engine.trace.columns) == ("pad", ("FZ_Base",))
         frames = [pd.read_csv(path) for path in sorted(folder.iterdir()) if len(path.read_bytes()) > 10**5][:3]
@@ -63,6 +48,34 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
     other = dengine("train", "--data", folder, "--channel", "FX_Base", "--store", store)
     assert other.exit_code == 1
     assert "Expected the channels FZ_Base, got FX_Base" in other.stderr
+
+
+PLANTS = {  # what is given of five plants' recordings, as their errors say one by one
+    "latin": "--labels 'latin/Prüfung.csv' --label-map i.O.=good,n.i.O.=bad",
+    "historian/export.parquet": "--part serial --time timestamp --label verdict",
+    "wide/shift.csv": "--channels FZ",
+    "bag/cell.mcap": "--trigger register@/phase --label /height_check/ok",
+    "lab/runs.npz": "--channels force --label accepted",
+}
+
+
+@pytest.mark.parametrize("source", PLANTS)
+def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say(
+    source: str, folder: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    found = document("data", source, *shlex.split(PLANTS[source]))["survey"]
+    good = int(load_dataset("insertion").y[np.random.default_rng(0).permutation(1503)[:60]].sum())
+    assert (found["traces"], found["samples"], found["good"], found["faults"]) == (60, 200, good, [])
+    assert found["rate_hz"] == (500.0 if "wide" in source or "lab" in source else 100.0)
+    asked = ["replay", "--data", source, "--reducer", "pca", "--repeats", "1", "--cycles", "60"]
+    while (done := dengine(*asked)).exit_code:
+        advice = re.findall(r"(--[a-z-]+) ('[^']*'|\S+?)(?=[.,;]?(?:\s|$))", done.stderr)
+        assert advice, done.stderr
+        asked += [shlex.split(word)[0] for pair in advice for word in pair]
+        assert len(asked) < 20
+    assert "pca on" in done.stdout
+    assert ("read as Windows-1252" in done.stderr) == (source == "latin")
 
 
 def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:

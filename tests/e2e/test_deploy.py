@@ -7,15 +7,19 @@ import shutil
 import subprocess
 import sys
 import tomllib
-import urllib.error
-import urllib.request
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
 import pytest
 
+pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengine[serve]'")
+
 from dengine.cli import main
 from dengine.errors import SettingError
+from dengine.serve.auth import read_tokens
+from dengine.serve.metrics import Metrics
+from tests.support.serving import a_service, started
 
 REPO = Path(__file__).resolve().parents[2]
 DEPLOY = REPO / "deploy"
@@ -70,27 +74,25 @@ def test_the_container_runs_as_nobody_special_and_what_it_starts_is_an_option_ea
 
 
 def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_order(tmp_path: Path) -> None:
-    pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengine[serve]'")
-    token = tmp_path / "token"
-    token.write_text("a-token-of-24-characters", encoding="ascii")
-    token.chmod(0o400)
+    token = token_file(tmp_path, 0o400)
     changed = {"/var/lib/dengine/cell.db": str(tmp_path / "cell.db"), "/run/secrets/dengine_token": str(token), "8000": "0"}
-    words = [changed.get(word, word) for word in json.loads(steps("CMD")[0])]
+    _, *words = [changed.get(word, word) for word in json.loads(steps("CMD")[0])]
     program, *check = json.loads(steps("HEALTHCHECK")[0].split("CMD", 1)[1])
     assert program == "python"
-    command = [sys.executable, "-m", "dengine", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as server:
-        try:
-            (port,) = re.findall(r":(\d+)", server.stdout.readline())
-            asked = [sys.executable, *(word.replace(":8000/", f":{port}/") for word in check)]
-            assert subprocess.run(asked, timeout=60, check=False).returncode == 0
-            with pytest.raises(urllib.error.HTTPError, match="401"):
-                urllib.request.urlopen(f"http://127.0.0.1:{port}/status", timeout=30)
-        finally:
-            server.terminate()  # as the container's end does
-        assert server.wait(60) == 0
+    with started(tmp_path, *words) as server:  # of two ports, and of two stores, the last counts
+        asked = [sys.executable, *(word.replace(":8000/", f":{server.port}/") for word in check)]
+        assert subprocess.run(asked, timeout=60, check=False).returncode == 0
+        with pytest.raises(OSError, match="401"):
+            server.ask("/status")
+        assert server.end() == 0  # as the container's end does
     assert subprocess.run(asked, timeout=60, capture_output=True, check=False).returncode != 0
     assert (tmp_path / "cell.db").is_file()
+
+
+def token_file(folder: Path, mode: int) -> Path:
+    (folder / "token").write_text("a-token-of-24-characters\nanother-of-these viewer Line display\n", encoding="ascii")
+    (folder / "token").chmod(mode)
+    return folder / "token"
 
 
 @pytest.mark.parametrize(
@@ -99,17 +101,11 @@ def test_what_the_container_starts_is_healthy_asks_for_the_token_and_ends_in_ord
 def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_right_of_the_group(
     mode: int, handed: bool, taken: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_token = pytest.importorskip("dengine.serve.auth").read_token
     if handed:
         monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
-    token = tmp_path / "token"
-    token.write_text("a-token-of-24-characters\n", encoding="ascii")
-    token.chmod(mode)
-    if taken:
-        assert read_token(token) == "a-token-of-24-characters"
-    else:
-        with pytest.raises(SettingError, match="its owner's alone"):
-            read_token(token)
+    with nullcontext() if taken else pytest.raises(SettingError, match="its owner's alone"):
+        found = read_tokens(token_file(tmp_path, mode))
+        assert [(each.operates, each.name) for each in found] == [(True, ""), (False, "Line display")]
 
 
 def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_credential() -> None:
@@ -124,6 +120,18 @@ def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_c
     assert settings("LoadCredential") == ["token:/etc/dengine/token"]
     assert "${CREDENTIALS_DIRECTORY}/token" in line
     assert "token" not in OPTIONS
+
+
+def test_dashboard_and_alerts_ask_for_metrics_that_there_are_and_for_their_labels() -> None:
+    with a_service() as service:
+        known = set(re.findall(r"^# TYPE (\w+)", Metrics(service).text()[0].decode(), flags=re.M))
+    dashboard = json.loads((DEPLOY / "grafana.json").read_text(encoding="utf-8"))
+    asked = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    asked += re.findall(
+        r"expr: (?:>-)?\s*(.+?)\n +(?:for|annotations|labels):", (DEPLOY / "alerts.yml").read_text(), flags=re.S
+    )
+    assert {re.sub("_(count|bucket)$", "", name) for name in re.findall(r"dengine_\w+", " ".join(asked))} <= known
+    assert set(re.findall(r'(\w+)=~?"', " ".join(asked))) == {"instance", "action", "repeated", "reason", "accepted", "job"}
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not here")

@@ -14,13 +14,12 @@ import pytest
 import torch
 from sklearn.decomposition import PCA
 
-from dengine import DataEngine, Dataset, ModelPrediction, Recipe, TraceSpec, export_torchscript, load_exported
+from dengine import DataEngine, Dataset, ModelPrediction, Recipe, TraceSpec, export_torchscript, load_exported, make_reducer
 from dengine.decision.rule import SAFE_MODE, DecisionRule
-from dengine.errors import ExportError, TraceError
-from dengine.export import ExportedModel, read_metadata
-from dengine.folds import content_fold, part_hash
-from dengine.records import ACTIONS, REASONS, Action, Reason
-from dengine.reducers import Reducer
+from dengine.errors import ExportError, OutputError, TraceError
+from dengine.export import read_metadata
+from dengine.folds import content_fold
+from dengine.records import Action, Reason
 from tests.support.exports import LIMIT, SAMPLES, bad_traces, fitted, recipe, row, trained, wild_traces
 
 
@@ -40,13 +39,8 @@ def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export_torchscript(audited, tmp_path_factory.mktemp("export") / "model.ts")
 
 
-# ------------------------------------------------------------------------------------------------- parity
-
-
 @pytest.mark.parametrize("neighbourhood", [{}, {"fraction": 0.1}, {"fraction": 0.3, "reject_fraction": 0.08}])
-def test_the_file_decides_exactly_as_the_engine(
-    make_data: Callable[..., Dataset], many: np.ndarray, tmp_path: Path, neighbourhood: dict[str, float]
-) -> None:
+def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp_path: Path, neighbourhood) -> None:
     with trained(make_data(400, SAMPLES), audit_rate=0.3, **neighbourhood) as engine:
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
         decisions = [engine.decide(x) for x in many]
@@ -85,7 +79,7 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:
-    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, fraction=0.1)
+    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, fraction=0.1, label_within=2000)
     engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
@@ -114,13 +108,13 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
             if i > 600 and not saved and known.action is Action.ACCEPT and not heard:  # one that waits
                 exported, saved = load_exported(exported.save(tmp_path / "later.ts")), True
         model = engine.model
-        mine = {f"ring.{name}": t for name, t in model.index.ring.state_dict().items()}
+        mine = {f"ring.{name}": t for name, t in model.index.state_dict().items()}
         mine |= model.rule.state_dict()
         kept = {".".join(name.split(".")[-2:]): t for name, t in exported.module.named_buffers()}
         for name in mine.keys() & kept.keys():  # what can change; freezing made constants of the rest
             torch.testing.assert_close(kept[name], mine[name], rtol=0, atol=0)
         assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
-        assert type(model.rule) is DecisionRule or {"evidence.members", "evidence.watch", "evidence.open"} <= kept.keys()
+        assert type(model.rule) is DecisionRule or {"evidence.told", "evidence.watch", "evidence.open"} <= kept.keys()
     assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
     assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED)) > 0
     assert len(modes) > 1 or stops == "some"
@@ -139,19 +133,6 @@ def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Calla
     assert exported.module.n_references() == held + 2
     assert exported.stop(new[3]) == held + 3
     assert not exported.module.settle()
-
-
-def test_a_restored_decision_waits_as_if_it_were_of_now(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    path = export_torchscript(lenient_engine(make_data), tmp_path / "model.ts")
-    one, two = load_exported(path), load_exported(path)
-    for i, x in enumerate(make_data(20, SAMPLES, seed=4).X):
-        found = one.decide(x, i // 2)
-        action, reason = ACTIONS.index(found.action), REASONS.index(found.reason)
-        two.module.restore(torch.from_numpy(x), part_hash(str(i // 2)), action, reason, found.lower, found.upper)
-    assert two.module.n_references() == one.module.n_references() == 300 + 19
-    for mine, other in zip(one.module.named_buffers(), two.module.named_buffers(), strict=True):
-        assert mine[0] == other[0]
-        torch.testing.assert_close(mine[1], other[1], rtol=0, atol=0)
 
 
 def lenient_engine(make_data: Callable[..., Dataset]) -> DataEngine:
@@ -186,12 +167,7 @@ def test_a_wrong_shape_says_what_was_expected(file: Path) -> None:
         exported.module.decide(torch.ones(98))
 
 
-# ------------------------------------------------------------------------------------------------- the file
-
-
-def test_the_file_says_what_it_is_without_being_loaded(
-    audited: DataEngine, file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_file_says_what_it_is_without_being_loaded(audited: DataEngine, file: Path, monkeypatch) -> None:
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
     metadata = read_metadata(file)
     assert metadata["schema"] == 2
@@ -216,9 +192,6 @@ def test_loading_unpickles_nothing_in_python(file: Path, monkeypatch: pytest.Mon
         monkeypatch.setattr(pickle, name, lambda *a, **k: pytest.fail("a pickle was read"))
     monkeypatch.setattr(torch, "load", lambda *a, **k: pytest.fail("a pickle was read"))
     load_exported(file)
-
-
-# ------------------------------------------------------------------------------------------------- damage
 
 
 def sum_anew(path: Path) -> None:
@@ -262,6 +235,16 @@ def zipped(path: Path, name: str, text: str) -> None:
         archive.writestr(name, text)
 
 
+def described(**changes: Any) -> Callable[[Path], Any]:
+    """The same module under another description."""
+
+    def replace(path: Path) -> None:
+        exported = load_exported(path)
+        torch.jit.save(exported.module, str(path), {"dengine.json": json.dumps(exported.metadata | changes).encode()})
+
+    return replace
+
+
 FOREIGN: dict[str, tuple[Callable[[Path], Any], str]] = {
     "garbage": (lambda path: path.write_bytes(b"no model at all" * 1000), r"it holds no dengine\.json"),
     "another zip": (lambda path: zipped(path, "holiday.txt", "sand"), "is not a dengine export"),
@@ -273,6 +256,21 @@ FOREIGN: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda path: zipped(path, "model/extra/dengine.json", json.dumps(read_metadata(path))),
         "is no loadable TorchScript",
     ),
+    **{
+        f"schema {schema}": (
+            described(schema=schema, dengine="9.0"),
+            rf"schema {schema}, written by dengine 9\.0; this one",
+        )
+        for schema in (1, None)
+    },
+    **{
+        f"of {trace}": (described(trace=trace), "description")
+        for trace in ({"samples": SAMPLES, "colour": "red"}, {"samples": 99}, None)
+    },
+    "another machine's": (
+        described(golden={"trace": [[1.0] * SAMPLES], "embedding": [[0.01, 0.01]]}),
+        "does not reproduce its golden embedding",
+    ),
 }
 
 
@@ -282,34 +280,6 @@ def test_a_foreign_file_with_its_sum_is_refused(copy: Path, kind: str) -> None:
     replace(copy)
     sum_anew(copy)
     with pytest.raises(ExportError, match=words):
-        load_exported(copy)
-
-
-def with_metadata(path: Path, **changes: Any) -> None:
-    """The same module under another description, with its sum."""
-    exported = load_exported(path)
-    torch.jit.save(exported.module, str(path), {"dengine.json": json.dumps(exported.metadata | changes).encode()})
-    sum_anew(path)
-
-
-@pytest.mark.parametrize("schema", [1, None])
-def test_another_schema_is_refused(copy: Path, schema: int | None) -> None:
-    with_metadata(copy, schema=schema, dengine="9.0")
-    with pytest.raises(ExportError, match=rf"schema {schema}, written by dengine 9\.0; this one reads schema 2"):
-        load_exported(copy)
-
-
-@pytest.mark.parametrize("trace", [{"samples": SAMPLES, "colour": "red"}, {"samples": 99}, None])
-def test_a_description_that_does_not_fit_is_refused(copy: Path, trace: Any) -> None:
-    with_metadata(copy, trace=trace)
-    with pytest.raises(ExportError, match="description"):
-        load_exported(copy)
-
-
-def test_a_machine_that_computes_otherwise_is_told(copy: Path) -> None:
-    golden = read_metadata(copy)["golden"]
-    with_metadata(copy, golden=golden | {"embedding": (np.array(golden["embedding"]) + 0.01).tolist()})
-    with pytest.raises(ExportError, match="does not reproduce its golden embedding"):
         load_exported(copy)
 
 
@@ -325,9 +295,6 @@ def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
             load_exported(copy)
 
 
-# ------------------------------------------------------------------------------------------------- what cannot be exported
-
-
 def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Dataset, tmp_path: Path) -> None:
     missed = fitted(data)
     missed.untold = True
@@ -341,65 +308,22 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(data: Datase
     ):
         with pytest.raises(ExportError, match=words):
             export_torchscript(what, tmp_path / "model.ts")
-    with pytest.raises(ExportError, match="choose a folder that exists"):
+    with pytest.raises(OutputError, match="choose a folder that exists"):
         export_torchscript(fitted(data), tmp_path / "nowhere" / "model.ts")
     assert list(tmp_path.iterdir()) == []
 
 
-# ------------------------------------------------------------------------------------------------- learning in the cell
-
-
-class TwoSpaces(torch.nn.Module):
-    """Mean and height of a trace, in two spaces that differ."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        flat = x.flatten(1)
-        z = torch.stack([flat.mean(1), flat[:, -20:].mean(1)], 1)
-        return torch.stack([z, z.flip(1) * 0.5 + 1.0], 1)
-
-
-class TwoSpacesReducer(Reducer):
-    """A reducer that cross-fits by itself, as the conv reducer does; labels tell it nothing."""
-
-    n_spaces = 2
-
-    def fit(self, X: np.ndarray, y: Any = None) -> "TwoSpacesReducer":
-        return self
-
-    def transform(self, X: np.ndarray) -> np.ndarray:
-        return self.embed(X).mean(axis=1)
-
-    def embed(self, X: np.ndarray) -> np.ndarray:
-        with torch.inference_mode():
-            return self.module()(torch.from_numpy(X)).numpy()
-
-    def module(self) -> torch.nn.Module:
-        return TwoSpaces()
-
-
-def ring_of(exported: ExportedModel) -> dict[str, np.ndarray]:
-    """The references that a module holds."""
-    buffers = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
-    return {name: buffers[name] for name in ("total", "labels", "spaces", "points")}
-
-
-def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
-    make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(make_data, tmp_path: Path) -> None:
     data, new = make_data(120, SAMPLES), make_data(60, SAMPLES, seed=1)
-    model = fitted(data, TwoSpacesReducer())
+    model = fitted(data, make_reducer("conv", folds=2, kernels=4), capacity=150)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
     for i, (x, y) in enumerate(zip(new.X, new.y, strict=True)):
-        assert exported.learn(x, bool(y)) == 121 + i
+        assert exported.learn(x, bool(y)) == min(121 + i, 150)
         model.add(x, y)
-    ring = ring_of(exported)
-    np.testing.assert_array_equal(ring["spaces"][120:180], content_fold(new.X, 2))
-    assert set(ring["spaces"][120:180]) == {0, 1}
-    for name, mine in ring.items():
-        np.testing.assert_array_equal(mine, getattr(model.index.ring, name).numpy())
-    other = make_data(100, SAMPLES, seed=2).X
-    known = model.predict_many(other)
-    assert [d[2:6] for d in exported.decide_many(other)] == [(k.lower, k.upper, k.n_success, k.n_failure) for k in known]
+    ring = {name.rsplit(".", 1)[-1]: t.numpy() for name, t in exported.module.named_buffers() if ".ring." in name}
+    np.testing.assert_array_equal(ring["spaces"][120:], content_fold(new.X[:30], model.n_spaces))
+    for name in ("total", "labels", "spaces", "points"):
+        np.testing.assert_array_equal(ring[name], getattr(model.index, name).numpy())
 
 
 def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path: Path) -> None:
@@ -414,22 +338,3 @@ def test_what_was_learned_survives_saving(file: Path, many: np.ndarray, tmp_path
     for x in bad_traces(many[0]):
         assert again.learn(x, True) == before + 80
     assert again.learn(many[80], True) == before + 81
-
-
-def test_the_oldest_reference_leaves_first_whatever_its_label(make_data: Callable[..., Dataset], tmp_path: Path) -> None:
-    data = make_data(30, SAMPLES)
-    orders = []
-    for flip in (0, 1):  # the same traces under opposite labels: the same references must be left
-        model = fitted(Dataset(data.X, data.y ^ flip), capacity=40)
-        exported = load_exported(export_torchscript(model, tmp_path / f"{flip}.ts"))
-        for x, y in zip(make_data(25, SAMPLES, seed=2).X, make_data(25, SAMPLES, seed=2).y, strict=True):
-            held = exported.learn(x, bool(y ^ flip))
-        assert held == 40
-        ring = ring_of(exported)
-        assert int(ring["total"]) == 55
-        orders.append(ring)
-        points = model.index.ring.points.numpy()
-        np.testing.assert_array_equal(ring["points"][:, 15:30], points[:, 15:30])  # the newest of the first ones stay
-        assert (ring["points"][:, :15] != points[:, :15]).any(axis=0).all()  # the oldest fifteen have left
-    np.testing.assert_array_equal(orders[0]["points"], orders[1]["points"])
-    np.testing.assert_array_equal(orders[0]["labels"][1], 1 - orders[1]["labels"][1])

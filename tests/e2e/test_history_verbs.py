@@ -1,38 +1,27 @@
 """`dengine history`, `explain` and `status`: what they print, of a store that has seen a little of everything."""
 
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy, Recipe, ReplayCell, open_store
+from dengine import Action, DataEngine, Dataset, Policy, ReplayCell
 from dengine.cli.history import WIDEST
-from dengine.cli.output import WIDE
 from dengine.decision.intervals import wilson_interval
-from dengine.history.status import Status, bad_accepts, course, status
-from dengine.store import Store
+from dengine.history.status import bad_accepts
 from dengine.store.records import Outcomes
-from tests.support.command_line import dengine, document, said, succeed, well
-from tests.support.driving import drive
-
-NOTHING = Outcomes(0, 0, 0, 0, 0, 0, 0, 0)
+from tests.support.command_line import dengine, document, said, succeed
+from tests.support.driving import RECIPE, drive, easy_parts
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine into safe mode."""
-    rng = np.random.default_rng(1)
-    y = rng.random(700) < 0.6
-    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (700, 40))
-    X[300:400] = 2 * X[300:400] + 8 * np.sin(2 * np.arange(40))
-    X[650, 3] = np.nan
-    y[rng.random(700) < 0.02] ^= True
+    data = easy_parts(700, 1, wave=slice(300, 400))
+    data.X[650, 3] = np.nan
+    data.y[np.random.default_rng(2).random(700) < 0.02] ^= 1
     path = tmp_path_factory.mktemp("store") / "engine.db"
     policy = Policy(alpha=0.2, lower_bound=0.8, guarantee="pooled", stops="all", audit_rate=0.05)
-    part = np.array([f"part-number-{i:05d}" for i in range(700)])
-    data = Dataset(X.astype(np.float32), y.astype(np.int8), name="changing", part=part)
     with DataEngine("pca", policy, store=str(path), replaying=True) as engine:
         for _ in engine.run(ReplayCell(data), 700):
             pass
@@ -50,13 +39,10 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(s
 
 
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
-    for option, value in (("--action", "accept"), ("--reason", "novel"), ("--label", "bad")):
-        found = document("history", store, "--last", 1000, option, value)["decisions"]
-        assert found
-        assert {each[option[2:]] for each in found} == {value}
-    found = document("history", store, "--last", 1000, "--model", "accept", "--action", "verify")["decisions"]
-    assert found
-    assert {(each["predicted"], each["action"]) for each in found} == {("accept", "verify")}
+    asked = {"action": "accept", "reason": "certain", "label": "bad", "predicted": "accept"}
+    words = [word for name, value in asked.items() for word in (f"--{name.replace('predicted', 'model')}", value)]
+    found = document("history", store, "--last", 1000, *words)["decisions"]
+    assert {tuple(each[name] for name in asked) for each in found} == {tuple(asked.values())}
     assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
     assert document("history", store, "--since", "2100-01-01")["decisions"] == []
     assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"
@@ -70,12 +56,12 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
         ("history", "--action pass", "'pass' is not one of"),
         ("history", "--reason why", "'why' is not one of"),
         ("history", "--last 0", "0 is not in the range"),
-        ("status", "--watch 1 --json", "--watch and --json exclude each other"),
+        ("explain", "nonsense", "Error: Expected the id of a decision of cell 'cell', got 'nonsense'"),
     ],
 )
 def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, store: Path) -> None:
     result = dengine(verb, store, *words.split())
-    assert result.exit_code == 2
+    assert result.exit_code == (1 if verb == "explain" else 2)
     assert expected in result.stderr
 
 
@@ -90,8 +76,6 @@ def test_every_reason_is_explained_in_80_columns_with_a_picture(store: Path, tmp
     for reason, id_ in known.items():
         out = tmp_path / f"{reason}.png"
         shown = succeed("explain", store, id_, "--out", out)
-        assert max(map(len, shown.replace(str(out), "").splitlines())) <= WIDE
-        assert "\u2026" not in shown
         assert id_ in shown
         assert out.read_bytes().startswith(b"\x89PNG")
         assert out.stat().st_size > 20_000
@@ -103,18 +87,11 @@ def test_an_explanations_document_is_its_record(store: Path) -> None:
     assert len(found["neighbours"]) == 4
     assert all(each["decision_id"] and "trace" not in each for each in found["neighbours"])
     assert found["bound"]["n_success"] == found["decision"]["n_success"]
-    assert found["envelope"]["largest"] is None or found["envelope"]["largest"] in found["envelope"]["excesses"]
+    widths = [each["widths"] for each in found["envelope"]["excesses"]]
+    assert widths == sorted(widths, reverse=True)
     assert found["said"][0].endswith("the bound meets the policy.")
     newest = document("history", store, "--last", 1)["decisions"][0]
     assert document("explain", store, "last")["decision"] | {"label": newest["label"]} == newest
-
-
-def test_an_unknown_decision_is_one_line_that_says_where_the_ids_are(store: Path) -> None:
-    result = dengine("explain", store, "nonsense")
-    assert result.exit_code == 1
-    assert result.stderr.startswith("Error: Expected the id of a decision of cell 'cell', got 'nonsense'")
-    assert "dengine history" in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
 
 
 def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
@@ -140,25 +117,18 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
     assert 0 <= found["new_labels"] <= found["recipe"]["retrain_every"] == 50
 
 
-def test_status_is_a_table_of_80_columns_and_a_picture(store: Path, tmp_path: Path) -> None:
-    out = tmp_path / "status.png"
-    shown = succeed("status", store, "--last", 200, "--out", out)
-    assert max(map(len, shown.replace(str(out), "").splitlines())) <= WIDE
-    for words in ("last 200", "since birth", "labels waiting", "way to an alarm", "of them bad"):
-        assert words in shown
-    assert out.read_bytes().startswith(b"\x89PNG")
-    opened = open_store(store)
-    drawn = course(opened, Recipe.from_toml(opened.settings()["recipe"]), 200)
-    opened.close()
-    assert sum(each.n for each in drawn.stretches) == 700
-    assert len(drawn.modes) >= 2
-
-
-def test_a_store_with_no_decision_yet_is_shown_and_drawn_too(tmp_path: Path) -> None:
-    DataEngine("pca", store=str(tmp_path / "new.db")).close()
-    assert "none was accepted" in succeed("status", tmp_path / "new.db", "--out", tmp_path / "new.png")
-    assert document("status", tmp_path / "new.db")["ever"]["verified_share"] is None
-    assert dengine("explain", tmp_path / "new.db", "last").exit_code == 1
+def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(tmp_path: Path) -> None:
+    file = tmp_path / "new.db"
+    DataEngine("pca", store=file).close()
+    assert "none is known" in succeed("status", file)
+    assert document("status", file)["ever"]["verified_share"] is None
+    assert dengine("explain", file, "last").exit_code == 1
+    with DataEngine.open(file) as engine:
+        engine.decide(np.arange(30.0))
+        engine.retrain()
+        dropped = engine.retrain()
+    ever = document("status", file)["ever"]
+    assert (ever["dropped"], ever["unlabelled"]) == ({dropped.reason: 2}, 1)
 
 
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
@@ -173,40 +143,14 @@ def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     assert bad_accepts(audited, some).verdict == "kept"
     assert bad_accepts(Outcomes(50, 30, 20, 0, 0, 0, 0, 0), every).verdict == "broken"
     assert bad_accepts(Outcomes(10, 1, 9, 0, 0, 0, 0, 0), every).verdict == "open"
-    assert bad_accepts(NOTHING, every).upper == 1.0
-
-
-def test_dropped_retrains_are_counted_with_their_reasons(tmp_path: Path) -> None:
-    with DataEngine("pca", store=str(tmp_path / "engine.db")) as engine:
-        engine.decide(np.arange(30.0))
-        engine.flush()
-        engine.retrain()
-        engine.retrain()
-        found = status(engine.store)
-        assert found.ever.dropped == {engine.store.retrains()[0].reason: 2}
-        assert found.ever.unlabelled == 1
-
-
-def test_watch_redraws_until_ctrl_c_and_ends_cleanly(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[int] = []
-
-    def drawn(store: Store, last: int, watching: bool) -> Status:
-        shown.append(last)
-        if len(shown) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return status(store, last, watching=watching)
-
-    monkeypatch.setattr("dengine.history.status.status", drawn)
-    result = well("status", store, "--watch", "0.1")
-    assert result.stdout.count("how it is doing") == len(shown) - 1 == 1
-    assert result.stderr == ""
+    assert bad_accepts(Outcomes(*[0] * 8), every).upper == 1.0
 
 
 def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(stream: Dataset, tmp_path: Path) -> None:
-    store, recipe = tmp_path / "engine.db", Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(0.1, 0.9))
-    with DataEngine(recipe=recipe, store=store) as engine:
+    store = tmp_path / "engine.db"
+    with DataEngine(recipe=RECIPE, store=store) as engine:
         drive(engine, stream, 0, 30)
-        assert "would accept │ none was checked" in " ".join(succeed("status", store).split())
+        assert "would accept │ none is known" in " ".join(succeed("status", store).split())
         engine.set_shadow(True)
         cycles = drive(engine, stream, 30, 300)
     certain = [cycle for cycle in cycles if cycle.decision.audit]
@@ -220,9 +164,6 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
         assert (span["n"], span["wrong"]) == (len(true), wrong)
         assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
     accept, certified = told["ever"]["would_accept"], told["certificate"]
-    assert accept["n"] > 50
-    assert accept["verdict"] == "kept"
-    assert certified["accepted"]["shadowed"] is True
+    assert (accept["n"] > 50, accept["verdict"], certified["accepted"]["shadowed"]) == (True, "kept", True)
     assert f"Of {accept['n']} parts that the model would accept, each of which was checked," in certified["sentence"]
-    assert "parts that the model would reject, each of which was" in certified["sentence_on_rejects"]
-    assert "the shadow mode, in which it only says what" in said("status", store)
+    assert "shadow yes" in said("status", store)

@@ -20,11 +20,7 @@ from dengine.records import Action, Reason
 from tests.support.exports import fitted, trained
 
 SPEC = TraceSpec(100, limit=500.0)
-BALLS: list[dict[str, Any]] = [
-    {},
-    {"interval": "binomial", "fraction": 0.3},
-    {"fraction": 0.3, "reject_fraction": 0.08},
-]
+BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "fraction": 0.3}, {"fraction": 0.3, "reject_fraction": 0.08}]
 
 
 @pytest.fixture(scope="module")
@@ -51,37 +47,25 @@ def test_both_formats_decide_alike(make_data: Callable[..., Dataset], tmp_path: 
     assert Action.ACCEPT in {d.action for d in one.decide_many(X)}
 
 
-def test_audits_are_refused_with_the_reason(data: Dataset, tmp_path: Path) -> None:
-    with trained(data, audit_rate=0.1) as engine, pytest.raises(ExportError, match="ONNX carries no audits"):
-        export_onnx(engine, tmp_path / "model.onnx")
-
-
 class OwnRule(DecisionRule):
     """A rule of the user's own; the twin cannot know what it does."""
-
-
-@pytest.mark.parametrize(
-    ("rule", "name"),
-    [
-        (Policy(guarantee="pooled").rule(), "PooledRule"),
-        (Policy(stops="all").rule(), "WatchedRule"),
-        (OwnRule(0.1, 0.9), "OwnRule"),
-    ],
-)
-def test_a_rule_that_learns_is_refused(data: Dataset, tmp_path: Path, rule: DecisionRule, name: str) -> None:
-    model = ModelPrediction("pca", rule=rule).fit(data.X, data.y)
-    with pytest.raises(ExportError, match=f"ONNX carries no {name}, a rule that learns; export torchscript"):
-        export_onnx(model, tmp_path / "model.onnx")
 
 
 def test_what_the_twin_cannot_do_is_refused(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashes = np.arange(1, len(data) + 1)
     hashes[7] = hashes[3]
-    model = ModelPrediction("pca").fit(data.X, data.y, hashes=hashes)
-    with pytest.raises(ExportError, match="ONNX carries no votes: 1 of the references"):
-        export_onnx(model, tmp_path / "model.onnx")
-    with pytest.raises(ExportError, match="use wilson or binomial"):
-        export_onnx(fitted(data, interval="jeffreys"), tmp_path / "model.onnx")
+    with trained(data, audit_rate=0.1) as engine:
+        for model, why in (
+            (engine, "ONNX carries no audits"),
+            (ModelPrediction("pca").fit(data.X, data.y, hashes=hashes), "ONNX carries no votes: 1 of the references"),
+            (fitted(data, interval="jeffreys"), "use wilson or binomial"),
+            *(
+                (ModelPrediction("pca", rule=rule).fit(data.X, data.y), f"no {type(rule).__name__}, a rule that learns")
+                for rule in (Policy(guarantee="pooled", stops="all").rule(), Policy(stops="all").rule(), OwnRule(0.1, 0.9))
+            ),
+        ):
+            with pytest.raises(ExportError, match=why):
+                export_onnx(model, tmp_path / "model.onnx")
     monkeypatch.setattr("dengine.export.onnx.find_spec", lambda name: None if name == "onnxscript" else object())
     with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
         export_onnx(fitted(data), tmp_path / "model.onnx")

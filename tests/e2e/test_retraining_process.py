@@ -15,15 +15,13 @@ import torch
 
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.serve.retraining import RetrainingProcess
+from tests.support.driving import learn
 
 CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
-def learn(engine: DataEngine, data: Dataset) -> None:
-    for x, y in zip(data.X[:40], data.y[:40], strict=True):
-        decision = engine.decide(x)
-        if decision.action != "reject":
-            engine.report(decision.id, bool(y))
+def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
+    learn(engine, data, range(40))
     while engine.retraining:
         engine.settle()
         time.sleep(0.01)
@@ -60,7 +58,7 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(data: Dataset) -> 
     with RetrainingProcess() as process, ThreadPoolExecutor(1) as thread:
         for executor in (process, thread):
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
-            learn(engine, data)
+            learn_and_settle(engine, data)
             assert engine.version == 1
             decided.append([(each.embedding, each.lower, each.upper) for each in map(engine.decide, data.X[40:60])])
     assert decided[0] == decided[1]  # bit for bit
@@ -72,6 +70,6 @@ def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retr
         os.kill(process.submit(os.getpid).result(60), signal.SIGKILL)
         with pytest.raises(BrokenExecutor):
             process.submit(os.getpid).result(60)
-        learn(engine, data)
+        learn_and_settle(engine, data)
         engine.start_retrain()
     assert engine.version >= 1

@@ -1,17 +1,12 @@
 """`dengine serve` as a process of its own: how it ends, and a robot whose force it records."""
 
 import http.client
-import json
-import os
 import queue
 import signal
-import subprocess
-import sys
 import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,66 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-for needed in ("uvicorn", "starlette", "prometheus_client", "msgspec", "defusedxml"):
-    pytest.importorskip(needed, reason='the server is not installed: pip install "dengine[serve]"')
+pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
-from dengine import DataEngine, Dataset, Recipe  # not before it is known to be there
+from dengine import DataEngine, Dataset, Recipe
 from dengine.cells import FakeController
-from dengine.cells.ur.protocol import column_of
+from tests.support.serving import WAIT, started
 
-REPO = Path(__file__).resolve().parents[2]
 SAMPLES = 80
-WAIT = 60.0  # seconds, for what takes a fraction of one: a machine may be busy
+NAMES = "action", "reason", "lower"
 
 
 @pytest.fixture(scope="module")
 def parts(make_data) -> Dataset:
     return make_data(200, samples=SAMPLES)
-
-
-@dataclass
-class Process:
-    """A server that runs, and what it said."""
-
-    process: subprocess.Popen[str]
-    port: int
-    said: str = ""
-
-    def ask(self, path: str, body: Any = None) -> dict[str, Any]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)
-        data, kind = (None, {}) if body is None else (json.dumps(body), {"content-type": "application/json"})
-        connection.request("GET" if body is None else "POST", path, data, kind)
-        answer = connection.getresponse()
-        said = json.loads(answer.read())
-        connection.close()
-        if answer.status != 200:
-            raise OSError(f"{path}: {answer.status} {said}")
-        return said
-
-    def robot(self) -> Any:
-        return xmlrpc.client.ServerProxy(f"http://127.0.0.1:{self.port}/RPC2")
-
-    def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
-        """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
-        (os.killpg if group else os.kill)(self.process.pid, number)
-        self.said, _ = self.process.communicate(timeout=WAIT)
-        return self.process.returncode
-
-
-@contextmanager
-def server(folder: Path, *words: str, wait: bool = True) -> Iterator[Process]:
-    """A server's process. wait : until it says where it listens."""
-    command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", "--no-page", *words]
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    environment = os.environ | {"PYTHONPATH": str(REPO)}
-    process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
-    try:
-        said = next(line for line in process.stdout if "is served at" in line or process.poll() is not None) if wait else ""
-        yield Process(process, int(said.partition("127.0.0.1:")[2].partition(",")[0] or 0))
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
 
 
 def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
@@ -135,12 +83,10 @@ class Robots:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
-    tmp_path: Path, parts: Dataset, name: str
-) -> None:
+def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(tmp_path, parts, name: str) -> None:
     recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=3.0)  # seconds: so that a retrain is met
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with server(tmp_path, "--recipe", "recipe.toml", "--rate", "0") as process:
+    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0") as process:
         robots = Robots(process.ask, parts)
         threads = robots.start()
         until(lambda: process.ask("/status")["retraining"])
@@ -159,18 +105,14 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
             known = engine.find(id_)
-            assert (known.decision.action, known.decision.reason, known.decision.lower) == (
-                answer["action"],
-                answer["reason"],
-                answer["lower"],
-            )
+            assert [getattr(known.decision, name) for name in NAMES] == [answer[name] for name in NAMES]
 
 
 @pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
 def test_a_server_that_is_killed_leaves_no_retraining_process_behind(tmp_path: Path, parts: Dataset, at_work: bool) -> None:
     recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with server(tmp_path, "--recipe", "recipe.toml", "--rate", "0", wait=at_work) as process:
+    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0", wait=at_work) as process:
         if at_work:
             threads = Robots(process.ask, parts).start(1)
             until(lambda: process.ask("/status")["retraining"])
@@ -204,7 +146,7 @@ class Insertions:
             force = next(self._force)
         elif force is None and self._over is not None:
             self._over.set()
-        return {column_of("FZ_Base"): force or 0.0, "output_int_register_25": float(force is not None)}
+        return {"actual_TCP_force[2]": force or 0.0, "output_int_register_25": float(force is not None)}
 
 
 def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, Any]:
@@ -219,14 +161,12 @@ def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, An
     return until(decided)
 
 
-def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(
-    tmp_path: Path, parts: Dataset
-) -> None:
+def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(tmp_path, parts) -> None:
     program = Insertions()
     with FakeController(program) as fake:
         robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
-        with server(tmp_path, "--reducer", "pca", *robot_at) as process:
-            robot = process.robot()
+        with started(tmp_path, "--no-page", "--reducer", "pca", *robot_at) as process:
+            robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
             for i in range(2):
                 answer = inserted(robot, program, parts.X[i])
                 assert (answer["action"], answer["reason"]) == (0, "no_model")

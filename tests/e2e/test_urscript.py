@@ -10,27 +10,24 @@ import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy, Recipe
-from dengine.serve.service import CellService
-from dengine.store.views import HistoryFilter
-from tests.support.serving import PushedTraces, served
-
-xml_rpc = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
 pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
-Starlette = pytest.importorskip("starlette.applications").Starlette
+
+from dengine import Action, Dataset
+from dengine.serve.auth import Access
+from dengine.serve.http import create_app
+from dengine.store.views import HistoryFilter
+from tests.support.serving import PushedTraces, a_service, held, served
 
 SCRIPT = Path(__file__).parents[2] / "training" / "ur_xmlrpc_cell.script"
 TEXT = SCRIPT.read_text(encoding="utf-8")
 CODE = [line.partition("#")[0].rstrip() for line in TEXT.splitlines()]
 SAMPLES = 60
-RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 BLOCK = re.compile(r"^\s*(def|thread|if|while)\b.*:$")
 MANUAL = {  # of the script manual of e-Series, version 5
     *("movel", "stopl", "pose_trans", "sleep", "force_mode", "end_force_mode", "get_actual_tcp_pose", "zero_ftsensor"),
@@ -80,9 +77,8 @@ class Handle(xmlrpc.client.ServerProxy):
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[SimpleNamespace]:
     """A server at a port of its own, its service, and its recorder."""
-    service = CellService(lambda: DataEngine.open_or_create(tmp_path / "cell.db", recipe=RECIPE), deadline=30.0)
-    recorder = PushedTraces()
-    with closing(service), served(Starlette(routes=xml_rpc.routes(service, recorder)), lifespan="off") as port:
+    recorder, access = PushedTraces(), Access(rate=0.0)
+    with a_service(tmp_path / "cell.db") as service, served(create_app(service, access, recorder=recorder)) as port:
         yield SimpleNamespace(service=service, recorder=recorder, port=port)
 
 
@@ -168,12 +164,9 @@ def test_a_shift_of_the_program_decides_checks_and_reports(cell: SimpleNamespace
 
 
 def test_what_is_not_answered_in_time_is_checked(cell: SimpleNamespace, make_data) -> None:
-    data, free = make_data(2, samples=SAMPLES, seed=3), threading.Event()
-    held = cell.service.submit(lambda engine: free.wait(60))
-    robot = Robot(data, 2, cell, patience=0.3)
-    robot.play()
-    free.set()
-    held.result(60)
+    robot = Robot(make_data(2, samples=SAMPLES, seed=3), 2, cell, patience=0.3)
+    with held(cell.service):
+        robot.play()
     assert robot.checked == [0, 1]
     assert sum("no answer" in said for said in robot.said) == 2
     assert sum("a label was not kept" in said for said in robot.said) == 2

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Policy, Recipe
+pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
+
+from dengine import Dataset
 from dengine.errors import BusyError
+from dengine.serve import xmlrpc as xml_rpc
+from dengine.serve.auth import Access
+from dengine.serve.http import create_app
 from dengine.serve.robot_calls import SAMPLES, RobotCalls
 from dengine.serve.service import CellService
-from tests.support.serving import PushedTraces, held, served
+from tests.support.serving import PushedTraces, a_service, held, served
 
-xml_rpc = pytest.importorskip("dengine.serve.xmlrpc", reason="XML-RPC needs the extra `serve`")
-pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
-Starlette = pytest.importorskip("starlette.applications").Starlette
-
-RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
 VERIFY, ACCEPT = 0, 1
 
 
@@ -45,23 +45,18 @@ class Cell:
 
 
 @pytest.fixture(scope="module")
-def stream(make_data) -> Dataset:
-    return make_data(200, samples=60, seed=3)
-
-
-@pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[Cell]:
-    file, recorder = tmp_path_factory.mktemp("cell") / "cell.db", PushedTraces()
-    service = CellService(lambda: DataEngine.open_or_create(file, recipe=RECIPE), file, deadline=30.0)
-    app = Starlette(routes=xml_rpc.routes(service, recorder, patience=0.1, most=200_000))
-    with closing(service), served(app, lifespan="off") as port:
-        made = Cell(service, recorder, port)
-        robot = made.robot()
-        for i in range(50):  # it retrains after 40
-            answer = robot.decide(stream.X[i].tolist())
-            if answer["action"] == VERIFY:
-                assert robot.report(answer["id"], bool(stream.y[i]))
-        yield made
+    recorder = PushedTraces()
+    with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as service:
+        app = create_app(service, Access(rate=0.0, largest=200_000), page=False, recorder=recorder)
+        with served(app) as port:
+            made = Cell(service, recorder, port)
+            robot = made.robot()
+            for i in range(50):  # it retrains after 40
+                answer = robot.decide(stream.X[i].tolist())
+                if answer["action"] == VERIFY:
+                    assert robot.report(answer["id"], bool(stream.y[i]))
+            yield made
 
 
 def fault_of(answer: tuple[int, bytes]) -> xmlrpc.client.Fault:
@@ -94,7 +89,10 @@ def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
     robot = cell.robot()
     id_ = robot.begin()
-    assert [robot.add(id_, stream.X[1][at : at + 25].tolist()) for at in (0, 25, 50)] == [25, 50, 60]
+    pieces = stream.X[1][:25].tolist(), stream.X[1][25:50].astype("<f4").tobytes(), stream.X[1][50:].tolist()
+    assert [robot.add(id_, piece) for piece in pieces] == [25, 50, 60]
+    assert robot.decide(stream.X[1].astype("<f4").tobytes(), "whole", "P8")["id"] == "whole"
+    assert np.array_equal(cell.find("whole").trace[0], stream.X[1])
     answer = robot.decide_added(id_, 7)
     assert (answer["id"], robot.decide_added(id_, 7), robot.action_added(id_)) == (id_, answer, answer["action"])
     known = cell.find(id_)

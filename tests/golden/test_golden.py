@@ -1,7 +1,6 @@
 """Engines and exported files decide as they did before the modules were moved and merged, bit for bit."""
 
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from dengine import Action, Reason
+from tests.support.programs import Program
 
 GOLDEN = Path(__file__).parent
 sys.path.insert(0, str(GOLDEN))
@@ -63,17 +63,15 @@ def test_an_exported_file_takes_every_decision_that_it_took(name: str, exported:
 
 
 @pytest.mark.parametrize("name", EXPORTED)
-def test_the_cell_program_takes_the_same_decisions(
-    name: str, exported: Callable[[str], Path], programs: Path, tmp_path: Path
-) -> None:
-    data, labels = STORIES[name].told()
-    rows = zip(data.part, labels, data.X, strict=True)
-    said = "".join(f"{part},{label},{','.join(f'{v:.9g}' for v in x)}\n" for part, label, x in rows)
-    options = ["--parts", "--learn", "--journal", str(tmp_path / "cell.csv")]
-    command = [str(programs / "dengine-cell"), str(exported(name)), *options]
-    done = subprocess.run(command, input=said, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    words = np.array([line.split(",")[:-1] for line in done.stdout.splitlines()])  # without the time that it took
+def test_the_cell_program_takes_the_same_decisions(name: str, exported, programs: Path, tmp_path: Path) -> None:
+    (data, labels), answers = STORIES[name].told(), []
+    with Program(programs, exported(name), "--journal", tmp_path / "cell.csv") as cell:
+        for x, part, label in zip(data.X, data.part, labels, strict=True):
+            id_, *said, _ = cell.decide(x, part)  # without the time that it took
+            answers.append(said)
+            if label and said[0] != Action.REJECT:
+                assert cell.ask(f"label {id_} {label}") == f"ok {id_}"
+    words = np.array(answers)
     expected = kept(name)
     if not SAME_MACHINE:
         assert (words[:, 0] != expected["action"]).mean() <= MOVED

@@ -31,12 +31,9 @@ ESTIMATORS = (
 BATCH = "UMAP lays the rows of a batch out together, so a row's place depends on those beside it."
 # By estimator, by check: why it is right that it fails.
 EXCLUDED: dict[type, dict[str, str]] = {
-    UmapReducer: {
-        "check_methods_sample_order_invariance": BATCH,
-        "check_methods_subset_invariance": BATCH,
-    },
+    UmapReducer: {"check_methods_sample_order_invariance": BATCH, "check_methods_subset_invariance": BATCH},
     CrossFitted: {
-        "check_fit2d_1feature": "Of ten rows, those outside one of the two folds are of one class, and that is said first.",
+        "check_fit2d_1feature": "Of ten rows, those outside one of the two folds are of one class, and that is said first."
     },
 }
 

@@ -13,7 +13,7 @@ MODELS = sorted((Path(__file__).parents[2] / "models").glob("*/model.ts"))
 
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
-def test_a_shipped_model_loads_and_is_certain_and_right_of_most_of_its_own_data(path: Path) -> None:
+def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_card_says_what_made_it(path: Path) -> None:
     model, data = load_exported(path), load_dataset("insertion")
     assert model.metadata["references"] == len(data)
     decisions = model.decide_many(data.X[:300])
@@ -21,8 +21,4 @@ def test_a_shipped_model_loads_and_is_certain_and_right_of_most_of_its_own_data(
     rejected = np.array([d.action == "reject" for d in decisions])
     assert (accepted | rejected).mean() > 0.5
     assert data.y[:300][accepted].mean() >= Recipe.load(path.parent.name).policy.lower_bound
-
-
-@pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
-def test_a_shipped_model_has_a_card_with_the_command_that_made_it(path: Path) -> None:
     assert f"--out models/{path.parent.name}" in (path.parent / "card.md").read_text(encoding="utf-8")

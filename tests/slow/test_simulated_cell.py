@@ -30,12 +30,12 @@ def good(**changes: float | str) -> Conditions:
 def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests_on_the_rim() -> None:
     pushed = push(good())
     assert abs(pushed.height_mm) < 0.5
-    force = pushed.wrench[:, 2]
+    force = pushed.force
     assert np.abs(force[:400]).max() < 3
     assert 8 < force[-50:].mean() < 41
     beside = push(good(offset_x_mm=5.0))
     assert beside.height_mm > 11
-    assert beside.wrench[-50:, 2].mean() == pytest.approx(40.0, abs=2.0)
+    assert beside.force[-50:].mean() == pytest.approx(40.0, abs=2.0)
 
 
 def traces(insertions: list[Insertion]) -> np.ndarray:
@@ -55,7 +55,7 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
     assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
 
 
-def test_the_clock_charges_cycles_verifications_and_stops() -> None:
+def test_the_clock_charges_cycles_verifications_stops_and_good_parts_sent_back() -> None:
     cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=0.0))
     cell.insert()
     assert not cell.verify()
@@ -64,21 +64,16 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
             again()
     cell.insert()
     assert cell.proceed() is Outcome.STOPPED
-    assert cell.clock == 47 + 5 + 47 + 120
     report = cell.report()
     assert (report.cycles, report.finished, report.verifications, report.stops) == (2, 0, 1, 1)
-    assert report.seconds_saved == 5 - 120
-
-
-def test_a_good_part_sent_back_costs_a_further_cycle() -> None:
-    cell = SimulatedCell(ALWAYS_GOOD, channels="all")
-    assert cell.insert().shape == (6, 1000)
+    assert (cell.clock, report.seconds_saved) == (47 + 5 + 47 + 120, 5 - 120)
+    cell = SimulatedCell(ALWAYS_GOOD)
+    assert cell.insert().shape == (1000,)
     cell.reject()
     cell.insert()
     cell.verify()
-    assert cell.clock == 47 + 47 + 5
     report = cell.report()
-    assert (report.finished, report.sent_back) == (1, 1)
+    assert (report.finished, report.sent_back, cell.clock) == (1, 1, 47 + 47 + 5)
     assert report.seconds_saved == (47 + 5) - cell.clock  # always verifying, one part would have taken 52 s
 
 
@@ -100,7 +95,6 @@ def test_scenarios_change_what_they_say_and_nothing_else() -> None:
         (lambda: CellParameters(debris=8.0), "probability"),
         (lambda: CellParameters(debris=0.6, weak_grip=0.6), "sum to at most 1"),
         (lambda: find_scenario("rain"), "nominal, wear, variant, bias_jump"),
-        (lambda: SimulatedCell(channels="x"), "z, all"),
         (lambda: simulate(0), "at least 1"),
         (lambda: push(good(), time_step_s=0.0007), "divides 2 ms"),
     ],
@@ -111,9 +105,9 @@ def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None
 
 
 def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
-    made = simulate(4, seed=6, n_jobs=1, channels="all")
+    made = simulate(4, seed=6, n_jobs=1)
     with np.load(save_insertions(tmp_path / "traces.npz", made, seed=6), allow_pickle=False) as saved:
-        assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 6, 1000))
+        assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 1000))
         np.testing.assert_allclose(saved["X"] * saved["scale"], traces(made), atol=0.51 * float(saved["scale"].max()))
         np.testing.assert_array_equal(saved["y"], [each.success for each in made])
         np.testing.assert_array_equal(saved["cause"], [each.cause for each in made])

@@ -1,14 +1,19 @@
 """The scripts in training/: what they say of themselves is so, and small data does not break them."""
 
 import importlib
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+
+from dengine import load_dataset
+from tests.support.driving import easy_parts
 
 FOLDER = Path(__file__).resolve().parents[2] / "training"
 Run = Callable[..., str]
@@ -34,11 +39,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """60 traces of 40 samples in two easy shapes."""
-    rng = np.random.default_rng(0)
-    y = rng.random(60) < 0.6
-    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (60, 40))
+    data = easy_parts(60, 0)
     path = tmp_path_factory.mktemp("data") / "tiny.npz"
-    np.savez(path, X=X.astype(np.float32), y=y.astype(np.int8))
+    np.savez(path, X=data.X, y=data.y)
     return path
 
 
@@ -46,27 +49,21 @@ def load(name: str) -> ModuleType:
     return importlib.import_module(name)
 
 
-def test_a_comparison_of_60_cycles_has_a_table_and_a_csv(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ["report", "--data", tiny, "--reducers", "pca", "--seeds", "0:2", "--n-jobs", 1, "--out", tmp_path]
-    out = run("compare_reducers", *words)
-    assert "pca" in out
+def test_a_comparison_has_a_table_and_a_csv_and_plays_nothing_twice_that_it_kept(run: Run, tiny, tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    words = ["report", "--data", tiny, "--reducers", "pca,never", "--seeds", "0:2", "--policies", "0.1:0.9", "--n-jobs", 1]
+    first, second = (run("compare_reducers", *words, "--out", tmp_path, "--keep", kept) for _ in range(2))
+    assert first[first.index("report:") :] == second[second.index("report:") :]  # times and all
+    assert len(list(kept.iterdir())) == 4
     assert len((tmp_path / "report_tiny.csv").read_text().splitlines()) == 1 + 2 * 2
 
 
-def test_a_comparison_plays_nothing_twice_that_it_kept(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ["report", "--data", tiny, "--reducers", "pca,never", "--seeds", "0:2", "--policies", "0.1:0.9", "--n-jobs", 1]
-    first, second = (run("compare_reducers", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2))
-    assert "4 of 4" in first
-    assert "of 4" not in second
-    assert first[first.index("report:") :] == second[second.index("report:") :]  # times and all
-
-
 def test_a_rival_without_a_bound_says_so_in_its_row(run: Run, tiny: Path, tmp_path: Path) -> None:
-    words = ["report", "--data", tiny, "--reducers", "pca,never,always,river", "--seeds", "0:1", "--policies", "0.1:0.9"]
+    words = ["report", "--data", tiny, "--reducers", "pca,never,always,knn", "--seeds", "0:1", "--policies", "0.1:0.9"]
     table = (line for line in run("compare_reducers", *words, "--n-jobs", 1, "--out", tmp_path).splitlines() if "|" in line)
     bounds = {line.split("|")[1].strip().split(":")[0]: line.split("|")[2].strip() for line in table}
     assert bounds["never"] == "none"
-    assert bounds["river"] == "none: threshold swept"
+    assert bounds["knn"] == "none: threshold swept"
     assert bounds["pca"] == "Wilson, at one look"
     assert bounds["always"].startswith("no error")
 
@@ -85,3 +82,61 @@ def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, mo
     monkeypatch.setattr(SqlStore, "put_version", slow)
     row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
     assert row["retrain_p50_s"] >= 0.4
+
+
+@pytest.mark.parametrize(
+    ("on", "change", "expected"),
+    [
+        ([0, 0, 0, 1, 1, 0], 2, (2, 2)),
+        ([0, 0, 1, 1, 0, 0], 2, (1, 2)),
+        ([1, 0, 0, 0, 0, 0], 2, (None, None)),  # a false alarm before the change is none of it
+        ([0, 0, 0, 0, 1, 1], 2, (3, None)),
+    ],
+)
+def test_an_alarm_is_counted_from_the_change_and_lasts_until_it_is_off(on: list, change: int, expected: tuple) -> None:
+    assert load("compare_drift").alarm_and_back(np.array(on, dtype=bool), change) == expected
+
+
+def test_a_change_is_marked_at_the_first_cycle_that_it_touches() -> None:
+    # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
+    changes = {"nominal": None, "wear": 2, "variant": 401, "bias_jump": 401}
+    assert {name: load("compare_drift").first_change(name, 800) for name in changes} == changes
+
+
+def test_escapes_are_shares_of_the_parts_that_were_passed_on() -> None:
+    log = SimpleNamespace(false_positive=np.array([0, 0, 0, 1, 0]), finished=np.array([1, 0, 1, 0, 0]))
+    assert load("compare_drift").escapes(log, slice(None)) == pytest.approx(1000 / 3)
+    assert np.isnan(load("compare_drift").escapes(log, slice(1, 2)))
+
+
+def test_a_stream_that_is_there_is_compared_under_drift_without_a_simulator(run, make_data, tmp_path, monkeypatch) -> None:
+    data = make_data(240, noise=0.2)
+    data.X[120:] += np.float32(30.0)  # the sensor's offset jumps half way
+    (tmp_path / "streams").mkdir()
+    np.savez(tmp_path / "streams" / "bias_jump_240_7.npz", X=data.X, y=data.y)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    words = ["--cycles", 240, "--scenarios", "bias_jump", "--seed", 7, "--n-jobs", 1, "--out", tmp_path]
+    assert "bias_jump" in run("compare_drift", *words, "--methods", "dengine,paper-conv")
+    table = pd.read_csv(tmp_path / "drift.csv").set_index("method")
+    novel = {name: int(said.split(" / ")[1]) for name, said in table["novel"].items()}
+    assert novel["dengine"] > 0 == novel["paper-conv"]
+    assert 1 <= int(table.loc["dengine", "alarm"]) < 40
+    assert table.loc["paper-conv", "alarm"] == "-"
+    assert (tmp_path / "drift.png").is_file()
+
+
+def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run: Run, tmp_path: Path) -> None:
+    steps = [([0.0, 0.0024, 0.0036], [0.0, 0.2, 0.3]), ([0.0036, 0.0048], [0.3, 0.5])]
+    graphs = [{"graph": {"time values": time, "torque values": torque}} for time, torque in steps]
+    with pytest.raises(SystemExit, match=r"Expected files Ch_\*.json"):
+        run("make_screw_driving", tmp_path)
+    for cycle, part, result in ((7, "a", "NOK"), (5, "a", "OK"), (6, "b", "OK")):
+        written = {"cycle": cycle, "id code": part, "result": result, "tightening steps": graphs}
+        (tmp_path / f"Ch_{cycle:012d}.json").write_text(json.dumps(written), encoding="utf-8")
+    said = run("make_screw_driving", tmp_path, "--samples", 7, "--out", tmp_path / "out.npz")
+    assert "3 runs of 2 workpieces, 2 OK and 1 NOK" in said
+    data = load_dataset(tmp_path / "out.npz")
+    np.testing.assert_allclose(data.X, [[0.0, 0.1, 0.2, 0.3, 0.5, 0.5, 0.5]] * 3, atol=1e-6)
+    assert (data.y.tolist(), data.unit, round(data.rate_hz)) == ([1, 1, 0], "N·m", 833)
+    with np.load(tmp_path / "out.npz") as stored:
+        assert (stored["workpiece"].tolist(), stored["nth_run"].tolist()) == (["a", "b", "a"], [0, 0, 1])

@@ -1,10 +1,12 @@
 """The `dengine` command in this process: what it printed, and with which exit code."""
 
 import json
+from tempfile import gettempdir
 
 from click.testing import CliRunner, Result
 
 from dengine.cli import main
+from dengine.cli.output import WIDE
 
 
 def dengine(*words: object) -> Result:
@@ -13,9 +15,12 @@ def dengine(*words: object) -> Result:
 
 
 def well(*words: object) -> Result:
-    """A verb that must end well."""
+    """A verb that must end well; but for JSON, help, paths and a history its output fits 80 columns, uncut."""
     result = dengine(*words)
     assert result.exit_code == 0, result.output
+    if not {"--json", "--help", "history"} & set(words):
+        assert not [line for line in result.stdout.splitlines() if len(line) > WIDE and gettempdir() not in line]
+        assert "\u2026" not in result.stdout  # how rich marks what it has cut
     return result
 
 

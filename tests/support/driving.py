@@ -4,7 +4,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dengine import Action, DataEngine, Dataset, Decision, ReplayCell
+from dengine import Action, DataEngine, Dataset, Decision, Policy, Recipe, ReplayCell
+
+RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
 
 
 class Counting:
@@ -32,6 +34,10 @@ class Counting:
         return np.full(len(X), Action.VERIFY, dtype=object)
 
 
+def make(recipe: Recipe = RECIPE, **options) -> DataEngine:
+    return DataEngine(recipe=recipe, replaying=True, **options)
+
+
 def drive(engine: DataEngine, data: Dataset, first: int = 0, last: int | None = None, **options) -> list:
     """The cycles of the parts first..last."""
     order = np.arange(len(data))[first:last]
@@ -49,3 +55,13 @@ def learn(engine: DataEngine, data: Dataset, rows: Iterable[int]) -> None:
         decision = engine.decide(data.X[i])
         if decision.action is not Action.REJECT:
             engine.report(decision.id, bool(data.y[i]))
+
+
+def easy_parts(n: int, seed: int, wave: slice = slice(0)) -> Dataset:
+    """Traces of 40 samples in two easy shapes, each of a part of its own. wave : where the sensor was hit by one."""
+    rng = np.random.default_rng(seed)
+    y = rng.random(n) < 0.6
+    X = np.where(y[:, None], np.linspace(0, 5, 40), np.linspace(5, 0, 40)) + rng.normal(0, 0.3, (n, 40))
+    X[wave] = 2 * X[wave] + 8 * np.sin(2 * np.arange(40))
+    part = np.array([f"part-number-{i:05d}" for i in range(n)])
+    return Dataset(X.astype(np.float32), y.astype(np.int8), name="easy", part=part)

@@ -1,5 +1,6 @@
 """Engines and models to be exported, and traces of every kind for what was exported of them."""
 
+import zlib
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,15 @@ def fitted(data: Dataset, reducer: Any = "pca", **settings: Any) -> ModelPredict
     """A model of all labels, as a script makes it."""
     classifier = WilsonRadiusClassifier(**{"alpha": 0.1, "lower_bound": 0.9} | settings)
     return ModelPrediction(reducer, classifier).fit(data.X, data.y)
+
+
+def cell_journal(*lines: str | bytes, head: str = "# dengine 4 0123") -> bytes:
+    """A cell program's journal of these lines, each with the checksum over all so far."""
+    crc, text = zlib.crc32(head.encode()), head.encode() + b"\n"
+    for line in (each.encode() if isinstance(each, str) else each for each in lines):
+        crc = zlib.crc32(line, crc)
+        text += b"%s,%08x\n" % (line, crc)
+    return text
 
 
 def bad_traces(x: np.ndarray) -> list[np.ndarray]:

@@ -1,10 +1,18 @@
-"""Servers for tests: an application at a port of its own, the engine's thread held up, and a certificate."""
+"""Servers for tests: a service, an application at a port of its own, `dengine serve` as it is typed, and a certificate."""
 
 from __future__ import annotations
 
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,17 +20,30 @@ from typing import Any
 
 import pytest
 
+from dengine import DataEngine, Recipe
 from dengine.errors import DataError
+from dengine.serve.service import CellService
+from tests.support.driving import RECIPE
+
+REPO = Path(__file__).resolve().parents[2]
+WAIT = 60.0  # seconds, for what takes a fraction of one: a machine may be busy
+
+
+def a_service(file: Path | None = None, recipe: Recipe = RECIPE, deadline: float = WAIT, **options: Any) -> Any:
+    """A service in memory, or in a file, as long as the context lasts."""
+    return closing(CellService(lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline, **options))
 
 
 @contextmanager
-def served(app: Any, port: int = 0, **options: Any) -> Iterator[int]:
-    """An application in a thread of this process; gives its port.  options : of uvicorn."""
+def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> Iterator[int]:
+    """An application in a thread of this process, as `dengine serve` has it; gives its port.  limits : of `Places`."""
     import uvicorn
 
-    from dengine.serve.server import bound
+    from dengine.serve.connections import Places
+    from dengine.serve.server import bound, uvicorn_options
 
-    server = uvicorn.Server(uvicorn.Config(app, **{"log_config": None, "timeout_graceful_shutdown": 1} | options))
+    places = {"http": Places(connections, **limits).connection, "timeout_graceful_shutdown": 1}
+    server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | places))
     with bound("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
@@ -33,6 +54,50 @@ def served(app: Any, port: int = 0, **options: Any) -> Iterator[int]:
         finally:
             server.should_exit = True
             thread.join()
+
+
+@dataclass
+class Process:
+    """A server that runs, and what it said."""
+
+    process: subprocess.Popen[str]
+    port: int
+    said: str = ""
+
+    def ask(self, path: str, body: Any = None) -> dict[str, Any]:
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)) as connection:
+            data, kind = (None, {}) if body is None else (json.dumps(body), {"content-type": "application/json"})
+            connection.request("GET" if body is None else "POST", path, data, kind)
+            answer = connection.getresponse()
+            said: dict[str, Any] = json.loads(answer.read())
+        if answer.status != 200:
+            raise OSError(f"{path}: {answer.status} {said}")
+        return said
+
+    def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
+        """Send a signal, to its whole group as a terminal does where asked, and return its exit code."""
+        (os.killpg if group else os.kill)(self.process.pid, number)
+        self.said, _ = self.process.communicate(timeout=WAIT)
+        return self.process.returncode
+
+
+@contextmanager
+def started(folder: Path, *words: str, wait: bool = True) -> Iterator[Process]:
+    """`dengine serve` and words, as they are typed in a folder. wait : until it says where it listens."""
+    command = [sys.executable, "-m", "dengine", "serve", "--store", "cell.db", "--port", "0", *words]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    environment = os.environ | {"PYTHONPATH": str(REPO)}
+    process = subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes)
+    try:
+        lines, said = [], None
+        while wait and said is None and (line := process.stdout.readline()):
+            lines, said = [*lines, line], re.search(r"is served at \S+:(\d+)", line)
+        assert said is not None or not wait, "".join(lines)
+        yield Process(process, int(said[1]) if said else 0)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
 
 
 class PushedTraces:

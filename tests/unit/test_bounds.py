@@ -36,13 +36,6 @@ def test_wilson_gives_the_papers_two_tables(n_success: int, alpha: float, digits
     assert tuple(truncated(bound, digits) for bound in wilson_interval(n_success, 100 - n_success, alpha)) == bounds
 
 
-def test_one_successful_neighbour_satisfies_the_binomial_interval_and_not_wilson() -> None:
-    # The paper's example: [1.0, 1.0] against [0.2, 1.0].
-    assert binomial_interval(1, 0, 0.05) == (1.0, 1.0)
-    low, high = wilson_interval(1, 0, 0.05)
-    assert (truncated(low, 1), high) == (0.2, 1.0)
-
-
 @pytest.mark.parametrize("alpha", ALPHAS)
 @pytest.mark.parametrize(
     ("interval", "method"),
@@ -63,9 +56,7 @@ def test_interval_equals_statsmodels(interval, method: str, alpha: float) -> Non
 
 @intervals
 @given(n_s=counts, n_f=counts, alpha=alphas)
-def test_bounds_enclose_the_observed_rate_and_exchanging_the_labels_mirrors_them(
-    interval, n_s: int, n_f: int, alpha: float
-) -> None:
+def test_bounds_enclose_the_observed_rate_and_exchanging_the_labels_mirrors_them(interval, n_s, n_f: int, alpha) -> None:
     lower, upper = interval(n_s, n_f, alpha)
     rate = n_s / (n_s + n_f) if n_s + n_f else 0.5
     assert 0.0 <= lower <= rate <= upper <= 1.0

@@ -1,11 +1,8 @@
 """Evidence by betting, and what is certified of accepted and rejected parts: the bound, what is known, the words."""
 
 import math
-from itertools import product
-from typing import Any
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -38,19 +35,14 @@ def test_the_bound_rises_with_a_bad_part_and_falls_with_a_good_one(c: tuple[int,
     assert failure_bound(n, n_bad, alpha / 2, q) >= upper
 
 
-def test_where_nothing_is_known_the_bound_is_one() -> None:
+def test_where_nothing_is_known_the_bound_is_one_and_what_cannot_be_is_named() -> None:
     assert failure_bound(0, 0, 0.05) == failure_bound(10_000, 0, 0.05, 0.0) == failure_bound(10, 0, 0.05, 0.02) == 1.0
-
-
-def test_settings_and_counts_out_of_range_are_named() -> None:
     with pytest.raises(SettingError, match=r"0 < alpha < 1, got 1\.5"):
         failure_bound(10, 0, 1.5)
     with pytest.raises(ValueError, match="n_bad = 11 of n = 10"):
         failure_bound(10, 11, 0.05)
     with pytest.raises(SettingError, match="0 < tolerance < 1, got 0"):
         certify(Outcomes(), 0.05, 0.0, "all", 0.0)
-    with pytest.raises(SettingError, match="0 < target < 1"):
-        certificate().accepted.audits_needed(1.0)
 
 
 def test_what_is_known_one_way_and_the_other_spends_alpha_once() -> None:
@@ -76,15 +68,6 @@ def test_a_sentence_never_promises_more_than_the_bound(c: tuple[int, int], alpha
         assert found.accepted.upper - 1e-12 <= said <= found.accepted.upper * 1.11
 
 
-@pytest.mark.parametrize("target", [0.05, 0.025, 0.01])
-def test_as_many_more_audits_as_are_asked_for_bring_the_bound_to_the_target(target: float) -> None:
-    found = certificate("some", 0.1, accepted=900, audited_accepts=100, audited_accepts_bad=1).accepted
-    more = found.audits_needed(target)
-    assert more is not None
-    assert failure_bound(found.n + more * 10, found.n_bad, found.alpha, 0.1) <= target + 1e-12
-    assert failure_bound(found.n + (more - 1) * 10, found.n_bad, found.alpha, 0.1) > target
-
-
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)
 
 tolerances = st.floats(0.001, 0.999)
@@ -92,7 +75,7 @@ tolerances = st.floats(0.001, 0.999)
 
 @given(counts, tolerances, propensities)
 def test_it_is_the_log_of_the_capital_as_the_docstring_has_it(c: tuple[int, int], theta: float, q: float) -> None:
-    n, n_bad = c[0] % 200, c[1] % (c[0] % 200 + 1)
+    n, n_bad = c[0] % 150, c[1] % (c[0] % 150 + 1)  # more would be beyond a float
     capitals = [b * (1 - b) ** n_bad / (1 - b * q * theta) ** n for b in BETS]
     assert log_evidence(n, n_bad, theta, q) == pytest.approx(math.log(sum(capitals) / sum(BETS)), abs=1e-9)
 
@@ -109,15 +92,6 @@ def test_the_mean_capital_is_one_at_the_tolerance_and_less_above_it(n: int, q: f
     assert mean_capital(p + 0.05) < 1.0 < mean_capital(p - 0.005)
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.*")
-def test_scripted_it_is_the_same_bit_for_bit() -> None:
-    scripted = torch.jit.script(log_evidence)
-    settings = product((0.001, 0.05, 0.5), (1.0, 0.02, 1 / 3))
-    for (n, part), (tolerance, q) in product(product((0, 1, 17, 1503, 10**7), (1000, 50, 3, 1)), settings):
-        n_bad = n // part
-        assert scripted(n, n_bad, tolerance, q) == log_evidence(n, n_bad, tolerance, q)
-
-
 @pytest.mark.parametrize(
     ("stops", "audit_rate", "seen", "known"),
     [
@@ -127,29 +101,21 @@ def test_scripted_it_is_the_same_bit_for_bit() -> None:
         ("some", 0.02, {"accepted": 9800, "audited_accepts": 200, "audited_accepts_bad": 3}, (10_000, 200, 3, 0.02)),
     ],
 )
-def test_what_is_known_of_accepted_parts(
-    stops: str, audit_rate: float, seen: dict[str, int], known: tuple[Any, ...]
-) -> None:
+def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: dict[str, int], known) -> None:
     found = certificate(stops, audit_rate, **seen).accepted
     assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == known
     assert found.upper == failure_bound(found.n, found.n_bad, found.alpha, found.propensity)
 
 
-def test_rejected_parts_are_known_by_audits_alone() -> None:
-    assert certificate("all", rejected=400).rejected.upper == 1.0
+def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:
     found = certificate("all", 0.1, rejected=3600, audited_rejects=400, audited_rejects_good=2).rejected
-    assert (found.n, found.n_looked_at, found.n_bad) == (4000, 400, 2)
-
-
-def test_one_sentence_says_what_was_kept_or_what_audits_tell() -> None:
+    assert (found.n, found.n_looked_at, found.n_bad, certificate("all", rejected=9).rejected.upper) == (4000, 400, 2, 1.0)
     end = " were bad on average, with 95 % confidence, however often one looks; the tolerance is 5 %."
     kept = certificate("all", accepted=1203, stops=24)
     assert kept.kept
-    assert kept.advice.startswith("To show 2.5 % takes about ")
     assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden
     assert kept.sentence == "Of 1,203 parts that went on without a check, at most 3.5 %" + end
     audited = certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20)
     of = "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 %"
     assert audited.sentence == of + end
-    beyond = certificate("all", accepted=1203, stops=60)
-    assert (beyond.kept, beyond.advice.endswith("at the present rate no number would do.")) == (False, True)
+    assert not certificate("all", accepted=1203, stops=60).kept

@@ -37,7 +37,7 @@ def test_decisions_follow_from_the_interval_and_the_interval_from_the_counts(int
     lower, upper = model.predict_interval(queries)
     np.testing.assert_allclose((lower, upper), policy.bound(*model.count(queries)), atol=1e-12)
     decisions = model.decide(queries)
-    assert list(decisions) == list(policy.actions(lower, upper))
+    assert list(decisions) == [policy.action(*each) for each in zip(lower, upper, strict=True)]
     assert set(decisions) == set(Action)
 
 
@@ -77,22 +77,6 @@ def test_learning_in_parts_is_learning_at_once_and_knows_the_classes_of_the_firs
     np.testing.assert_array_equal(parts.count(Z), whole.count(Z))
     with pytest.raises(ValueError, match="Expected labels among"):
         parts.partial_fit(Z[:1], [2])
-
-
-@pytest.mark.parametrize(("label", "counts"), [(1, (5, 0)), (0, (0, 5))])
-def test_labels_of_one_class_count_as_what_they_are(label: int, counts: tuple[int, int]) -> None:
-    model = WilsonRadiusClassifier(radius=9.0).fit(np.zeros((5, 2)), np.full(5, label))
-    assert tuple(int(c[0]) for c in model.count([[0.0, 0.0]])) == counts
-
-
-@pytest.mark.parametrize("learn", ["fit", "partial_fit"])
-def test_labels_of_three_classes_or_none_are_refused_in_scikit_learns_words(learn: str) -> None:
-    for labels, message in (
-        ([0, 1, 2], "Only binary classification is supported"),
-        ([0.1, 0.2, 0.3], "Unknown label type"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            getattr(WilsonRadiusClassifier(), learn)(np.zeros((3, 2)), labels)
 
 
 @pytest.mark.parametrize(

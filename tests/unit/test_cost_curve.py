@@ -1,26 +1,24 @@
 """What a part costs under each policy: sums by hand, the choice, what it says, its picture and its verb."""
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
 from dengine import Dataset, Policy, Recipe
-from dengine.cli import main
 from dengine.errors import SettingError
 from dengine.experiments.costs import CostCurve, cost_a_part, cost_curve, curve_of
 from dengine.experiments.figures import cost_picture
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Replay, replay
+from tests.support.command_line import dengine, document, succeed
 from tests.support.replays import replay_of
 
 COSTS = Costs(check=5, escape=100, false_reject=20)
 STRICT, LAX = Policy(0.05, 0.95), Policy(0.5, 0.8)
-HOW = {"recipe": "pca", "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats": 4, "cycles": 120}
+RECIPE = Recipe.load("pca").with_policy(stops="all")
+HOW = {"recipe": RECIPE, "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats": 4, "cycles": 120}
 
 
 def played(policy: Policy, seed: int, verified: int, accepted: int, bad: int, rejected: int = 0, good: int = 0) -> Replay:
@@ -47,7 +45,6 @@ def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
     one = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
     assert cost_a_part(one, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
     assert cost_a_part(one, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
-    assert cost_a_part(played(LAX, 0, 100, 0, 0), COSTS) == 5.0
 
 
 def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
@@ -108,26 +105,12 @@ def found(make_data: Callable[..., Dataset]) -> CostCurve:
     return cost_curve(make_data(160), check=5, escape=20, false_reject=10, **HOW)
 
 
-def test_the_curve_is_that_of_replays(found: CostCurve, make_data: Callable[..., Dataset]) -> None:
-    policy = replace(Recipe.load("pca").policy, alpha=0.5, lower_bound=0.8)
-    again = [
-        replay(make_data(160), Recipe.load("pca").with_policy(alpha=0.5, lower_bound=0.8), seed, 120) for seed in (2, 3)
-    ]
-    assert found.rows[0].policy == policy
+def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: CostCurve, make_data) -> None:
+    asked = RECIPE.with_policy(alpha=0.5, lower_bound=0.8)
+    again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
+    assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
     assert found.rows[0].cost == pytest.approx(np.mean([cost_a_part(one, found.costs) for one in again]))
     assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
-
-
-def test_what_a_recipe_says_beside_alpha_and_lb_stays(make_data: Callable[..., Dataset]) -> None:
-    how = HOW | {"recipe": Recipe.load("pca").with_policy(stops="all")}
-    policy = cost_curve(make_data(160), check=5, escape=20, false_reject=10, **how).policy
-    assert (policy.alpha, policy.stops) == (0.5, "all")
-
-
-@pytest.mark.parametrize("how", [{"repeats": 1}, {"alphas": (2,)}, {"lower_bounds": (0.4,)}, {"check": -1}])
-def test_what_cannot_be_asked_is_refused_before_anything_is_played(how: dict) -> None:
-    with pytest.raises(SettingError):
-        cost_curve("insertion", **{"check": 5, "escape": 20, "false_reject": 10} | how)
 
 
 def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> None:
@@ -142,30 +125,19 @@ def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> 
     assert "check 5 EUR, escape 20 EUR, false reject 10 EUR" in figure.get_suptitle()
 
 
-@pytest.fixture
-def folder(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Path, monkeypatch) -> None:
     np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
     monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def costs(words: str) -> Result:
-    how = "--data mine.npz --reducer pca --cycles 90 --repeats 2 --alphas 0.5,0.1 --lower-bounds 0.8 --n-jobs 1"
-    return CliRunner().invoke(main, ["costs", *how.split(), *words.split()])
-
-
-def test_the_verb_shows_a_table_and_writes_the_curve(folder: Path) -> None:
-    done = costs("--escape 20 --false-reject 10 --out out --keep kept")
-    assert done.exit_code == 0, done.output
-    shown = " ".join(done.stdout.split())
-    assert "what a part costs, in s, by alpha and LB" in shown
-    assert max(map(len, done.stdout.splitlines())) <= 80
-    assert (folder / "out" / "costs.png").stat().st_size > 10_000
-    assert (folder / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") == 3
-    told = json.loads(costs("--escape 20 --false-reject 10 --keep kept --json").stdout)
+    words = "costs --data mine.npz --reducer pca --cycles 90 --repeats 2 --alphas 0.5,0.1 --lower-bounds 0.8 --n-jobs 1"
+    words += " --escape 20 --false-reject 10 --keep kept"
+    shown = succeed(*words.split(), "--out", "out")
+    assert "what a part costs, in s, by alpha and LB" in " ".join(shown.split())
+    assert max(map(len, shown.splitlines())) <= 80
+    assert (tmp_path / "out" / "costs.png").stat().st_size > 10_000
+    assert (tmp_path / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") == 3
+    told = document(*words.split())
     assert told["verdict"] in ("pays", "may pay", "does not pay")
     assert [row["alpha"] for row in told["rows"]] == [0.5, 0.1]
-    assert told["sentence"] in shown
-    assert len(list((folder / "kept").iterdir())) == 4  # played once
-    done = costs("--escape 20 --false-reject 10 --alpha 0.1")
-    assert (done.exit_code, "name those to be tried, --alphas" in " ".join(done.output.split())) == (2, True)
+    assert told["sentence"] in " ".join(shown.split())
+    assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
+    assert "name those to be tried, --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())

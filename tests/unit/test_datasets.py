@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import DengineError, load_dataset
+from dengine import load_dataset
 from dengine.datasets import make_dataset
 from dengine.errors import DataError
 
@@ -44,7 +44,7 @@ def test_cut_keeps_the_first_samples_of_every_channel(make_data, channels: int) 
     ("X", "y", "message"),
     [
         (np.zeros((3, 4)), [0, 1], r"got \(\(3, 4\), \(2,\)\)"),
-        (np.zeros(4), [0, 1, 0, 1], "Expected X"),
+        (np.zeros(4), [0, 1, 0, 1], "Expected traces"),
         (np.zeros((2, 4)), [0, 2], "Expected labels 1 .success. and 0"),
         (np.zeros((2, 4)), [0, np.nan], "Expected labels"),
         (np.zeros((0, 4)), [], "at least one trace"),
@@ -64,18 +64,6 @@ def test_a_damaged_file_or_one_of_objects_is_a_data_error(saved, tmp_path: Path,
         load_dataset(path)
     with pytest.raises(DataError, match=r"Expected arrays X and y in .*found forces"):
         load_dataset(saved(forces=np.zeros(3)))
-
-
-def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(DengineError, match=r"Expected a data set among insertion, a file \(\.npz, .*insertoin is neither"):
-        load_dataset("insertoin")
-
-
-def test_the_bundled_set_is_labelled_insertions() -> None:
-    data = load_dataset("insertion")
-    assert (data.X.shape, data.name, data.rate_hz, data.unit) == ((1503, 1000), "insertion", 500.0, "N")
-    assert np.isfinite(data.X).all()
-    assert 0.5 < data.y.mean() < 0.99
 
 
 @pytest.mark.parametrize("channels", [1, 2])

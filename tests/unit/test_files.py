@@ -10,13 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from dengine import DataEngine, export_torchscript, load_exported
-from dengine.cli import main
 from dengine.errors import ExportError, OutputError
-from dengine.export import sum_file
+from dengine.export.bundle import beside
 from dengine.files import DATABASES, check_output, write_manifest, write_output
+from tests.support.command_line import dengine
+from tests.support.driving import learn
 
 TEXT = b"my notes\n"
 
@@ -25,13 +25,8 @@ TEXT = b"my notes\n"
 def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
     path, data = tmp_path_factory.mktemp("outputs") / "engine.db", make_data(70)
     with DataEngine("pca", retrain_every=60, store=path) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, y)
+        learn(engine, data, range(len(data)))
     return path
-
-
-def dengine(*words: object):
-    return CliRunner().invoke(main, [str(word) for word in words])
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -79,7 +74,7 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
 
 def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path: Path) -> None:
     target = tmp_path / "model.ts"
-    for present in (target, sum_file(target)):
+    for present in (target, beside(target, "sha256")):
         present.write_bytes(TEXT)
         done = dengine("export", store, "--out", target)
         assert (done.exit_code, present.read_bytes()) == (1, TEXT)
@@ -88,9 +83,9 @@ def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path
     target.write_bytes(TEXT)
     (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
     assert dengine("export", store, "--out", target, "--force").exit_code == 0
-    assert sum_file(target).read_text() == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
+    assert beside(target, "sha256").read_text() == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
     assert load_exported(target).trace.samples == 100
-    sum_file(target).write_text("0" * 64 + "  model.ts\n")  # as if killed between the file and its sum
+    beside(target, "sha256").write_text("0" * 64 + "  model.ts\n")  # as if killed between the file and its sum
     with pytest.raises(ExportError, match="is damaged or truncated"):
         load_exported(target)
 
@@ -102,7 +97,7 @@ def test_an_export_onto_its_own_store_is_refused_even_by_force(store: Path, form
     assert (done.exit_code, len(done.output.splitlines())) == (1, 1)
     assert "is a database, as a store is, and was left as it was" in done.output
     assert hashlib.sha256(store.read_bytes()).hexdigest() == before
-    assert not sum_file(store).exists()
+    assert not beside(store, "sha256").exists()
 
 
 FULL = """
@@ -124,7 +119,7 @@ def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store: Pat
         model = export_torchscript(engine, tmp_path / "model.ts")
     before = model.read_bytes()
     done = subprocess.run([sys.executable, "-c", FULL, store, model], capture_output=True, text=True, check=False)
-    assert done.stdout.startswith(f"ExportError Cannot write {model}: File too large; choose a folder"), done.stderr
+    assert done.stdout.startswith(f"OutputError Cannot write {model}: File too large; choose a folder"), done.stderr
     assert model.read_bytes() == before
     load_exported(model)
     assert {each.name for each in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}

@@ -10,7 +10,7 @@ from scipy import stats
 
 from dengine import TraceSpec
 from dengine.decision.rule import script
-from dengine.folds import audited, content_fold, content_hash, fold_of, hash_weights, toss
+from dengine.folds import audited, content_fold, content_hash, fold_of, toss
 from dengine.traces import TraceGate
 
 any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -35,7 +35,6 @@ GOLDEN = {  # (hash, toss, fold of 2, fold of 5): a store, a controller and an e
     "odd": (-1704657004933038080, 40023773, 1, 3),
     "two channels": (-6115420420893392896, 790665473, 1, 3),
 }
-GOLDEN_WEIGHTS = [-2152535657050944081, 7960286522194355701]
 
 
 @pytest.mark.parametrize("name", golden_traces())
@@ -45,14 +44,6 @@ def test_the_hash_of_a_trace_never_changes(name: str) -> None:
     x = np.atleast_2d(golden_traces()[name])
     gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
-
-
-def test_the_weights_never_change_and_are_odd() -> None:
-    weights = hash_weights(4000)
-    assert (weights & 1 == 1).all()
-    assert len(np.unique(weights)) == 4000
-    assert weights[:2].tolist() == GOLDEN_WEIGHTS
-    np.testing.assert_array_equal(hash_weights(152), weights[:152])
 
 
 @given(st.randoms(use_true_random=False))
@@ -84,9 +75,10 @@ def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> 
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 
+@pytest.mark.parametrize("step", [2.0**-20, 1 / 64, 1.0, 2.0])  # of a sensor: low bits of a raw hash would be zeros
 @pytest.mark.parametrize("folds", [2, 3, 5, 10])
-def test_folds_are_balanced(folds: int) -> None:
-    sizes = np.bincount(content_fold(noise(10_000, 20), folds), minlength=folds)
+def test_folds_are_balanced(folds: int, step: float) -> None:
+    sizes = np.bincount(content_fold(np.round(noise(10_000, 20) / step) * step, folds), minlength=folds)
     assert stats.chisquare(sizes).pvalue > 1e-4
 
 

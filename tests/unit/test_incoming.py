@@ -9,11 +9,9 @@ from threading import Event
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine import DataEngine, Dataset
 from dengine.engine.versions import STEP
-from tests.support.driving import Counting, evidence, learn
-
-RECIPE = Recipe("pca", radius=0.5, policy=Policy(alpha=0.1, lower_bound=0.9), retrain_every=40)
+from tests.support.driving import RECIPE, Counting, evidence, learn
 
 
 class Slow(Counting):
@@ -70,9 +68,7 @@ def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(data: Dat
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
-def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
-    data: Dataset, tmp_path: Path
-) -> None:
+def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(data, tmp_path: Path) -> None:
     probe = data.X[180:]
     for n in (55, 83, 97, 121):
         with ThreadPoolExecutor(1) as pool:

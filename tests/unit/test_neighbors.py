@@ -48,7 +48,7 @@ def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacit
         start += size
     kept = slice(max(0, start - capacity), start)
     assert len(index) == min(start, capacity)
-    held = sorted(map(tuple, index.ring.points[:, : len(index)].T.tolist()))
+    held = sorted(map(tuple, index.held("points").tolist()))
     assert held == sorted(map(tuple, Z[kept].tolist()))
     expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
     assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
@@ -111,11 +111,9 @@ def test_the_bound_lies_above_the_truth_in_nearly_all_draws() -> None:
 
 
 @pytest.mark.parametrize(("agreement", "votes"), [(1.0, (1, 0)), (0.0, (6, 0)), (0.2, (3, 0))])
-def test_m_points_of_a_part_are_worth_m_over_one_plus_m_minus_one_times_its_agreement(
-    agreement: float, votes: tuple[int, int]
-) -> None:
+def test_m_points_of_a_part_are_worth_m_over_one_plus_m_minus_one_times_its_agreement(agreement: float, votes) -> None:
     index = RadiusIndex(dim=1)
     index.add(np.zeros((6, 1)), np.ones(6), parts=np.full(6, 7))
-    index.ring.agreement.fill_(agreement)
+    index.agreement.fill_(agreement)
     n_success, n_failure = index.count(np.zeros((1, 1)), radius=1.0)
     assert (int(n_success[0]), int(n_failure[0])) == votes

@@ -107,9 +107,8 @@ def test_a_glitch_among_the_references_blinds_to_nothing_else(size: float) -> No
     known[100], known[200, 0, 500] = size, -size
     gate = fit_novelty(known, 1.5)
     assert share(gate, HELD_OUT[:300]) <= 0.01
-    assert {share(gate, GARBAGE[kind](HELD_OUT[:50], np.random.default_rng(1))) for kind in ("noise", "hum", "offset")} == {
-        1.0
-    }
+    for kind in ("noise", "hum", "offset"):
+        assert share(gate, GARBAGE[kind](HELD_OUT[:50], np.random.default_rng(1))) == 1.0
 
 
 def three_channels(x: Traces) -> Traces:

@@ -46,7 +46,11 @@ def test_every_error_masks_what_it_says(kind: type[DengineError]) -> None:
         assert "robot:***@" in str(error)
 
 
-@pytest.mark.parametrize("url", [f"postgresql://u:{SECRET}@a:{SECRET}@host/db", f"sqlite://u:{SECRET}@/a.db", NOBODY])
+NO_URLS = f"postgresql://u:{SECRET}@a:{SECRET}@host/db sqlite://u:{SECRET}@/a.db mysql://u:{SECRET}@host/db {NOBODY} "
+NO_URLS += "sqlite:// sqlite:///:memory: nonsense://x a://:b:c"
+
+
+@pytest.mark.parametrize("url", NO_URLS.split())
 def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_chain(url: str) -> None:
     with pytest.raises(StoreError) as caught:
         SqlStore(url)
@@ -59,7 +63,7 @@ def test_a_url_that_cannot_be_used_is_refused_without_its_password_in_the_whole_
 CALLS = [  # every verb that takes a store, and what click repeats
     f"status {NOBODY}", f"status {NOBODY} --json", f"train --data insertion --store {NOBODY}",
     f"run --cycles 1 --store {NOBODY}", f"serve --port 0 --store {NOBODY}", f"export {NOBODY} --out model.ts",
-    f"import-labels journal.csv --store {NOBODY}",
+    f"import-labels journal.csv --store {NOBODY}", f"report {NOBODY} 5 bad",
     f"explain {NOBODY} last", f"correct {NOBODY} a bad", f"forget {NOBODY} a", f"rollback {NOBODY} 1",
     f"policy {NOBODY} --alpha 0.1 --shadow on", f"history {NOBODY}", f"verify {NOBODY}", f"retrain {NOBODY}",
     NOBODY, f"status --store={NOBODY}", f"import-labels {NOBODY} --store a.db",

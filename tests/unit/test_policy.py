@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +9,6 @@ from hypothesis import strategies as st
 from dengine import Action, Policy
 from dengine.errors import SettingError
 
-unit = st.floats(0.0, 1.0)
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
 
 
@@ -19,14 +17,6 @@ def test_both_thresholds_are_met_with_equality() -> None:
     assert policy.action(0.75, 1.0) is Action.ACCEPT
     assert policy.action(0.0, 0.25) is Action.REJECT
     assert {policy.action(math.nextafter(0.75, 0), 1.0), policy.action(0.0, 0.2500001)} == {Action.VERIFY}
-
-
-@given(policies, st.lists(st.tuples(unit, unit), max_size=8))
-def test_actions_of_arrays_are_the_actions_one_by_one(policy: Policy, bounds: list[tuple[float, float]]) -> None:
-    pairs = np.sort(np.array(bounds, dtype=float).reshape(-1, 2), axis=1)
-    actions = policy.actions(pairs[:, 0], pairs[:, 1])
-    assert actions.dtype == object
-    assert list(actions) == [policy.action(lower, upper) for lower, upper in pairs]
 
 
 @given(policies)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from sklearn.decomposition import PCA
 
-from dengine import DataEngine, Dataset, Outcome, Policy, Recipe, Replay, ReplayCell, replay
+from dengine import DataEngine, Dataset, Outcome, Recipe, Replay, ReplayCell, replay
 from dengine.errors import SettingError
 from dengine.experiments.replay import Contender, watch
+from tests.support.driving import RECIPE
 from tests.support.replays import same
 
-RECIPE = Recipe("pca", radius=0.5, policy=Policy(0.1, 0.9), retrain_every=40)
 KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
 
 
@@ -57,24 +57,16 @@ class Silent:
         self.insert, self.verify, self.proceed, self.reject = cell.insert, cell.verify, cell.proceed, cell.reject
 
 
-def engine() -> DataEngine:
-    return DataEngine.from_recipe(RECIPE, seed=1, replaying=True)
+def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: Dataset, played: Replay) -> None:
+    def engine() -> DataEngine:
+        return DataEngine.from_recipe(RECIPE, seed=1, replaying=True)
 
-
-@pytest.fixture(scope="module")
-def order(data: Dataset) -> np.ndarray:
-    return np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
-
-
-def test_a_live_run_and_a_replay_by_recipe_or_engine_keep_the_same_record(data: Dataset, played: Replay, order) -> None:
+    order = np.random.default_rng(1).permutation(len(data))  # as in a replay of seed 1
     log = watch(engine(), ReplayCell(data, order), 200)
     same(log, played, "index", "dataset", "seed")
     assert played.stretches(4) == log.stretches(4)
     same(replay(data, engine(), seed=1), played)
-
-
-def test_what_a_cell_does_not_tell_stays_unknown(data: Dataset, played: Replay, order) -> None:
-    log = watch(engine(), Silent(ReplayCell(data, order)), 200)
+    log = watch(engine(), Silent(ReplayCell(data, order)), 200)  # what the cell does not tell stays unknown
     told = log.verified | log.stopped
     assert 0 < told.sum() < 200
     np.testing.assert_array_equal(log.truth[told], played.truth[told])
@@ -98,6 +90,16 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
 
 
+def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(data: Dataset, played: Replay) -> None:
+    engine = DataEngine("pca")
+    decision = [cycle.decision for cycle in engine.run(ReplayCell(data), 80)][-1]
+    frame = engine.history_frame(last=5)
+    assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (True, decision.id, 80)
+    for each in (engine, decision, data, played, engine.explain(decision.id)):
+        assert len(repr(each)) < 240
+        assert each._repr_html_().startswith("<table>")
+
+
 def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Dataset, tmp_path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(RECIPE.to_toml(), encoding="utf-8")
@@ -105,15 +107,6 @@ def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(data: Datase
     names = ["paper", "mine", "mine", "pca", "PCA", "sklearn.decomposition:PCA", "PCA"]
     assert [Contender.load(recipe).name for recipe in asked] == names
     assert replay(data, PCA(2), cycles=30).summary()["recipe"] == "PCA"
-
-
-def test_a_replay_cell_plays_its_order_and_says_when_all_is_played(data: Dataset) -> None:
-    cell = ReplayCell(data, np.array([5, 3]))
-    for i in (5, 3):
-        np.testing.assert_array_equal(cell.insert(), data.X[i])
-        assert cell.verify() == bool(data.y[i])
-    with pytest.raises(IndexError, match="has 2 cycles, and all were played"):
-        cell.insert()
 
 
 @pytest.mark.parametrize("confirm", [False, True])

@@ -52,7 +52,7 @@ class FuseRule(DecisionRule):
         return 0 if found == 1 and int(self.pause.item()) > 0 else found
 
     @torch.jit.export
-    def tell(self, lower: float, upper: float, success: bool) -> None:
+    def tell(self, lower: float, upper: float, success: bool, predicted: int = 0, looked: float = 1.0) -> None:
         """A stop sets the fuse; each label after it burns a little of it."""
         if not success and lower >= self.accept_at:
             self.pause.fill_(5)
@@ -72,7 +72,7 @@ class SpokenRule(DecisionRule):
 class FailingRule(FuseRule):
     """Cannot be told anything."""
 
-    def tell(self, lower: float, upper: float, success: bool) -> None:
+    def tell(self, lower: float, upper: float, success: bool, predicted: int = 0, looked: float = 1.0) -> None:
         raise RuntimeError("tell failed")
 
 

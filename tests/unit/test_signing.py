@@ -6,14 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import dengine.export.torchscript
 from dengine import Dataset, ModelPrediction, TraceSpec, export_torchscript, load_exported
-from dengine.cli import main
-from dengine.errors import ExportError
+from dengine.errors import ExportError, OutputError
 from dengine.export import make_key, read_metadata
 from dengine.export.bundle import write_export
+from tests.support.command_line import dengine as command
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +36,7 @@ def test_a_key_is_new_secret_and_never_replaced(key: Path, tmp_path: Path) -> No
     (tmp_path / "link.key").symlink_to(tmp_path / "planted")
     with pytest.raises(ExportError, match="is there already"):
         make_key(tmp_path / "link.key")
-    done = CliRunner().invoke(main, ["export", "--make-key", str(tmp_path / "nowhere" / "cell.key")])
+    done = command("export", "--make-key", tmp_path / "nowhere" / "cell.key")
     assert (done.exit_code, "choose a folder that exists" in " ".join(done.output.split())) == (1, True)
     assert key.read_text() == kept
     assert not (tmp_path / "planted").exists()
@@ -53,9 +52,7 @@ def test_the_signature_is_that_of_the_standard(model: ModelPrediction, key: Path
 
 
 @pytest.mark.parametrize("kind", ["unsigned", "another key", "changed", "a short key", "no key", "not text"])
-def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(
-    model: ModelPrediction, key: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_signed_with_the_key_is_refused_before_torch_sees_it(model, key, tmp_path, kind, monkeypatch) -> None:
     file = export_torchscript(model, tmp_path / "model.ts", key=key)
     if kind == "unsigned":
         file.with_name("model.ts.sig").unlink()
@@ -92,7 +89,7 @@ def test_a_file_that_is_replaced_loses_its_earlier_signature(key: Path, tmp_path
 def test_a_signature_of_another_tool_is_not_replaced(key: Path, tmp_path: Path) -> None:
     own = tmp_path / "model.ts.sig"
     own.write_text("-----BEGIN PGP SIGNATURE-----\n")
-    with pytest.raises(ExportError, match="was left as it was"):
+    with pytest.raises(OutputError, match="was left as it was"):
         write_export(tmp_path / "model.ts", b"one", key=key)
     assert own.read_text().startswith("-----BEGIN")
     assert not (tmp_path / "model.ts").exists()

@@ -10,52 +10,28 @@ from hypothesis import strategies as st
 
 from dengine.errors import ReportError, StoreError
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
-from dengine.store import Change, NewLabel, SqlStore, Store
+from dengine.store import Change, NewLabel, SqlStore
 from tests.support.plans import plans
-
-C, T = 1, 30
-
-
-def trace(seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(C, T)).astype(np.float32)
+from tests.support.stores import decision, label, put_decision, put_labels, trace
 
 
-def put(store: Store, name: str, seed: int = 0, content_hash: int = 7) -> None:
-    made = Decision(name, Action.VERIFY, Action.VERIFY, 0.2, 1.0, 1, 0, None, 0, Reason.UNCERTAIN, False, 1.0)
-    store.put_decision(made, trace(seed), content_hash, False)
+def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7) -> None:
+    put_decision(store, decision(name), trace(seed), content_hash, False)
 
 
-def label(name: str, success: bool = True) -> NewLabel:
-    return NewLabel(name, success, Source.VERIFICATION, 0, None)
-
-
-def fill(store: Store, n: int = 5) -> None:
+def fill(store: SqlStore, n: int = 5) -> None:
     """Decisions "0", "1", ... with the labels True, False, True, ..."""
     for i in range(n):
         put(store, str(i), seed=i, content_hash=100 + i)
-        store.put_labels([label(str(i), i % 2 == 0)])
+        put_labels(store, label(str(i), i % 2 == 0))
 
 
-def correct(store: Store, success: bool | None, *names: str, author: str = "kim") -> int:
+def correct(store: SqlStore, success: bool | None, *names: str, author: str = "kim") -> int:
     kind = "forget" if success is None else "correct"
     return store.record(Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success))
 
 
-# ------------------------------------------------------------------------------------------------------- corrections
-
-
-def test_the_newest_correction_of_a_decision_counts_and_the_label_stays_where_it_was(store: Store) -> None:
-    fill(store)
-    correct(store, False, "0")
-    correct(store, True, "1", "0")
-    correct(store, False, "2")
-    found = store.labelled()
-    assert (found.seq.tolist(), found.labels.tolist()) == ([1, 2, 3, 4, 5], [1, 1, 0, 0, 1])
-    assert [store.get_decision(name).success for name in "0123"] == [True, True, False, False]
-    assert store.evidence_since(0).success.tolist() == [True, True, False, False, True]
-
-
-def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: Store) -> None:
+def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
     fill(store)
     correct(store, None, "1", "3")
     found = store.labelled()
@@ -66,19 +42,9 @@ def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: Store) -> No
     held = store.get_decision("1")
     assert (held.success, held.source, held.trace.tolist()) == (None, Source.VERIFICATION, trace(1).tolist())
     assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (3, 2, 0)
-    with pytest.raises(ReportError, match="'1'"):
-        store.put_labels([label("1")])
 
 
-def test_what_was_forgotten_can_be_corrected_again(store: Store) -> None:
-    fill(store)
-    correct(store, None, "1")
-    correct(store, True, "1")
-    assert store.labelled().labels.tolist() == [1, 1, 1, 0, 1]
-    assert (store.status()["forgotten"], store.status()["corrected"]) == (0, 1)
-
-
-def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(store: Store) -> None:
+def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(store: SqlStore) -> None:
     fill(store)
     correct(store, False, "0")
     correct(store, None, "0", "2")
@@ -89,12 +55,12 @@ def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numb
     assert store.labelled(1, first=2, last=4, corrected_to=0).seq.tolist() == [4]
 
 
-def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: Store) -> None:
+def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: SqlStore) -> None:
     fill(store, 3)
     store.put_event("note", "before")
     assert correct(store, False, "2", "0", author="kim") == 2
     put(store, "late")
-    store.put_labels([label("late")])
+    put_labels(store, label("late"))
     assert correct(store, None, "late", author="") == 3
     found = store.corrections()
     assert [(c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in found] == [
@@ -111,9 +77,7 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
 
 
 @pytest.mark.parametrize(("name", "said"), [("nobody", "does not hold"), ("open", "report its label")])
-def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(
-    store: Store, name: str, said: str
-) -> None:
+def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(store, name: str, said: str) -> None:
     fill(store, 2)
     put(store, "open")
     store.save_settings({"a": "1"})
@@ -123,19 +87,19 @@ def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is
     assert store.labelled().labels.tolist() == [1, 0]
 
 
-def test_an_event_a_version_and_settings_are_kept_together(store: Store) -> None:
+def test_an_event_a_version_and_settings_are_kept_together(store: SqlStore) -> None:
     report = RetrainReport(1, 0.0, 2, 0, True, "rolled back")
     store.record(Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"}))
     assert (store.retrains(), store.settings(), store.last_version().last_seq) == ([report], {"b": "2"}, 7)
 
 
-def test_an_events_data_that_json_has_not_is_refused(store: Store) -> None:
+def test_an_events_data_that_json_has_not_is_refused(store: SqlStore) -> None:
     with pytest.raises(StoreError, match="as JSON has it"):
         store.put_event("note", "", {"x": float("nan")})
     assert store.events() == []
 
 
-def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(store: Store) -> None:
+def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(store: SqlStore) -> None:
     kinds = [
         (Action.ACCEPT, Action.ACCEPT, False),
         (Action.VERIFY, Action.ACCEPT, True),
@@ -143,8 +107,8 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     ]
     for i, (action, predicted, audit) in enumerate(kinds * 2):
         made = Decision(str(i), action, predicted, 0.9, 1.0, 9, 0, None, i // 3, Reason.CERTAIN, audit, 0.1)
-        store.put_decision(made, trace(i), i, False)
-        store.put_labels([NewLabel(str(i), True, Source.AUDIT, 0, None)])
+        put_decision(store, made, trace(i), i, False)
+        put_labels(store, NewLabel(str(i), True, Source.AUDIT, 0, None))
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")
     o = store.outcomes()
@@ -155,13 +119,13 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     assert (later.accepted, later.stops, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
 
 
-def test_what_an_earlier_version_decided_can_be_left_out(store: Store) -> None:
+def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> None:
     for version in (1, 2):
         for i in range(3):
             name = f"{version}-{i}"
             accept = Decision(name, Action.ACCEPT, Action.ACCEPT, 0.9, 1.0, 9, 0, None, version, Reason.CERTAIN, False, 0.1)
-            store.put_decision(accept, trace(i), i, False)
-        store.put_labels([NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version)])
+            put_decision(store, accept, trace(i), i, False)
+        put_labels(store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version))
     assert store.unreported_accepts(2) == ["2-1", "2-2"]
     assert (store.silent_total(2), store.silent_total()) == (2, 3)
     assert (store.evidence_since(0, 2).seq.tolist(), len(store.evidence_since(0).seq)) == ([2], 2)
@@ -169,13 +133,13 @@ def test_what_an_earlier_version_decided_can_be_left_out(store: Store) -> None:
 
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(said=st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
-def test_any_corrections_leave_what_plain_python_would(store: Store, said: list[tuple[int, bool | None]]) -> None:
+def test_any_corrections_leave_what_plain_python_would(store: SqlStore, said: list[tuple[int, bool | None]]) -> None:
     run = uuid.uuid4().hex[:8]
     begin = store.status()["labels"] + store.status()["forgotten"]
     before = len(store.corrections())
     for i in range(6):
         put(store, f"{run}-{i}")
-        store.put_labels([label(f"{run}-{i}", i % 2 == 0)])
+        put_labels(store, label(f"{run}-{i}", i % 2 == 0))
     now: dict[int, bool | None] = {i: i % 2 == 0 for i in range(6)}
     for i, success in said:
         correct(store, success, f"{run}-{i}")
@@ -183,11 +147,11 @@ def test_any_corrections_leave_what_plain_python_would(store: Store, said: list[
     kept = {begin + 1 + i: success for i, success in now.items() if success is not None}
     found = store.labelled(first=begin + 1)
     assert dict(zip(found.seq.tolist(), found.labels.tolist(), strict=True)) == kept
+    evidence = store.evidence_since(begin)
+    assert dict(zip(evidence.seq.tolist(), evidence.success.tolist(), strict=True)) == kept
+    assert [store.get_decision(f"{run}-{i}").success for i in range(6)] == list(now.values())
     as_reported = store.labelled(first=begin + 1, corrected_to=before)
     assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]
-
-
-# ---------------------------------------------------------------------------------------------------------- databases
 
 
 def test_corrections_survive_closing_and_belong_to_their_cell(place: tuple[str, str]) -> None:

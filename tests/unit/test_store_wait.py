@@ -12,9 +12,7 @@ from dengine.store import SqlStore, open_store
 @pytest.mark.parametrize(
     ("said", "argument", "wait"), [(None, None, 0.4), ("7.5", None, 7.5), ("7.5", 2.0, 2.0), ("", None, 0.4)]
 )
-def test_the_argument_comes_before_the_environment_before_the_default(
-    said: str | None, argument: float | None, wait: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_argument_comes_before_the_environment_before_the_default(said, argument, wait, tmp_path, monkeypatch) -> None:
     monkeypatch.delenv("DENGINE_STORE_WAIT")
     if said is not None:
         monkeypatch.setenv("DENGINE_STORE_WAIT", said)

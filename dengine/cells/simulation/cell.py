@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
 from ...records import Outcome
-from .conditions import CHANNELS, RATE_HZ, CellParameters, Conditions, draw_conditions, find_scenario
+from .conditions import RATE_HZ, CellParameters, Conditions, draw_conditions, find_scenario
 from .world import DEPTH_MM, TIME_STEP_S, Push, push
 
 CAUSES = ("none", "missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "wrong_part")
@@ -38,39 +38,30 @@ class SensorFaults:
     dropped_share: float
 
 
-def draw_sensor(parameters: CellParameters, rng: np.random.Generator) -> SensorFaults:
-    """Draw the faults of one trace, from a stream of their own: nothing but the force itself can tell the outcome."""
-    drawn = {each.name: float(rng.uniform(*getattr(parameters, each.name))) for each in fields(SensorFaults)}
-    return replace(SensorFaults(**drawn), bias_n=drawn["bias_n"] + parameters.bias_offset_n)
-
-
 def read_sensor(
-    wrench: NDArray[np.float64], faults: SensorFaults, parameters: CellParameters, rng: np.random.Generator
+    force: NDArray[np.float64], faults: SensorFaults, parameters: CellParameters, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """What the sensor reports of a true wrench (samples, 6), as (6, samples) float32: newtons and newton metres."""
+    """What the sensor reports of a true z-force (samples,) in newtons, as float32."""
     keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
-    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], wrench.T, axis=-1)  # the first-order low-pass in the sensor
-    unit = np.array([1.0] * 3 + [parameters.torque_scale_m] * 3)[:, None]  # newtons to each channel's own unit
-    sign = rng.choice((-1.0, 1.0), size=(6, 1))
-    sign[2] = 1.0  # the z-force keeps the sign that was drawn, the other channels get one of their own
-    samples = true.shape[1]
+    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], force)  # the first-order low-pass in the sensor
+    samples = len(true)
     time_s = np.arange(samples) / RATE_HZ
-    phase = rng.uniform(0, 2 * np.pi, size=(6, 1))
+    # The bundled traces were made with this draw, and with the other five of what is drawn in sixes.
+    rng.integers(2, size=6)
+    phase = rng.uniform(0, 2 * np.pi, size=6)[2]
     slow = faults.bias_n + faults.drift_n * time_s / time_s[-1]
     ripple = faults.ripple_n * np.sin(2 * np.pi * faults.ripple_hz * time_s + phase)
-    noise = faults.noise_n * rng.standard_normal(true.shape)
-    reading = true / unit + sign * slow + ripple + noise
-    steps = np.round(reading / faults.step_n) * faults.step_n
+    noise = faults.noise_n * rng.standard_normal((6, samples))[2]
+    steps = np.round((true + slow + ripple + noise) / faults.step_n) * faults.step_n
     arrived = np.where(rng.random(samples) < faults.dropped_share, 0, np.arange(samples))
-    held = steps[:, np.maximum.accumulate(arrived)]  # of a dropped sample the last that arrived, in all channels at once
-    return np.asarray(held * unit, dtype=np.float32)
+    return np.asarray(steps[np.maximum.accumulate(arrived)], dtype=np.float32)  # a dropped sample: the last that arrived
 
 
 @dataclass(frozen=True, slots=True)
 class Insertion:
     """One simulated insertion and its truth.
 
-    trace : (1000,) or (6, 1000) float32; newtons, and newton metres for the three torques.
+    trace : (1000,) float32, the z-force in newtons.
     success : whether the final height is within the tolerance; nothing else enters the label.
     cause : of a failure, one of `CAUSES`; `"none"` for a success.
     height_mm : of the part's top over its nominal seated height.
@@ -86,22 +77,20 @@ class Insertion:
     sensor: SensorFaults
 
 
-def insert_once(
-    parameters: CellParameters, seed: int, cycle: int, channels: str = "z", time_step_s: float = TIME_STEP_S
-) -> Insertion:
+def insert_once(parameters: CellParameters, seed: int, cycle: int, time_step_s: float = TIME_STEP_S) -> Insertion:
     """Simulate one cycle. The same `parameters`, `seed` and `cycle` give the same insertion, in any order or process.
 
-    channels : `"z"` for the z-force, `"all"` for force x, y, z and torque x, y, z.
     time_step_s : of the physics.
     """
     world_rng, sensor_rng, _ = _streams(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
     pushed = push(conditions, time_step_s)
-    faults = draw_sensor(parameters, sensor_rng)
-    reading = read_sensor(pushed.wrench, faults, parameters, sensor_rng)
+    # The sensor's faults have a stream of their own: nothing but the force itself can tell the outcome.
+    faults = SensorFaults(*(float(sensor_rng.uniform(*getattr(parameters, each.name))) for each in fields(SensorFaults)))
+    faults = replace(faults, bias_n=faults.bias_n + parameters.bias_offset_n)
     success = abs(pushed.height_mm) <= parameters.height_tolerance_mm
     return Insertion(
-        trace=reading[2] if CHANNELS[channels] == 1 else reading,
+        trace=read_sensor(pushed.force, faults, parameters, sensor_rng),
         success=success,
         cause="none" if success else _cause(conditions, pushed),
         height_mm=pushed.height_mm,
@@ -161,7 +150,6 @@ class SimulatedCell:
     parameters : every physical setting, see `CellParameters`.
     scenario : what changes while it runs, a name in `SCENARIOS`.
     seed : the same seed gives the same insertions, whatever is decided about them.
-    channels : `"z"` for traces of (1000,), `"all"` for (6, 1000).
     cycles : length of the run a scenario is laid over; "half way" is half of it. The cell goes on after it.
     """
 
@@ -170,13 +158,11 @@ class SimulatedCell:
         parameters: CellParameters | None = None,
         scenario: str = "nominal",
         seed: int = 0,
-        channels: str = "z",
         cycles: int = 600,
     ) -> None:
-        expect(channels in CHANNELS, f"channels of {', '.join(CHANNELS)}", channels, "choose one of these")
         expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()
-        self.scenario, self.seed, self.channels, self.cycles = scenario, seed, channels, cycles
+        self.scenario, self.seed, self.cycles = scenario, seed, cycles
         self.clock = 0.0
         self.last: Insertion | None = None  # the truth about the part in the cell: for reports, never for an engine
         self._change = find_scenario(scenario)
@@ -187,16 +173,14 @@ class SimulatedCell:
     @property
     def truth(self) -> bool:
         """Whether the part just inserted is good."""
-        if self.last is None:
-            raise DengineError("Expected insert() before truth, got truth of an empty cell; insert a part.")
-        return self.last.success
+        return self.last is not None and self.last.success
 
     def insert(self) -> NDArray[np.float32]:
         """Pick a part, push it into the fixture, return the force: newtons at 500 Hz for 2 s."""
         if self._waiting:
             raise DengineError("Expected verify(), proceed() or reject() after insert(), got insert(); call one.")
         changed = self._change(self.parameters, self._done, self.cycles)
-        insertion = insert_once(changed, self.seed, self._done, self.channels)
+        insertion = insert_once(changed, self.seed, self._done)
         self.last, self._waiting = insertion, True
         self.clock += self.parameters.cycle_s
         self._done += 1
@@ -237,7 +221,6 @@ class SimulatedCell:
         return CellReport(self._done, self.clock, parts_per_hour=per_hour, seconds_saved=p.verify_s * left_out - lost, **n)
 
     def _take(self, call: str) -> Insertion:
-        """The part in the fixture; each can be taken once."""
         if self.last is None or not self._waiting:
             raise DengineError(f"Expected insert() before {call}(), got {call}() with no part waiting; insert one.")
         self._waiting = False

@@ -16,7 +16,6 @@ RATE_HZ = 500.0
 FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
 _PROBABILITIES = {"silent_share", "confirm_share", *FAULTS}
 _SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
-CHANNELS = {"z": 1, "all": 6}  # z-force alone, or force x, y, z in newtons and torque x, y, z in newton metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +48,6 @@ class CellParameters:
     **Sensor**
     noise_n, ripple_n, ripple_hz : white noise and gear ripple. bias_n, drift_n : offset, and its change over a trace.
     step_n : quantisation. dropped_share : samples lost, the last one is held. bandwidth_hz : low-pass filter.
-    torque_scale_m : torque channels carry the same faults, scaled by this lever.
     bias_offset_n : a constant on top of every bias; zero but in the `bias_jump` scenario.
     """
 
@@ -100,7 +98,6 @@ class CellParameters:
     step_n: Range = (0.02, 0.15)
     dropped_share: Range = (0.0, 0.02)
     bandwidth_hz: float = 90.0
-    torque_scale_m: float = 0.03
     bias_offset_n: float = 0.0
 
     def __post_init__(self) -> None:

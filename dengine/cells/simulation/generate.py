@@ -15,7 +15,7 @@ import numpy as np
 from ...errors import expect
 from ...files import write_output
 from .cell import Insertion, insert_once
-from .conditions import CHANNELS, RATE_HZ, CellParameters, find_scenario
+from .conditions import RATE_HZ, CellParameters, find_scenario
 from .world import TIME_STEP_S
 
 
@@ -24,27 +24,24 @@ def simulate(
     seed: int = 0,
     scenario: str = "nominal",
     n_jobs: int = -1,
-    channels: str = "z",
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int], object] = lambda n: None,
     time_step_s: float = TIME_STEP_S,
 ) -> list[Insertion]:
     """The first n cycles of a cell, in their order.
 
     In the nominal scenario insertion i depends on (seed, i) alone; in the others on its place among the n as well.
     n_jobs : processes, as joblib counts them; the backend is the caller's, by `joblib.parallel_config`.
-    progress : called with (done, n) as insertions come in.
+    progress : called with 1 as each insertion comes in.
     """
     from joblib import Parallel, delayed
 
     expect(n >= 1, "at least 1 trace to simulate", n, "raise n")
-    expect(channels in CHANNELS, f"channels of {', '.join(CHANNELS)}", channels, "choose one of these")
     base, change = CellParameters(), find_scenario(scenario)
-    tasks = (delayed(insert_once)(change(base, cycle, n), seed, cycle, channels, time_step_s) for cycle in range(n))
+    tasks = (delayed(insert_once)(change(base, cycle, n), seed, cycle, time_step_s) for cycle in range(n))
     insertions: list[Insertion] = []
     for insertion in Parallel(n_jobs=n_jobs, return_as="generator")(tasks):
         insertions.append(insertion)
-        if progress is not None:
-            progress(len(insertions), n)
+        progress(1)
     return insertions
 
 
@@ -58,17 +55,13 @@ def save_insertions(
     OutputError where a file is there, without `force`.
     """
     buffer, X = BytesIO(), np.stack([each.trace for each in insertions])
-    # Value of one integer step: 0.01 N, or as much more as the largest sample needs; torques have their own.
-    if X.ndim == 2:
-        scale = np.asarray(max(0.01, float(np.abs(X).max()) / 32000))
-    else:
-        scale = np.maximum(np.array([0.01] * 3 + [0.0003] * 3), np.abs(X).max(axis=(0, 2)) / 32000)[:, None]
+    scale = max(0.01, float(np.abs(X).max()) / 32000)  # newtons of one integer step, more where the largest sample needs it
     rows = [asdict(each.conditions) | asdict(each.sensor) for each in insertions]
     names = [name for name in rows[0] if name != "fault"]
     np.savez_compressed(
         buffer,
         X=np.round(X / scale).astype(np.int16),
-        scale=scale.astype(np.float32),
+        scale=np.float32(scale),
         y=np.array([each.success for each in insertions], dtype=np.int8),
         cause=np.array([each.cause for each in insertions]),
         height_mm=np.array([each.height_mm for each in insertions], dtype=np.float32),
@@ -76,7 +69,7 @@ def save_insertions(
         conditions=np.array([[row[name] for name in names] for row in rows], dtype=np.float32),
         condition_names=np.array(names),
         rate_hz=np.float32(RATE_HZ),
-        unit=np.array("N" if X.ndim == 2 else "N, N·m"),
+        unit=np.array("N"),
         seed=np.int64(seed),
         scenario=np.array(scenario),
         simulated=np.array(True),

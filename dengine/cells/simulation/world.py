@@ -1,6 +1,6 @@
 """The simulated world: gripper, part and fixture in MuJoCo, and one force-limited push.
 
-    forces, height_mm = push(conditions)
+    push(conditions).force
 
 Lengths inside MuJoCo are metres. The rim of the fixture is z = 0 and its seat z = -DEPTH_MM. The hole is built from
 boxes, because MuJoCo turns colliding meshes into their convex hulls and would close it.
@@ -33,12 +33,12 @@ _SETTLE_SAMPLES = 40
 class Push:
     """What one push left behind.
 
-    wrench : (1000, 6) float64, what the sensor would read without its faults: newtons and newton metres; pushing is +z.
+    force : (1000,) float64 newtons along z, what the sensor would read without its faults; pushing is positive.
     height_mm : of the part's top over its nominal seated height; of the bare floor where there was no part.
     slip_mm : how far the part slid up in the gripper.
     """
 
-    wrench: NDArray[np.float64]
+    force: NDArray[np.float64]
     height_mm: float
     slip_mm: float
 
@@ -55,35 +55,35 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     try:
         model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
     except ValueError as error:
+        got = f"a world that MuJoCo refuses ({error})"
         raise SettingError(
-            f"Expected sizes, masses and springs above zero in the cell's parameters, got a world that MuJoCo refuses "
-            f"({error}); raise the one that is zero."
+            f"Expected sizes, masses and springs above zero, got {got}; raise the one that is zero."
         ) from error
     data = mujoco.MjData(model)
-    wrench = _drive(mujoco, model, data, conditions, steps)
+    force = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":
-        return Push(wrench, height_mm=-LENGTH_MM, slip_mm=0.0)
+        return Push(force, height_mm=-LENGTH_MM, slip_mm=0.0)
     top_mm = 1000 * float(data.site("top").xpos[2])
     slip_mm = 1000 * float(data.joint("in_hand").qpos[0])
-    return Push(wrench, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
+    return Push(force, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
 
 
 def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> NDArray[np.float64]:
     """Run the push under its controller; the reading is zeroed before the motion, with the part in hand."""
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
-    settled = np.array(data.sensordata)
+    settled = float(data.sensordata[2])
     travel_m = (conditions.gap_mm + conditions.protrusion_mm + DEPTH_MM + conditions.overtravel_mm) / 1000
     period_s, delay_samples = 1 / RATE_HZ, conditions.delay_s * RATE_HZ
-    target_m, wrench = 0.0, np.empty((SAMPLES, 6))
+    target_m, force = 0.0, np.empty(SAMPLES)
     for sample in range(SAMPLES):
         if sample >= delay_samples:
-            room = (conditions.force_limit_n - wrench[sample - 1, 2]) / _BAND_N if sample else 1.0
+            room = (conditions.force_limit_n - force[sample - 1]) / _BAND_N if sample else 1.0
             target_m += min(1.0, max(-1.0, room)) * conditions.speed_mm_s / 1000 * period_s
         data.ctrl[0] = -min(target_m, travel_m)
         mujoco.mj_step(model, data, steps)
-        wrench[sample] = settled - data.sensordata  # pushing is positive
-    return wrench
+        force[sample] = settled - data.sensordata[2]  # pushing is positive
+    return force
 
 
 def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
@@ -120,7 +120,7 @@ def fixture_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str
   <actuator>
     <position joint="drive" kp="80000" kv="1200" timeconst="0.01"/>
   </actuator>
-  <sensor><force site="sensor"/><torque site="sensor"/></sensor>
+  <sensor><force site="sensor"/></sensor>
 </mujoco>"""
 
 

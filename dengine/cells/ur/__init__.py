@@ -2,8 +2,8 @@
 
 The client is our own: a trace must be every sample, or say which are missing. ur_rtde keeps the newest package only, and
 records at the PC's clock: some packages are lost and others are there twice, unnoticed; when the controller hangs up, its
-getters answer with the last values for ever (`training/benchmark_recording.py --ur-rtde` measures that). Ours keeps every
-package, goes by the controller's own timestamps, connects again, and writes orders over the connection that answers them.
+getters answer with the last values for ever. Ours keeps every package, goes by the controller's own timestamps, connects
+again, and writes orders over the connection that answers them.
 """
 
 from __future__ import annotations

@@ -5,36 +5,30 @@ python -m dengine.cells.ur --port 30004 --speed 10
 
 from __future__ import annotations
 
-import argparse
 import sys
 import threading
+
+import click
 
 from ...errors import DengineError
 from .controller import FakeController, RobotProgram
 from .protocol import PORT
 
 
-def main() -> None:
+@click.command(help=__doc__)
+@click.option("--data", default="insertion", show_default=True, help="Anything that load_dataset takes.")
+@click.option("--host", default="127.0.0.1", show_default=True)
+@click.option("--port", default=PORT, show_default=True, help="0: any that is free.")
+@click.option("--speed", default=1.0, show_default=True, help="Against real time; 0: as fast as it is read.")
+def main(data: str, host: str, port: int, speed: float) -> None:
     """Listen until interrupted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default="insertion", help="anything that load_dataset takes")
-    parser.add_argument("--host", default="127.0.0.1")
-    parser.add_argument("--port", type=int, default=PORT, help="0: any that is free")
-    parser.add_argument("--speed", type=float, default=1.0, help="against real time; 0: as fast as it is read")
-    asked = parser.parse_args()
     try:
-        program = RobotProgram(asked.data)
+        program = RobotProgram(data)
     except DengineError as error:
         sys.exit(str(error))
-    with FakeController(program, asked.host, asked.port, asked.speed or None) as fake:
-        print(
-            f"A controller without a robot at {fake.host}:{fake.port}, {len(program.data)} parts; Ctrl-C ends it.",
-            flush=True,
-        )
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            print(f"{len(program.played)} parts were inserted.")
+    with FakeController(program, host, port, speed or None) as fake:
+        click.echo(f"A controller without a robot at {host}:{fake.port}, {len(program.data)} parts; Ctrl-C ends it.")
+        threading.Event().wait()
 
 
 if __name__ == "__main__":

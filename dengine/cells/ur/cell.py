@@ -13,6 +13,7 @@ trigger. A program that starts answers an old order with VOID. `training/ur_cell
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
@@ -23,7 +24,7 @@ from ...datasets.triggers import Trigger
 from ...errors import CellError
 from ...records import Outcome
 from .recorder import InsertionRecord, RtdeRecorder
-from .stream import Row
+from .stream import Row, StreamReport
 
 ORDER = "input_int_register_24"
 ANSWER = "output_int_register_24"
@@ -63,25 +64,13 @@ class Runtime(IntEnum):
 
 
 OUTCOMES = {Answer[outcome.name]: outcome for outcome in Outcome}
-ANSWERS = {
-    Verb.INSERT: (Answer.DONE,),
-    Verb.VERIFY: (Answer.GOOD, Answer.BAD),
-    Verb.PROCEED: tuple(OUTCOMES),
-    Verb.REJECT: (Answer.DONE,),
-}
+ANSWERS = {Verb.VERIFY: (Answer.GOOD, Answer.BAD), Verb.PROCEED: tuple(OUTCOMES)}  # to the others DONE
+REFUSALS: dict[int, str] = {Answer.VOID: "its program was started anew", Answer.FAILED: "it says that it failed"}
 
 
 def word(number: int, what: Verb | Answer) -> int:
     """An order, or an answer, as it stands in its register."""
     return 10 * number + what
-
-
-def after(number: int) -> int:
-    """The number of the next order."""
-    return number % MOST + 1
-
-
-REFUSALS = {int(Answer.VOID): "its program was started anew", int(Answer.FAILED): "it says that it failed"}
 
 
 class UrCell(AbstractContextManager["UrCell"]):
@@ -104,13 +93,10 @@ class UrCell(AbstractContextManager["UrCell"]):
         start_timeout: float = 30.0,
         **how: Any,
     ) -> None:
-        also = (ANSWER, ORDER, RUNTIME)
-        self.recorder = RtdeRecorder(host, trigger, also=also, inputs=(ORDER,), **how)
+        self.recorder = RtdeRecorder(host, trigger, also=(ANSWER, ORDER, RUNTIME), inputs=(ORDER,), **how)
         self.order_timeout, self.start_timeout = order_timeout, start_timeout
         self.last: InsertionRecord | None = None
         self.incomplete = 0
-        columns = self.recorder.stream.columns
-        self._at = {name: columns.index(name) for name in also}
         try:
             self._number = self._take_over()
         except BaseException:
@@ -122,6 +108,10 @@ class UrCell(AbstractContextManager["UrCell"]):
 
     def __exit__(self, *raised: object) -> None:
         self.close()
+
+    def report(self) -> StreamReport:
+        """Counts of all packages, and of the traces with a gap."""
+        return replace(self.recorder.report(), incomplete=self.incomplete)
 
     def insert(self) -> NDArray[np.float32]:
         """Pick a part, push it in, and give the force: (T,) or (C, T), NaN where a sample never came."""
@@ -146,9 +136,9 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _ask(self, verb: Verb) -> Answer:
         """Give one order, and read until it is answered; an insertion also until its trace is over."""
         self.recorder.arm()  # what came while nothing was asked is nobody's
-        self._number = after(self._number)
+        self._number = self._number % MOST + 1
         self.last = None if verb is Verb.INSERT else self.last
-        self.recorder.stream.write((word(self._number, verb),))
+        self.recorder.stream.write({ORDER: word(self._number, verb)})
         answer: Answer | None = None
         for row in self.recorder.rows(self.order_timeout):
             if verb is Verb.INSERT and self.last is None:
@@ -162,18 +152,17 @@ class UrCell(AbstractContextManager["UrCell"]):
         return answer
 
     def _silence(self, what: str) -> CellError:
-        why = "it did not; does its program do what training/ur_cell.script does, is it paused, does it wait for a part?"
-        if self.recorder.stream.trouble:
-            why = f"there is no connection: {self.recorder.stream.trouble}"
-        return CellError(f"Expected the robot at {self.recorder.stream.where} {what} in time, {why}.")
+        stream, why = self.recorder.stream, "it did not; does its program do what ur_cell.script does, is it paused?"
+        why = f"there is no connection: {stream.trouble}" if stream.trouble else why
+        return CellError(f"Expected the robot at {stream.where} {what} in time, {why}")
 
     def _answered(self, row: Row, verb: Verb) -> Answer | None:
         """The answer to the order under way, if this package holds it; CellError for one that is no success."""
-        number, what = divmod(int(row.values[self._at[ANSWER]]), 10)
-        state = int(row.values[self._at[RUNTIME]])
+        number, what = divmod(int(row.values[ANSWER]), 10)
+        state = int(row.values[RUNTIME])
         about = f"order {self._number} ({verb.name.lower()})"
         if number == self._number:
-            if what in ANSWERS[verb]:
+            if what in ANSWERS.get(verb, (Answer.DONE,)):
                 return Answer(what)
             said = REFUSALS.get(what, f"it answered {what}")
             raise CellError(f"Expected the robot to carry out {about}, {said}; look at the part, then begin again.")
@@ -185,14 +174,13 @@ class UrCell(AbstractContextManager["UrCell"]):
         """The number of the last order there was, once it is answered and the program runs."""
         what = ""
         for row in self.recorder.rows(self.start_timeout):
-            ordered, answered, state = (int(row.values[self._at[name]]) for name in (ORDER, ANSWER, RUNTIME))
+            ordered, answered, state = (int(row.values[name]) for name in (ORDER, ANSWER, RUNTIME))
             if state == Runtime.PLAYING and ordered // 10 == answered // 10:
                 return ordered // 10
             owing = f"it owes an answer to order {ordered // 10}"
             what = owing if state == Runtime.PLAYING else "its program does not run"
         if not what:
             raise self._silence("to send its state")
-        raise CellError(
-            f"Expected the robot at {self.recorder.stream.where} to be ready within {self.start_timeout:g} s, "
-            f"{what}; start training/ur_cell.script, or your own program of the same handshake, on it."
-        )
+        do = "start training/ur_cell.script, or your own program of the same handshake, on it"
+        where = f"the robot at {self.recorder.stream.where}"
+        raise CellError(f"Expected {where} to be ready within {self.start_timeout:g} s, {what}; {do}.")

@@ -9,15 +9,17 @@ do what real ones do on bad days: `Trouble`.
 
 from __future__ import annotations
 
+import re
 import socket
 import struct
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from numpy.typing import NDArray
 from ...datasets import load_dataset
 from ...errors import CellError, SettingError
 from .cell import ANSWER, ORDER, PHASE, RUNTIME, Answer, Runtime, Verb, word
-from .protocol import CHANNELS, IN_USE, NOT_FOUND, VERSION, Kind, Package, Packages, Recipe, column_of, type_of
+from .protocol import CHANNELS, IN_USE, NOT_FOUND, VERSION, Kind, Package, Packages, Recipe
 
 CHECK, REST = 5, 2  # control cycles of a height check, and of standstill before an insertion is answered
 Values = dict[str, float]
@@ -44,7 +46,7 @@ class RobotProgram:
         self.confirm, self.approach = confirm, approach
         X = self.data.X if self.data.X.ndim == 3 else self.data.X[:, None]
         names = self.data.channels if len(self.data.channels) == X.shape[1] > 1 else tuple(CHANNELS)[: X.shape[1]]
-        self._columns = [column_of(name) for name in (("FZ_Base",) if X.shape[1] == 1 else names)]
+        self._columns = [CHANNELS.get(name, name) for name in (("FZ_Base",) if X.shape[1] == 1 else names)]
         self._traces: NDArray[np.float64] = X.astype(np.float64)
         self.played: list[int] = []
         self.place: tuple[int, int] | None = None
@@ -112,14 +114,19 @@ FOREIGN = (OSError, CellError, struct.error, ValueError, KeyError)  # of a clien
 PATIENCE = struct.pack("ll", 5, 0)  # seconds, a timeval: a client that does not read is hung up on
 GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
 TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
+FIELDS = {  # that it has: patterns of their names, and their types
+    r"timestamp|speed_scaling|(in|out)put_double_register_\d+": "DOUBLE",
+    r"actual_(q|qd|TCP_pose|TCP_speed|TCP_force)": "VECTOR6D",
+    r"robot_mode|safety_mode|(in|out)put_int_register_\d+": "INT32",
+    r"runtime_state": "UINT32",
+    r"actual_digital_(in|out)put_bits": "UINT64",
+    r"(in|out)put_bit_register_\d+": "BOOL",
+}
 
 
-class Program(Protocol):
-    """What runs on the robot."""
-
-    place: tuple[int, int] | None
-
-    def step(self, inputs: dict[str, float]) -> Mapping[str, float]: ...  # a control cycle: outputs by column
+def type_of(name: str) -> str:
+    """The type of a field by its name; NOT_FOUND for none."""
+    return next((kind for pattern, kind in FIELDS.items() if re.fullmatch(pattern, name)), NOT_FOUND)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +159,7 @@ class Client:
         self.every = 1  # cycles
         self.inputs: dict[int, Recipe] = {}
         self.started = False
-        self.held: list[bytes] = []
+        self.held = b""
 
     def send(self, data: bytes) -> bool:
         """Whether the socket took it."""
@@ -172,6 +179,7 @@ class Client:
 class FakeController(AbstractContextManager["FakeController"]):
     """Listens on host and port (0: any that is free) and plays a program, until it is closed.
 
+    program : has `step` and `place`, as `RobotProgram` has them; None: the robot rests.
     speed : cycles against real time; None: as fast as clients read.  troubles : what goes wrong, and when.
     refuses : requests that it says no to, Kind.VERSION or Kind.START; names of outputs that it does not have, and of inputs
     that another client holds.  `lost` : part and sample of every package of an insertion that no client was sent.
@@ -180,7 +188,7 @@ class FakeController(AbstractContextManager["FakeController"]):
 
     def __init__(
         self,
-        program: Program | None = None,
+        program: Any = None,
         host: str = "127.0.0.1",
         port: int = 0,
         speed: float | None = 1.0,
@@ -196,7 +204,8 @@ class FakeController(AbstractContextManager["FakeController"]):
         self._clients: list[Client] = []
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._begin = self._cycle = self._drop = self._hold = 0
+        self._begin = self._cycle = 0
+        self._until = Counter[str]()  # the cycle at which a trouble that lasts is over
         self._threads = [threading.Thread(target=each, daemon=True) for each in (self._accept, self._run)]
         for thread in self._threads[:]:
             thread.start()
@@ -251,8 +260,7 @@ class FakeController(AbstractContextManager["FakeController"]):
             case Kind.TEXT:
                 return
             case Kind.DATA:
-                recipe = client.inputs[payload[0]]
-                self.inputs.update(zip(recipe.columns, recipe.unpack(payload), strict=True))
+                self.inputs.update(client.inputs[payload[0]].unpack(payload))
                 return
             case Kind.OUTPUTS:
                 (rate,) = struct.unpack_from(">d", payload)
@@ -279,7 +287,7 @@ class FakeController(AbstractContextManager["FakeController"]):
         client.started = kind is Kind.START and answer == b"\1"
 
     def _recipe(self, number: int, names: bytes, refused: Collection[Kind | str], why: str) -> Recipe:
-        listed = names.decode().rstrip(",").split(",")  # ur_rtde ends its list with a comma
+        listed = names.decode().split(",")
         return Recipe(number, tuple(listed), tuple(why if name in refused else type_of(name) for name in listed))
 
     def _run(self) -> None:
@@ -298,9 +306,11 @@ class FakeController(AbstractContextManager["FakeController"]):
         values = {**STATE, **self.inputs, **(self.program.step(dict(self.inputs)) if self.program else {})}
         place = self.program.place if self.program else None
         trouble = self._troubles.pop(place, None) if place else None
-        kind, cycles = (trouble.kind, trouble.cycles) if trouble else ("", 0)
-        self._drop, self._hold = max(self._drop, cycles * (kind == "drop")), max(self._hold, cycles * (kind == "hold"))
-        self._begin = self._cycle if kind == "reset" else self._begin
+        kind = trouble.kind if trouble else ""
+        if trouble:
+            self._until[kind] = max(self._until[kind], self._cycle + trouble.cycles)
+        if kind == "reset":
+            self._begin = self._cycle
         for each in self._clients if kind == "close" else ():
             each.hang_up()
         values["timestamp"] = (self._cycle - self._begin) * CYCLE_S
@@ -308,21 +318,20 @@ class FakeController(AbstractContextManager["FakeController"]):
         sent = [self._send(each, values, kind) for each in started]
         if place is not None and not any(sent):
             self.lost.add(place)
-        self._drop, self._hold, self._cycle = max(self._drop - 1, 0), max(self._hold - 1, 0), self._cycle + 1
+        self._cycle += 1
         return bool(started)
 
-    def _send(self, each: Client, values: Mapping[str, float], trouble: str) -> bool:
+    def _send(self, each: Client, values: Values, trouble: str) -> bool:
         """Whether the package of this cycle is on its way, now or later."""
-        if self._drop or each.output is None:
+        if self._cycle < self._until["drop"] or each.output is None:
             return False
-        data = each.output.pack([values.get(name, 0.0) for name in each.output.columns])
+        data = each.output.pack(values)
         if trouble in ("half", "garbage"):
             each.send(data[: len(data) // 2] if trouble == "half" else GARBAGE)
             each.hang_up()
             return False
-        if self._hold:
-            each.held.append(data)
+        each.held += data * (2 if trouble == "repeat" else 1)
+        if self._cycle < self._until["hold"]:
             return True
-        data = b"".join(each.held) + data * (2 if trouble == "repeat" else 1)
-        each.held.clear()
+        data, each.held = each.held, b""
         return each.send(data)

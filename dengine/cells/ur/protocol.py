@@ -7,7 +7,6 @@ Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol versi
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from enum import IntEnum
 from functools import cached_property
 from typing import NamedTuple
 
-from ...errors import CellError, SettingError
+from ...errors import CellError
 
 PORT = 30004
 VERSION = 2
@@ -103,20 +102,18 @@ class Recipe:
         named = zip(self.names, sizes, strict=True)
         return tuple(name if size == 1 else f"{name}[{i}]" for name, size in named for i in range(size))
 
-    def pack(self, values: Sequence[float]) -> bytes:
-        """A data package, whole; where a field is no double, its value is cut to a whole number."""
-        letters = self.layout.format[2:]
-        held = [value if letter == "d" else int(value) for value, letter in zip(values, letters, strict=True)]
+    def pack(self, values: Mapping[str, float]) -> bytes:
+        """A data package of these columns, 0 where one is left out; a field that is no double takes a whole number."""
+        letters = zip(self.columns, self.layout.format[2:], strict=True)
+        held = [values.get(name, 0) if letter == "d" else int(values.get(name, 0)) for name, letter in letters]
         return Package(Kind.DATA, self.layout.pack(self.number, *held)).packed()
 
-    def unpack(self, payload: bytes) -> tuple[float, ...]:
-        """The values, one a column; CellError for a package of another size, or of another recipe."""
+    def unpack(self, payload: bytes) -> dict[str, float]:
+        """The values by column; CellError for a package of another size, or of another recipe."""
         if len(payload) != self.layout.size or payload[0] != self.number:
-            raise CellError(
-                f"Expected a data package of recipe {self.number} with {self.layout.size} bytes, got one of recipe "
-                f"{payload[0] if payload else 'none'} with {len(payload)}."
-            )
-        return self.layout.unpack(payload)[1:]
+            got = f"one of recipe {payload[0] if payload else 'none'} with {len(payload)}"
+            raise CellError(f"Expected a data package of recipe {self.number} with {self.layout.size} bytes, got {got}.")
+        return dict(zip(self.columns, self.layout.unpack(payload)[1:], strict=True))
 
 
 def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
@@ -126,60 +123,12 @@ def recipe_of(payload: bytes, names: Sequence[str], what: str) -> Recipe:
         raise CellError(f"Expected the types of {len(names)} {what} fields, got {len(types)}: {', '.join(types)[:80]}.")
     named = dict(zip(names, types, strict=True))
     if unknown := [name for name, kind in named.items() if kind not in (*TYPES, IN_USE)]:
-        raise CellError(
-            f"Expected {what} fields that this controller has, it does not know {', '.join(unknown)}; name others, or "
-            "bring its software up to date (registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)."
-        )
+        do = "name others, or bring its software up to date (registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"
+        raise CellError(f"Expected {what} fields that this controller has, it does not know {', '.join(unknown)}; {do}.")
     if held := [name for name, kind in named.items() if kind == IN_USE]:
-        raise HeldError(
-            f"Expected to write {', '.join(held)}, another client of this controller does; close it, or its fieldbus "
-            "unit (EtherNet/IP, PROFINET), or choose other registers."
-        )
+        do = "close it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers"
+        raise HeldError(f"Expected to write {', '.join(held)}, another client of this controller does; {do}.")
     return Recipe(payload[0], tuple(names), types)
-
-
-INDEXED = re.compile(r"(input|output)_(bit|int|double)_register_(\d+)")
-FIELDS: Mapping[str, str] = {  # of the guide, those that a controller gives out; registers with a number: `type_of`
-    name: kind
-    for kind, names in {
-        "DOUBLE": (
-            "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum actual_main_voltage "
-            "actual_robot_voltage actual_robot_current standard_analog_input0 standard_analog_input1 "
-            "standard_analog_output0 standard_analog_output1 io_current payload tcp_force_scalar speed_slider_fraction "
-            "standard_analog_output_0 standard_analog_output_1"
-        ),
-        "VECTOR6D": (
-            "target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current "
-            "joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
-            "joint_temperatures actual_joint_voltage payload_inertia ft_raw_wrench external_force_torque"
-        ),
-        "VECTOR3D": "actual_tool_accelerometer payload_cog elbow_position elbow_velocity",
-        "UINT64": "actual_digital_input_bits actual_digital_output_bits",
-        "INT32": "robot_mode safety_mode safety_status",
-        "UINT32": (
-            "runtime_state robot_status_bits safety_status_bits output_bit_registers0_to_31 output_bit_registers32_to_63 "
-            "input_bit_registers0_to_31 input_bit_registers32_to_63 speed_slider_mask script_control_line"
-        ),
-        "UINT8": (
-            "standard_digital_output_mask standard_digital_output configurable_digital_output_mask "
-            "tool_digital_output_mask tool_digital_output configurable_digital_output standard_analog_output_mask "
-            "standard_analog_output_type"
-        ),
-        "VECTOR6INT32": "joint_mode",
-    }.items()
-    for name in names.split()
-}
-
-
-def type_of(name: str) -> str:
-    """The type of a field by its name; NOT_FOUND for none."""
-    found = INDEXED.fullmatch(name)
-    if found is None:
-        return FIELDS.get(name, NOT_FOUND)
-    number = int(found[3])
-    if found[2] == "bit":
-        return "BOOL" if 64 <= number < 128 else NOT_FOUND
-    return {"int": "INT32", "double": "DOUBLE"}[found[2]] if number < 48 else NOT_FOUND
 
 
 AXES = ("FX_Base", "FY_Base", "FZ_Base", "MuX_Base", "MuY_Base", "MuZ_Base")
@@ -188,18 +137,3 @@ CHANNELS = {  # as recordings of UR cells call them; newtons and newton metres, 
     **{name: f"actual_TCP_force[{i}]" for i, name in enumerate(AXES)},
     **{name: f"actual_TCP_pose[{i}]" for i, name in enumerate(POSES)},
 }
-
-
-def column_of(name: str) -> str:
-    """The controller's number that a channel or a signal is: by a name of CHANNELS, or by its own, `actual_q[5]`."""
-    column = CHANNELS.get(name, name)
-    field, _, index = column.partition("[")
-    kind = type_of(field)
-    size = 0 if kind == NOT_FOUND else TYPES[kind][1]
-    known = index == "" if size == 1 else index.endswith("]") and index[:-1].isdecimal() and int(index[:-1]) < size
-    if not known:
-        raise SettingError(
-            f"Expected a channel among {', '.join(CHANNELS)}, or a number of the controller, as actual_q[5] or "
-            f"output_double_register_24, got {name!r}."
-        )
-    return column

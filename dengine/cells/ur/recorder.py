@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...datasets.triggers import Start, StartFinder, Trigger, as_trigger, place
 from ...errors import CellError, SettingError
 from ...records import TraceSpec
-from .protocol import PORT, column_of
+from .protocol import CHANNELS, PORT
 from .stream import Row, RtdeStream, StreamReport
 
 
@@ -28,13 +28,11 @@ class InsertionRecord:
     """One recorded insertion. trace : (T,), or (C, T) of several channels, float32; NaN where a sample never came.
 
     missing : samples that never came; where the start itself fell into a gap all of them, for then no place is known.
-    late : samples that came late, and are in their place.  repeated : samples that came twice; the first counts.
-    reconnects : connections made again meanwhile.
+    repeated : samples that came twice; the first counts.  reconnects : connections made again meanwhile.
     """
 
     trace: NDArray[np.float32]
     missing: int
-    late: int
     repeated: int
     reconnects: int
 
@@ -68,19 +66,17 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             raise SettingError(f"Expected 0 to {samples - 1} samples from before the trigger, got {before}.")
         self.trigger = as_trigger(trigger)
         self.channels = (channels,) if isinstance(channels, str) else tuple(channels)
-        fields = [column_of(name).partition("[")[0] for name in (*self.channels, *self.trigger.signals)]
-        forces = set(fields[: len(self.channels)]) == {"actual_TCP_force"}
-        unit = "N" if forces and not any(name.startswith("Mu") for name in self.channels) else "mixed units"
-        self.spec = TraceSpec(samples, rate_hz, len(self.channels), unit, columns=self.channels)
+        self._columns = [CHANNELS.get(name, name) for name in self.channels]
+        self._signals = {name: CHANNELS.get(name, name) for name in self.trigger.signals}
+        forces = {f"actual_TCP_force[{i}]" for i in range(3)}.issuperset(self._columns)
+        self.spec = TraceSpec(samples, rate_hz, len(self.channels), "N" if forces else "mixed units", columns=self.channels)
         self._before = before
-        self.stream = RtdeStream(host, tuple(dict.fromkeys(("timestamp", *fields, *also))), inputs, rate_hz, port, timeout)
+        self.stream = RtdeStream(host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout)
         self._step = self.stream.step
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
-        self._position = 0  # in the stream, of the next package to look at
         self._rows: list[Row] = []
         self._start: Start | None = None
-        self._columns = [self.stream.columns.index(column_of(name)) for name in self.channels]
-        self._signals = {name: self.stream.columns.index(column_of(name)) for name in self.trigger.signals}
+        self._armed: int | None = None  # connections before, when an insertion was waited for
 
     def close(self) -> None:
         self.stream.close()
@@ -90,8 +86,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     def arm(self) -> None:
         """Look for an insertion from now on: what came before is given up."""
-        self._position = self.stream.position
         self._forget()
+        self._armed = self.stream.clear()
 
     def report(self) -> StreamReport:
         """Counts of all packages since it was opened."""
@@ -116,8 +112,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         """The packages that nobody has looked at, as they come, for so long."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
-            for row in self.stream.after(self._position, left):
-                self._position += 1
+            if (row := self.stream.take(left)) is not None:
                 yield row
 
     @property
@@ -142,16 +137,15 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     def cut(self) -> InsertionRecord:
         """What there is of the insertion; all of it NaN where its start was not seen."""
-        start, first, rows = self._start, self._first(), self._rows
+        start, first, rows, armed = self._start, self._first(), self._rows, self._armed
         self._forget()
-        reconnects = 0 if start is None else rows[-1].session - rows[0].session
-        late = sum(row.late for row in rows if row.timestamp > first - self._step / 2)
+        reconnects = 0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
         rows = rows if start is not None and start.seen else []
         values = np.array([[row.values[c] for c in self._columns] for row in rows], dtype=np.float64)
         values = values.reshape(len(rows), len(self._columns))
         placed = place([row.timestamp for row in rows], values, first, self.spec.samples, self._step)
         trace = placed.trace[0] if len(self._columns) == 1 else placed.trace
-        return InsertionRecord(trace, placed.missing, late, placed.repeated, reconnects)
+        return InsertionRecord(trace, len(placed.missing), placed.repeated, reconnects)
 
     def _first(self) -> float:
         """The time of the trace's first sample; NaN while there is none."""
@@ -159,4 +153,4 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
     def _forget(self) -> None:
         self._finder.forget()
-        self._rows, self._start = [], None
+        self._rows, self._start, self._armed = [], None, None

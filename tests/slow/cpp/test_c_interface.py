@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import dengine
 from dengine import Dataset, export_torchscript, load_exported
-from dengine.cli import main
 from dengine.errors import ExportError
 from dengine.export import export_sources, import_journal
 from dengine.records import ACTIONS, Action
+from tests.support.command_line import dengine as command
 from tests.support.exports import trained
 
 SAMPLES = 80
@@ -35,7 +34,7 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     run("cmake", "-S", repo / "tests" / "slow" / "cpp" / "consumer", "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}")
     run("cmake", "--build", build)
     store, key = tmp_path / "engine.db", tmp_path / "cell.key"
-    assert CliRunner().invoke(main, ["export", "--make-key", str(key)]).exit_code == 0
+    assert command("export", "--make-key", key).exit_code == 0
     with trained(make_data(400, SAMPLES), store, fraction=0.3, reject_fraction=0.08) as engine:
         file = export_torchscript(engine, tmp_path / "model.ts", key=key)
     X = make_data(120, SAMPLES, seed=9).X
@@ -59,7 +58,7 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
 
 
 def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:
-    done = CliRunner().invoke(main, ["export", "--cpp", str(tmp_path / "cell")], catch_exceptions=False)
+    done = command("export", "--cpp", tmp_path / "cell")
     assert done.exit_code == 0
     assert (tmp_path / "cell" / "VERSION").read_text() == f"{dengine.__version__}\n"
     assert (tmp_path / "cell" / "include" / "dengine.h").is_file()

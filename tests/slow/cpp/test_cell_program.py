@@ -3,11 +3,10 @@
 import random
 import resource
 import shutil
-import subprocess
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from dengine.export import import_journal, make_key
 from dengine.export.cell_journal import read_journal
 from dengine.records import Action
 from tests.support.exports import SAMPLES, trained
+from tests.support.programs import Program, asked, must_agree
 
 
 class Learned(NamedTuple):
@@ -25,49 +25,28 @@ class Learned(NamedTuple):
     store: Path
     file: Path
     key: Path
+    guarantee: str
 
 
-@pytest.fixture(scope="module", params=["some", "all"])
+POLICIES = {
+    "local": {"guarantee": "local", "stops": "some", "fraction": 0.3, "reject_fraction": 0.08},
+    "pooled": {"guarantee": "pooled", "stops": "some", "fraction": 0.1, "audit_rate": 0.6},  # its only evidence
+    "all": {"guarantee": "pooled", "stops": "all", "fraction": 0.1},
+}
+
+
+@pytest.fixture(scope="module", params=POLICIES)
 def learned(request, make_data: Callable[..., Dataset], tmp_path_factory) -> Learned:
     folder, data = tmp_path_factory.mktemp(request.param), make_data(400, SAMPLES, noise=1.5)
-    guarantee = {"some": "local", "all": "pooled"}[request.param]
-    settings = {"some": {"fraction": 0.3, "reject_fraction": 0.08}, "all": {"fraction": 0.1}}[request.param]
-    settings |= {"audit_rate": 0.2, "guarantee": guarantee, "stops": request.param}
+    settings = {"audit_rate": 0.2} | POLICIES[request.param]
     key = make_key(folder / "cell.key")
     with trained(data, folder / "engine.db", **settings) as engine:
-        return Learned(folder / "engine.db", export_torchscript(engine, folder / "model.ts", key=key), key)
+        return Learned(
+            folder / "engine.db", export_torchscript(engine, folder / "model.ts", key=key), key, settings["guarantee"]
+        )
 
 
-ONE = pytest.mark.parametrize("learned", ["some"], indirect=True)
-
-
-class Program:
-    """The program, line by line."""
-
-    def __init__(self, programs: Path, *arguments: Any, **options: Any) -> None:
-        command = [str(programs / "dengine-cell"), *map(str, arguments)]
-        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        self.process = subprocess.Popen(command, text=True, bufsize=1, **pipes, **options)
-
-    def __enter__(self) -> "Program":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.communicate()
-
-    def ask(self, line: str) -> str:
-        """The answer to a line; "" where the program is gone."""
-        try:
-            self.process.stdin.write(line + "\n")
-        except BrokenPipeError:
-            return ""
-        said = self.process.stdout.readline()
-        return said.rstrip("\n") if said.endswith("\n") else ""
-
-    def end(self) -> tuple[int, str]:
-        _, said = self.process.communicate(timeout=60)
-        return self.process.returncode, said
+ONE = pytest.mark.parametrize("learned", ["local"], indirect=True)
 
 
 @pytest.fixture
@@ -79,10 +58,6 @@ def start(programs: Path, learned: Learned, tmp_path: Path) -> Callable[..., Pro
 @pytest.fixture(scope="module")
 def X(make_data: Callable[..., Dataset]) -> np.ndarray:  # noqa: N802  # as everywhere
     return make_data(60, SAMPLES, seed=9, noise=1.5).X
-
-
-def asked(x: np.ndarray, part: str | None = None) -> str:
-    return f"decide {part + ' ' if part else ''}{','.join(f'{v:.9g}' for v in x)}"
 
 
 def stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, np.ndarray, list[str | None], list[list[int]]]:
@@ -100,13 +75,6 @@ def stream(make_data: Callable[..., Dataset], n: int) -> tuple[np.ndarray, np.nd
     return X, data.y, parts, due
 
 
-def same(answer: str, decision: Any) -> bool:
-    words = answer.split(",")
-    found = [words[1], words[2], float(words[3]), float(words[4]), int(words[5]), int(words[6])]
-    expected = [str(decision.action), str(decision.reason), *map(pytest.approx, (decision.lower, decision.upper))]
-    return found == [*expected, decision.n_success, decision.n_failure]
-
-
 def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as_its_own(
     start: Callable[..., Program], learned: Learned, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
@@ -117,10 +85,9 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
     with DataEngine.open(tmp_path / "own.db", replaying=True) as engine, start("--key", learned.key) as cell:
         stops_all = engine.policy.stops == "all"  # there the engine wants no late label of a confirmed part
         for i, (x, part) in enumerate(zip(X, parts, strict=True)):
-            answer = cell.ask(asked(x, part))
             decisions.append(engine.decide(x, part))
-            assert same(answer, decisions[-1]), (i, answer, decisions[-1])
-            ids.append(answer.split(",")[0])
+            must_agree([answer := cell.decide(x, part)], decisions[-1:])
+            ids.append(answer[0])
             for k in due[i]:
                 if decisions[k].action is Action.REJECT or (stops_all and k != i and decisions[k].action is Action.ACCEPT):
                     continue
@@ -131,7 +98,8 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
                 told_of += k != i
         assert cell.end() == (0, "")
     assert told_of > 20
-    assert {d.action for d in decisions} >= {Action.VERIFY, Action.ACCEPT, *([] if stops_all else [Action.REJECT])}
+    rejects = [Action.REJECT] if learned.guarantee == "local" else []
+    assert {d.action for d in decisions} >= {Action.VERIFY, Action.ACCEPT, *rejects}
     report = import_journal(tmp_path / "imported.db", journal)
     assert report.contradicted == report.cut == report.known == 0
     found = []
@@ -160,19 +128,19 @@ def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_
     ids: dict[int, str] = {}
     acknowledged: dict[str, bool] = {}
 
-    def play(cell: Program, first: int, last: int, decided: dict[int, str]) -> None:
+    def play(cell: Program, first: int, last: int, decided: dict[int, list[str]]) -> None:
         for kind, k in lines[first:last]:
             if kind == "decide":
-                ids[k], decided[k] = cell.ask(asked(X[k], parts[k])).rsplit(",", 1)[0].split(",", 1)
-            elif not decided[k].startswith("reject"):
+                ids[k], *decided[k], _ = cell.decide(X[k], parts[k])
+            elif decided[k][0] != "reject":
                 assert cell.ask(f"label {ids[k]} {y[k]}") == f"ok {ids[k]}"
                 acknowledged[ids[k]] = bool(y[k])
 
-    whole: dict[int, str] = {}
+    whole: dict[int, list[str]] = {}
     with Program(programs, learned.file) as cell:
         play(cell, 0, len(lines), whole)
     acknowledged.clear()
-    decided: dict[int, str] = {}
+    decided: dict[int, list[str]] = {}
     kills = done = 0
     while done < len(lines):
         until = min(len(lines), done + rng.randrange(10, 60))
@@ -193,7 +161,7 @@ def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], 
     journal, ids = tmp_path / "cell.csv", {}
     with start() as cell:
         for x in X:
-            id_, action = cell.ask(asked(x)).split(",")[:2]
+            id_, action = cell.decide(x)[:2]
             ids.setdefault(action, id_)
         assert set(ids) == {"verify", "accept", "reject"}
         assert cell.ask(f"label {ids['verify']} 1") == f"ok {ids['verify']}"
@@ -208,6 +176,7 @@ def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], 
             "label nobody 1": 'expected the id of one of the last 10000 decisions, got "nobody"',
             f"label {ids['verify']} 100": "expected label ID 0|1",
             "stop": "expected stop ID",
+            "1,2,3": "expected decide, label or stop",
         }
         for line, message in wrong.items():
             answer = cell.ask(line)
@@ -218,24 +187,37 @@ def test_a_label_is_taken_once_and_never_changed(start: Callable[..., Program], 
     with start() as cell:  # after a restart, too
         assert "has the other label already" in cell.ask(f"label {ids['verify']} 0")
         with start() as second:  # two do not write one journal
-            code, said = second.end()
-        assert code == 1
-        assert "is being written by another program" in said
+            second.must_refuse("is being written by another program")
 
 
 @ONE
-def test_traces_come_from_files_too(programs: Path, learned: Learned, X: np.ndarray, tmp_path: Path) -> None:
+def test_traces_come_from_files_too_and_one_that_cannot_be_read_is_verified(programs, learned, X, tmp_path: Path) -> None:
     X[0].tofile(tmp_path / "trace.f32")
     (tmp_path / "column.txt").write_text("\n".join(map(str, X[0])))
     (tmp_path / "short.f32").write_bytes(X[0].tobytes()[:-3])
+    good = asked(X[0], "P1")
+    wrong = {
+        "decide": "expected decide [PART] TRACE",
+        "decide a b c": "expected decide [PART] TRACE",
+        "decide P1, 1,2": "without commas",
+        "decide 1;2": "cannot read 1;2",
+        good.replace("P1", "P\x01"): "expected a part's number in UTF-8",
+        f"decide {tmp_path / 'short.f32'}": "expected 400 bytes, got 397",
+        f"decide {tmp_path}": "no trace's file",
+        good.rsplit(",", 1)[0]: "expected 100 samples, got 99",
+        good.rsplit(",", 1)[0] + ",12N": 'expected a number in column 100, got "12N"',
+    }
     with Program(programs, learned.file) as cell:
         said = [f"decide P1 {tmp_path / name}" for name in ("trace.f32", "column.txt")]
-        answers = [cell.ask(line) for line in (asked(X[0], "P1"), *said)]
+        answers = [cell.ask(line) for line in (good, good + "\r", *said)]
         assert len({answer.split(",", 1)[1].rsplit(",", 1)[0] for answer in answers}) == 1
-        wrong = ("", "a b c", "P1, 1,2", "1;2", "P\xa01 1,2", f"{tmp_path / 'short.f32'}", f"{tmp_path}")
-        for words in wrong:
-            assert cell.ask(f"decide {words}").startswith("-,verify,malformed,0,1,0,0,")
-        assert cell.end()[0] == 1
+        for line in wrong:
+            assert cell.ask(line).startswith("-,verify,malformed,0,1,0,0,")
+        code, said = cell.end()
+    assert code == 1
+    for line, why in zip(said.splitlines(), wrong.values(), strict=True):
+        assert "is malformed: " in line
+        assert why in line
 
 
 @ONE
@@ -244,7 +226,7 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start,
     full = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (20_000, 20_000))  # bytes that the journal may have
     with start(preexec_fn=full) as cell:
         for x in X:
-            id_, action, reason = cell.ask(asked(x)).split(",")[:3]
+            id_, action, reason = cell.decide(x)[:3]
             if id_ == "-":
                 assert (action, reason) == ("verify", "journal_error")
                 refused += 1
@@ -258,7 +240,7 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(start,
     assert held.cut == 0
     assert set(acknowledged) <= {line.decision.id for line in held.lines if line.label}
     with start() as cell:  # there is room again
-        assert not cell.ask(asked(X[0])).startswith("-")
+        assert cell.decide(X[0])[0] != "-"
 
 
 @ONE
@@ -274,4 +256,4 @@ def test_with_a_key_only_what_was_signed_with_it_is_loaded(programs: Path, learn
     ):
         (tmp_path / "model.ts.sig").write_text(signature)
         with Program(programs, tmp_path / "model.ts", "--key", key) as cell:
-            assert expected in cell.end()[1]
+            cell.must_refuse(expected)

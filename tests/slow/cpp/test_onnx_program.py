@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dat
 from dengine.export import export_onnx, load_onnx, make_key
 from dengine.export.bundle import write_export
 from dengine.records import Action, Reason
+from tests.support.programs import Program, must_agree
 
 
 def library() -> Path:
@@ -37,44 +37,33 @@ def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return export_onnx(model, folder / "model.onnx", trace=TraceSpec(1000, limit=500.0), key=key), key
 
 
-def decide(
-    programs: Path, *arguments: Any, stdin: bytes = b"", code: int = 0, runtime: Any = None
-) -> tuple[list[list[str]], str]:
+def program(programs: Path, *arguments: Any, runtime: Any = None) -> Program:
     env = os.environ | {"DENGINE_ONNXRUNTIME": str(library() if runtime is None else runtime)}
-    command = [str(programs / "dengine-onnx"), *map(str, arguments)]
-    done = subprocess.run(command, input=stdin, capture_output=True, check=False, env=env, timeout=120)
-    assert done.returncode == code, done.stderr
-    return [line.split(",") for line in done.stdout.decode().splitlines()], done.stderr.decode()
+    return Program(programs, *arguments, name="dengine-onnx", env=env)
 
 
-def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_ones(
-    programs: Path, signed: tuple[Path, Path]
-) -> None:
+def test_it_decides_on_the_bundled_traces_as_python_does_and_verifies_the_bad_ones(programs: Path, signed) -> None:
     file, key = signed
     X = load_dataset("insertion").X[700:1000].copy()
     X[0, 3], X[1, 5], X[2, 0], X[3], X[4] = np.nan, -np.inf, 1e30, 2.5, X[4] * 9.0
     expected = load_onnx(file, key=key).decide_many(X)
-    lines = [f"decide P{i} {','.join(map(str, x))}" for i, x in enumerate(X)]
-    asked, _ = decide(programs, file, "--key", key, stdin="\n".join(lines).encode())
-    plain, _ = decide(programs, file, "--binary", stdin=X.astype(np.float32).tobytes())
-    assert [words[0] for words in asked] == ["-"] * len(X)  # no label of it can come
-    for found in ([words[1:] for words in asked], plain):
-        for words, decision in zip(found, expected, strict=True):
-            assert words[:2] == [str(decision.action), str(decision.reason)]
-            assert list(map(float, words[2:4])) == pytest.approx([decision.lower, decision.upper], abs=1e-12)
-            assert list(map(int, words[4:6])) == [decision.n_success, decision.n_failure]
-            np.testing.assert_allclose(list(map(float, words[6:8])), decision.embedding[0], rtol=1e-6)
+    with program(programs, file, "--key", key) as cell:
+        answers = [cell.decide(x, f"P{i}") for i, x in enumerate(X)]
+    must_agree(answers, expected, accuracy=1e-12)
+    assert {words[0] for words in answers} == {"-"}  # no label of it can come
     assert {d.action for d in expected} >= {Action.ACCEPT, Action.VERIFY}
     bad = {Reason.NOT_FINITE, Reason.SATURATED, Reason.CONSTANT}
     assert bad <= {d.reason for d in expected}
 
 
 def test_it_learns_nothing_and_says_so(programs: Path, signed: tuple[Path, Path], tmp_path: Path) -> None:
-    found, _ = decide(programs, signed[0], stdin=b"label x-1 1\nstop x-1\ndecide 1,2\n", code=1)
-    assert found[0] == ["error a model in ONNX learns nothing; export TorchScript"] == found[1]
-    assert found[2][:3] == ["-", "verify", "malformed"]
-    assert "learns nothing" in decide(programs, signed[0], "--journal", tmp_path / "cell.csv", code=1)[1]
-    assert "learns nothing" in decide(programs, signed[0], "--learn", code=1)[1]
+    learns_nothing = "a model in ONNX learns nothing"
+    with program(programs, signed[0]) as cell:
+        assert cell.ask("label x-1 1") == f"error {learns_nothing}; export TorchScript" == cell.ask("stop x-1")
+        assert cell.decide(np.ones(2))[:3] == ["-", "verify", "malformed"]
+        assert cell.end()[0] == 1
+    with program(programs, signed[0], "--journal", tmp_path / "cell.csv") as cell:
+        cell.must_refuse(learns_nothing)
 
 
 def flip(file: Path) -> None:
@@ -100,15 +89,16 @@ def test_a_file_that_must_not_be_used_is_refused(programs: Path, signed, tmp_pat
     shutil.copytree(signed[0].parent, tmp_path, dirs_exist_ok=True)
     spoil, expected = SPOILT[kind]
     spoil(file := tmp_path / "model.onnx")
-    lines, said = decide(programs, file, "--key", signed[1], stdin=b"decide 1,2\n", code=1)
-    assert lines == []
-    assert expected in said
+    with program(programs, file, "--key", signed[1]) as cell:
+        cell.must_refuse(expected)
     if kind == "flip":  # by its sum as well
-        assert "it is damaged or truncated" in decide(programs, file, code=1)[1]
+        with program(programs, file) as cell:
+            cell.must_refuse("it is damaged or truncated")
 
 
 @pytest.mark.parametrize(
     ("runtime", "expected"), [("nothing.so", "name it in DENGINE_ONNXRUNTIME"), ("libm.so.6", "is no onnxruntime")]
 )
 def test_without_onnxruntime_it_says_where_to_name_it(programs: Path, signed, runtime: str, expected: str) -> None:
-    assert expected in decide(programs, signed[0], code=1, runtime=runtime)[1]
+    with program(programs, signed[0], runtime=runtime) as cell:
+        cell.must_refuse(expected)

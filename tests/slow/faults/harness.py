@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dengine import Action, DataEngine, Dataset, Policy, Recipe, RetrainReport, load_dataset
-from dengine.store import SqlStore, Store
+from dengine.store import SqlStore
 from dengine.store.journal import HEADER
 
 RECIPE = Recipe("pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9))
@@ -27,7 +27,8 @@ class Outcome:
 
     labels : acknowledged.  lost : of these, not stored as they were acknowledged.  wrong : decisions that a reopened engine
     makes otherwise, and faults that were not noticed.  raised : exceptions that reached the cell.  longest : wait for a
-    decision or a report that set off no retrain, in seconds.  told : the first of what went wrong, in words.
+    decision or a report that set off no retrain, in seconds.  versions : swapped in between kills.
+    told : the first of what went wrong, in words.
     """
 
     injected: int = 0
@@ -36,6 +37,7 @@ class Outcome:
     wrong: int = 0
     raised: int = 0
     longest: float = 0.0
+    versions: int = 0
     told: list[str] = field(default_factory=list)
 
     def tell(self, error: BaseException) -> None:
@@ -88,19 +90,22 @@ class Cell:
 
     def _part(self, x: Any, good: bool) -> None:
         try:
-            decision = self._timed(lambda: self.engine.decide(x))
+            decision = self.timed(lambda: self.engine.decide(x))
             bad_accept = decision.action is Action.ACCEPT and not good
             if decision.action is Action.VERIFY or bad_accept:
-                self._timed(lambda: self.engine.report(decision.id, good))
+                self.timed(lambda: self.engine.report(decision.id, good))
                 self.acknowledged[decision.id] = good
         except Exception as error:  # whatever reaches the cell is what is counted here
             self.outcome.tell(error)
 
-    def _timed(self, work: Callable[[], Any]) -> Any:
-        begin = time.perf_counter()
-        result = work()
-        if not isinstance(result, RetrainReport):  # a retrain takes its own time, which is no wait
-            self.outcome.longest = max(self.outcome.longest, time.perf_counter() - begin)
+    def timed(self, work: Callable[[], Any]) -> Any:
+        """Do this, and see how long it takes."""
+        begin, result = time.perf_counter(), None
+        try:
+            result = work()
+        finally:
+            if not isinstance(result, RetrainReport):  # a retrain takes its own time, which is no wait
+                self.outcome.longest = max(self.outcome.longest, time.perf_counter() - begin)
         return result
 
     def until_back(self) -> None:
@@ -129,7 +134,7 @@ def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:
     return [(d.action, d.lower, d.upper, d.n_success, d.n_failure, d.embedding, d.model_version) for d in seen]
 
 
-def missing(store: Store, acknowledged: dict[str, bool]) -> int:
+def missing(store: SqlStore, acknowledged: dict[str, bool]) -> int:
     """How many labels a store does not hold as they were acknowledged."""
     found = {name: store.get_decision(name) for name in acknowledged}
     return sum(known is None or known.success is not acknowledged[name] for name, known in found.items())

@@ -1,10 +1,14 @@
-"""SIGKILL at random moments: of the cell, in an outage, of an import, an export, a version's commit, the C++ journal.
+"""SIGKILL at random moments: of the cell, served or not, in an outage, of an import, an export, the C++ journal.
+
+Then, too, what a killed cell leaves is damaged: its write-ahead log is cut, or a bit of its journal flipped.
 
 The children come from a server of forks that has imported everything, so that a kill costs what it kills and no start.
 """
 
 from __future__ import annotations
 
+import http.client
+import json
 import multiprocessing
 import os
 import signal
@@ -13,19 +17,26 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from dengine import Action, DataEngine, Recipe, export_torchscript, load_exported
+from dengine import Action, DataEngine, Reason, Recipe, export_torchscript, load_exported
 from dengine.datasets.importing import import_labelled
 from dengine.errors import DengineError, ExportError
 from dengine.export import import_journal
+from dengine.serve.http import create_app
+from dengine.serve.retraining import RetrainingProcess
+from dengine.serve.service import CellService
+from dengine.store.journal import HEADER
+from tests.support.serving import served
 
 from .harness import PROBE, RECIPE, Cell, Outcome, Place, missing, stream
+from .kinds import flipped
 
 # The server of forks looks for what it loads beforehand along PYTHONPATH, not along this program's path.
 HERE = str(Path(__file__).resolve().parents[3])
@@ -36,10 +47,13 @@ LOADED = (
     "dengine.datasets.importing",
     "dengine.export.torchscript",
     "dengine.reducers.pca",
+    "dengine.serve.http",
+    "uvicorn",
 )
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload([*LOADED, "sklearn.decomposition", "pandas"])
 IN_ONE = 20  # kills of one store, so that opening it takes no longer than the kill
+SOON = replace(RECIPE, retrain_every=10)  # versions are swapped in between kills
 OFTEN = replace(RECIPE, retrain_every=3)  # a version's commit is under way most of the time
 
 
@@ -55,18 +69,22 @@ def _acknowledge(path: str, *words: object) -> None:
         file.write(" ".join(map(str, words)) + "\n")
 
 
-def cell(place: Place, told: str, seed: int, recipe: Recipe = RECIPE, locked_after: int | None = None) -> None:
-    """Decide and report on and on, and tell of each once it was acknowledged.
+def cell(place: Place, told: str, seed: int, recipe: Recipe = SOON, locked_after: int | None = None) -> None:
+    """Decide and report on and on, under ids of its own, and tell of each once it was answered and acknowledged.
 
     After each report it decides on a probe; or, `locked_after` so many parts, its store is locked.
     """
     engine, data, rng = DataEngine.open_or_create(place.store(), recipe=recipe), stream(), np.random.default_rng(seed)
     other = None if locked_after is None else sqlite3.connect(place.url, isolation_level=None, timeout=30)
+    _acknowledge(told, "began", engine.store.status()["labels"], engine.version)
     for n, _ in enumerate(_for_a_while()):
         if other is not None and n == locked_after:
             other.execute("BEGIN IMMEDIATE")
         i = int(rng.integers(len(data) - PROBE))
-        decision = engine.decide(data.X[i])
+        decision = engine.decide(data.X[i], decision_id=f"{seed}-{n}")
+        if decision.reason is Reason.NO_STORE:
+            continue  # recorded under no id, or verified over a slow disk
+        _acknowledge(told, "answer", decision.id, i, decision.action, decision.lower)
         if decision.action is Action.VERIFY:
             engine.report(decision.id, bool(data.y[i]))
             _acknowledge(told, "label", decision.id, int(data.y[i]))
@@ -76,21 +94,49 @@ def cell(place: Place, told: str, seed: int, recipe: Recipe = RECIPE, locked_aft
 
 
 often = partial(cell, recipe=OFTEN)
-in_outage = partial(cell, locked_after=20)
+in_outage = partial(cell, locked_after=5)
+
+
+def serving(place: Place, told: str, seed: int) -> None:
+    """A served cell, with the process that retrains beside it."""
+    with RetrainingProcess() as pool:
+        pool.submit(int).result()  # it has begun
+        service = CellService(lambda: DataEngine.open_or_create(place.store(), recipe=SOON, executor=pool))
+        with closing(service), served(create_app(service, page=False)) as port:
+            _acknowledge(told, "began", service.engine.store.status()["labels"], service.engine.version, port)
+            time.sleep(60)
+
+
+def drive(told: str, seed: int) -> None:
+    """Ask a served cell, and tell it, until it is killed."""
+    data, rng = stream(), np.random.default_rng(seed)
+    port = int(Path(told).read_text().split()[3])
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:
+
+        def ask(path: str, **body: object) -> dict[str, Any]:
+            connection.request("POST", path, json.dumps(body), {"content-type": "application/json"})
+            answer = connection.getresponse()
+            said: dict[str, Any] = json.loads(answer.read())
+            if answer.status != 200:
+                raise ConnectionError(said)
+            return said
+
+        with suppress(OSError, http.client.HTTPException, ValueError):  # it was killed, as it was to be
+            for n, _ in enumerate(_for_a_while()):
+                i = int(rng.integers(len(data) - PROBE))
+                said = ask("/decide", trace=data.X[i].tolist(), request=f"{seed}-{n}")
+                if said["late"] or said["reason"] == Reason.NO_STORE:
+                    continue
+                _acknowledge(told, "answer", said["id"], i, said["action"], said["lower"])
+                if said["action"] == Action.VERIFY:
+                    ask("/report", id=said["id"], success=bool(data.y[i]))
+                    _acknowledge(told, "label", said["id"], int(data.y[i]))
 
 
 def importing(place: Place, told: str, seed: int) -> None:
     """An import of recorded labels, chunk by chunk."""
-    data = stream()
-    done = 0
-
-    def on_traces(n: int) -> None:
-        nonlocal done
-        done += n
-        _acknowledge(told, "imported", done)
-
     _acknowledge(told, "imported", 0)
-    import_labelled(place.store(), data, recipe=RECIPE, on_traces=on_traces)
+    import_labelled(place.store(), stream(), recipe=RECIPE, on_traces=lambda n: _acknowledge(told, "imported", n))
     time.sleep(60)
 
 
@@ -102,53 +148,93 @@ def exporting(place: Place, told: str, seed: int) -> None:
             _acknowledge(told, "exported")
 
 
+def _at_home(surroundings: dict[str, str], child: Callable[..., None], *words: object) -> None:
+    """Run a child where its killer looks for its journal: the server of forks keeps the surroundings of its start."""
+    os.environ.update(surroundings)
+    child(*words)
+
+
 def killed(child: Callable[..., None], place: Place, seed: int, most: float = 0.5) -> list[list[str]]:
-    """Run a child until a random moment after its first word, kill it, and return what it told."""
-    told = f"{place.url if '://' not in place.url else f'/tmp/dengine-{place.cell}'}.told"
-    Path(told).unlink(missing_ok=True)
-    process = CONTEXT.Process(target=child, args=(place, told, seed), daemon=True)
+    """Run a child until a random moment after its first word, kill it, and return what it, and who asked it, told."""
+    told = f"{place.url if '://' not in place.url else f'/tmp/dengine-{os.getpid()}-{place.cell}'}.told"
+    Path(told).write_text("")
+    process = CONTEXT.Process(target=_at_home, args=(dict(os.environ), child, place, told, seed))
     process.start()
     end = time.monotonic() + 60
-    while not Path(told).exists() and process.is_alive() and time.monotonic() < end:
+    while "\n" not in Path(told).read_text() and process.is_alive() and time.monotonic() < end:
         time.sleep(0.005)
-    time.sleep(float(np.random.default_rng(seed).uniform(0.0, most)))
-    os.kill(process.pid, signal.SIGKILL)
+    timer = threading.Timer(float(np.random.default_rng(seed).uniform(0.0, most)), process.kill)
+    timer.start()
+    if child is serving and process.is_alive():
+        drive(told, seed)
+    timer.join()
     process.join()
-    text = Path(told).read_text() if Path(told).exists() else ""
-    Path(told).unlink(missing_ok=True)
+    if process.exitcode != -signal.SIGKILL:
+        raise RuntimeError("the process that was to be killed had ended by itself")
+    text = Path(told).read_text()
+    Path(told).unlink()
     return [line.split() for line in text[: text.rfind("\n") + 1].splitlines()]
 
 
-def check_cell(outcome: Outcome, place: Place, told: list[list[str]]) -> None:
-    """Every acknowledged label is there; where nothing came after the last probe, the engine says the same of it."""
+def cut_wal(place: Place, seed: int) -> str:
+    """Cut or remove the write-ahead log."""
+    wal, rng = Path(f"{place.url}-wal"), np.random.default_rng(seed)
+    Path(f"{place.url}-shm").unlink(missing_ok=True)
+    wal.unlink() if seed % 2 else os.truncate(wal, int(rng.integers(wal.stat().st_size + 1)))
+    return "the ledger lacks entry"
+
+
+def flip_journal(place: Place, seed: int) -> str:
+    """Flip a bit of a record in the journal."""
+    journal = Path(f"{place.url}.{place.cell}.journal")
+    written = journal.read_bytes().rstrip(b"\0")
+    journal.write_bytes(written)
+    if len(written) > HEADER:
+        flipped(journal, np.random.default_rng(seed))
+    return "not as they were written"
+
+
+def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: str = "") -> None:
+    """Every acknowledged label is there, every id has its answer; an engine to which nothing came decides as before.
+
+    excuse : what an event must say where labels, ids or decisions may differ.
+    """
+    began = [words[1:3] for words in told if words[0] == "began"]
     labels = {words[1]: words[2] == "1" for words in told if words[0] == "label"}
-    probes = [words[1:] for words in told if words[0] == "probe"]
     with DataEngine.open(place.store()) as engine:
         outcome.labels += len(labels)
-        outcome.lost += missing(engine.store, labels)
-        n_stored = engine.store.status()["labels"]
+        outcome.versions += sum(engine.version - int(version) for _, version in began)
+        said = bool(excuse) and any(excuse in event.text for event in engine.store.events())
+        lost, n_stored = missing(engine.store, labels), engine.store.status()["labels"]
         probe = engine.decide(stream().X[-1])
+        outcome.lost += 0 if said and lost == 1 else lost
         now = [str(v) for v in (engine.version, probe.lower, probe.upper, probe.n_success, probe.n_failure)]
-        if probes and told[-1][0] == "probe" and n_stored == check_cell.stored + len(labels):
-            outcome.wrong += now != probes[-1]
-            check_cell.compared += 1
-        check_cell.stored = n_stored
+        if told and told[-1][0] == "probe" and not said and [n_stored - len(labels)] == [int(n) for n, _ in began]:
+            outcome.must(now == told[-1][1:], f"decides otherwise: {now}, {told[-1]}")
+        for id_, i, *answer in (words[1:] for words in told if words[0] == "answer" and not said):
+            again = engine.decide(stream().X[int(i)], decision_id=id_)
+            outcome.must([again.action, str(again.lower)] == answer, f"{id_} is answered otherwise: {answer}, {again}")
 
 
-check_cell.stored = 0  # labels in the store when it was last looked at
-check_cell.compared = 0
+def kill_cells(
+    outcome: Outcome,
+    place: Place,
+    times: int,
+    child: Callable[..., None] = cell,
+    damage: Callable[[Place, int], str] | None = None,
+) -> None:
+    """Kill so often; a store is killed `IN_ONE` times in a row, then there is a new one.
 
-
-def kill_cells(outcome: Outcome, place: Place, times: int, child: Callable[..., None] = cell) -> None:
-    """Kill so often; a store is killed `IN_ONE` times in a row, then there is a new one."""
+    damage : done to what was left, of a store of its own each time; returns what is to be said of it.
+    """
     for seed in range(times):
-        if seed % IN_ONE == 0:
-            check_cell.stored = 0
-            own = next_place(place, seed)
+        own = next_place(place, seed if damage else seed - seed % IN_ONE)
+        if damage:
+            DataEngine(recipe=SOON, store=own.store()).close()
         told = killed(child, own, seed)
         outcome.injected += 1
         try:
-            check_cell(outcome, own, told)
+            check_cell(outcome, own, told, damage(own, seed) if damage else "")
         except DengineError as error:
             outcome.tell(error)
 
@@ -165,20 +251,17 @@ def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
         own = next_place(place, seed)
         told = killed(importing, own, seed, most=1.5)
         outcome.injected += 1
-        done = max((int(words[1]) for words in told), default=0)
+        done = sum(int(words[1]) for words in told)
         outcome.labels += done
         try:
             with own.store() as store:
                 outcome.lost += max(0, done - store.status()["labels"])
             import_labelled(own.store(), stream(), recipe=RECIPE)
             with own.store() as store:
-                outcome.must(
-                    store.status()["labels"] == n, f"{store.status()['labels']} of {n} labels after the repetition"
-                )
+                found = store.status()["labels"]
+            outcome.must(found == n, f"{found} of {n} labels after the repetition")
         except DengineError as error:
             outcome.tell(error)
-        for file in Path(own.url).parent.glob(Path(own.url).name + "*"):
-            file.unlink()
 
 
 def exported(place: Place) -> Path:
@@ -215,6 +298,8 @@ def kill_programs(outcome: Outcome, place: Place, times: int, program: Path) -> 
         import_journal(place.store(), journal)
         with place.store() as store:
             outcome.lost += missing(store, acknowledged)
+        journal.write_bytes(b"".join(journal.read_bytes().splitlines(keepends=True)[:-3]))
+        outcome.must("its head knows" in import_journal(place.store(), journal).aside, "the last lines can be removed")
     except DengineError as error:
         outcome.tell(error)
 

@@ -1,32 +1,51 @@
-"""Faults while the cell runs: its store locked, full, slow, moved, replaced, cut off; its executor, Ctrl-C, a fork."""
+"""Faults of a running cell's store, disk, server, clock and processes; and what is found changed when it is opened."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import signal
 import sqlite3
+import subprocess
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
-from dengine import Reason
+from dengine import Action, DataEngine, Decision, Reason, ReplayCell
 from dengine.engine import trainer
-from dengine.errors import StoreError
+from dengine.errors import ReportError, StoreError, TraceError
+from dengine.store import StoredDecision, verify_history
+from dengine.store.journal import journal_path
+from dengine.store.ledger import row_sum
+from tests.support.serving import started
 
-from .disk import closed_while_hung, failing_disk, hung_disk, run_over_a_hung_disk
-from .harness import Cell, Outcome, Place, stream
+from .harness import Cell, Outcome, Place, bounds, missing, stream
 
 BEFORE, DURING, AFTER = 100, 40, 60  # parts; a version is stored after 40 labels
 OUTAGE = 0.5  # seconds that a fault goes on after the parts that met it
 AWAY = 1.5  # seconds after which a store is not slow, but away
 ODD = "no-database-takes-it"
+IDS = 100  # asked for again while the store is away
+FLIPS = 40  # of one bit each
+CHANGES = (
+    "UPDATE setting SET value = replace(value, 'lower_bound = 0.9', 'lower_bound = 0.8') WHERE key = 'recipe'",
+    "UPDATE label SET success = 1 - success WHERE seq = 3",
+    "UPDATE correction SET success = 1 - success",
+    "UPDATE label SET success = 1 - success WHERE seq = 3; UPDATE label SET sum = sum_of() WHERE seq = 3",
+    "DELETE FROM label WHERE seq = 3",
+    "UPDATE model_version SET accepted = 0",
+)
+SYNC = Path(os.environ.get("DENGINE_SYNC", os.devnull))  # what the library between this process and its disk is told by
 
 
 def during(cell: Cell, fault: Any, away: bool = False) -> None:
@@ -68,50 +87,24 @@ def moved_away(file: Path) -> Iterator[None]:
     away.rename(file)
 
 
+def away(place: Place) -> contextlib.AbstractContextManager[None]:
+    """The store away: its file under another name, or its server's processes frozen."""
+    return stopped(place) if "://" in place.url else moved_away(Path(place.url))
+
+
 def moved(outcome: Outcome, place: Place) -> None:
     """The store's file moved away, and put back."""
     during(Cell(place, outcome), moved_away(Path(place.url)), away=True)
 
 
-def full(outcome: Outcome, place: Place) -> None:
-    """The disk full: SQLite may not grow its file by another page."""
-    during(Cell(place, outcome), _full())
-
-
-@contextlib.contextmanager
-def _full() -> Iterator[None]:
-    most = 1
-
-    def bound(connection: Any, *_: object) -> None:
-        if isinstance(connection, sqlite3.Connection):
-            connection.execute(f"PRAGMA max_page_count = {most}")
-
-    sa.event.listen(sa.pool.Pool, "checkout", bound)  # it stays, so that every connection may grow again
-    yield
-    most = 1073741823
-
-
-@contextlib.contextmanager
-def _statements(react: Callable[[str, Any], None]) -> Iterator[None]:
-    """Do this before each statement of any store in this process."""
-
-    def before(connection: Any, cursor: Any, statement: str, parameters: Any, *_: object) -> None:
-        react(statement, parameters)
-
-    sa.event.listen(sa.Engine, "before_cursor_execute", before)
-    try:
-        yield
-    finally:
-        sa.event.remove(sa.Engine, "before_cursor_execute", before)
-
-
 def lost_journal(outcome: Outcome, place: Place) -> None:
-    """The journal deleted, moved, or its folder removed, while the store is locked."""
+    """The journal deleted, moved, or its folder removed, while the store is away."""
     cell = Cell(place, outcome)
     cell.play(BEFORE)
-    journal = Path(f"{place.url}.{place.cell}.journal")
-    with lock(place):
-        for lose in (Path.unlink, lambda file: file.rename(f"{file}.away")):
+    journal, remote = journal_path(cell.engine.store.database.url, place.cell), "://" in place.url
+    ways = [Path.unlink, lambda file: file.rename(f"{file}.away"), *[lambda file: shutil.rmtree(file.parent)] * remote]
+    with stopped(place) if remote else lock(place):
+        for lose in ways:
             cell.play(10)
             lose(journal)
             outcome.injected += 1
@@ -122,31 +115,24 @@ def lost_journal(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-def no_room_for_versions(outcome: Outcome, place: Place) -> None:
-    """The disk full whenever a version is stored."""
-
-    def refuse(statement: str, parameters: Any) -> None:
-        if statement.startswith("INSERT INTO model_version"):
-            raise sa.exc.OperationalError(statement, {}, sqlite3.OperationalError("database or disk is full"))
-
-    during(Cell(place, outcome), _statements(refuse))
-
-
 def unstorable(outcome: Outcome, place: Place) -> None:
     """A row that no database takes."""
 
-    def refuse(statement: str, parameters: Any) -> None:
+    def refuse(connection: Any, cursor: Any, statement: str, parameters: Any, *_: object) -> None:
         if statement.startswith("INSERT INTO decision") and ODD in repr(parameters):
             raise sa.exc.DataError(statement, {}, OverflowError("out of range"))
 
     cell = Cell(place, outcome)
     cell.play(BEFORE)
     outcome.injected += 1
-    with _statements(refuse):
+    sa.event.listen(sa.Engine, "before_cursor_execute", refuse)
+    try:
         cell.engine.decide(stream().X[0], decision_id=ODD)
         cell.play(DURING)
         cell.engine.flush()
         cell.until_back()  # a busy machine's store may have been late, too
+    finally:
+        sa.event.remove(sa.Engine, "before_cursor_execute", refuse)
     texts = [event.text for event in cell.engine.store.events() if event.kind == "dead letter"]
     outcome.must(len(texts) == 1 and ODD in texts[0], "the row did not become a dead letter")
     cell.finish()
@@ -193,18 +179,60 @@ def _backends(url: str, work: Callable[[sa.Connection, int], object]) -> None:
     engine.dispose()
 
 
+@contextlib.contextmanager
+def stopped(place: Place) -> Iterator[None]:
+    """PostgreSQL's processes for these cells frozen."""
+    pids: list[int] = []
+    _backends(place.url, lambda connection, pid: pids.append(pid) or os.kill(pid, signal.SIGSTOP))
+    yield
+    for pid in pids:
+        os.kill(pid, signal.SIGCONT)
+
+
 def frozen(outcome: Outcome, place: Place) -> None:
     """PostgreSQL's processes for this cell frozen (SIGSTOP)."""
-    pids: list[int] = []
+    during(Cell(place, outcome), stopped(place), away=True)
 
-    @contextlib.contextmanager
-    def stopped() -> Iterator[None]:
-        _backends(place.url, lambda connection, pid: pids.append(pid) or os.kill(pid, signal.SIGSTOP))
-        yield
-        for pid in pids:
-            os.kill(pid, signal.SIGCONT)
 
-    during(Cell(place, outcome), stopped())
+def closed_while_away(outcome: Outcome, place: Place) -> None:
+    """An engine closed while its store is away."""
+    before, cell = set(threading.enumerate()), Cell(place, outcome)
+    cell.play(60)
+    with away(place):
+        outcome.injected += 1
+        cell.play(30)
+        cell.engine.close()
+    for thread in set(threading.enumerate()) - before:
+        thread.join(15.0)
+        outcome.must(not thread.is_alive(), f"{thread.name} goes on")
+    end = time.monotonic() + 10.0
+    while True:
+        with contextlib.suppress(StoreError):  # until the server has noticed that the session is over
+            cell.engine = DataEngine.open(place.store())
+            break
+        outcome.must(time.monotonic() < end, "the cell was not given free")
+        time.sleep(0.2)
+    cell.finish()
+
+
+def killed_server(outcome: Outcome, place: Place) -> None:
+    """PostgreSQL killed (SIGKILL of its process for the cell) at a random moment of its commits."""
+    cell, rng, pids = Cell(place, outcome), np.random.default_rng(0), list[int]()
+    cell.play(BEFORE)
+    for _ in range(5):
+        _backends(place.url, lambda connection, pid: pids.append(pid))
+        timer = threading.Timer(float(rng.uniform(0.0, 0.2)), os.kill, (pids[-1], signal.SIGKILL))
+        timer.start()
+        outcome.injected += 1
+        cell.play(20)
+        timer.join()
+        up = False
+        while not up:
+            time.sleep(OUTAGE)
+            with contextlib.suppress(sa.exc.OperationalError):  # it recovers
+                up = _backends(place.url, lambda connection, pid: None) is None
+        cell.until_back()
+    cell.finish()
 
 
 def cut_off(outcome: Outcome, place: Place) -> None:
@@ -216,6 +244,301 @@ def cut_off(outcome: Outcome, place: Place) -> None:
         outcome.injected += 1
         cell.play(10)
         cell.until_back()
+    cell.finish()
+
+
+@contextlib.contextmanager
+def _syncs(do: str) -> Iterator[None]:
+    """What every sync of this process does: "hang" or "fail"."""
+    SYNC.write_text(do)
+    try:
+        yield
+    finally:
+        SYNC.write_text("")
+
+
+def _before_a_disk(outcome: Outcome, place: Place) -> Cell:
+    """A cell that waits as long as a robot's."""
+    cell = Cell(replace(place, wait=0.4), outcome)
+    cell.play(60)
+    cell.engine.flush()
+    outcome.injected += 1
+    return cell
+
+
+def _unsynced(cell: Cell, i: int) -> Decision:
+    """Decide and report while nothing is synced: what is not on the disk is verified, and not acknowledged."""
+    engine, outcome, x, good = cell.engine, cell.outcome, stream().X[i], bool(stream().y[i])
+    cell.timed(lambda: engine.decide(x))
+    known: Decision = cell.timed(lambda: engine.decide(x, decision_id=f"part-{i}"))
+    outcome.must(known.action is Action.VERIFY, f"{known.id} goes on unchecked, and is on no disk")
+    for success, error in ((good, StoreError), (not good, ReportError), (good, StoreError)):
+        with contextlib.suppress(error):
+            cell.timed(lambda success=success: engine.report(known.id, success))
+            outcome.must(False, f"the label {success} of {known.id} was acknowledged on no disk")
+    return known
+
+
+def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
+    """A disk whose syncs hang: no call takes long, and what was not taken can be said again."""
+    cell, data = _before_a_disk(outcome, place), stream()
+    with _syncs(do):
+        told = {i: _unsynced(cell, i) for i in range(60, 63)}
+        fault = cell.timed(lambda: cell.engine.store_fault)
+    outcome.must(bool(fault), "the engine says that its disk is well")
+    cell.until_back()
+    for i, known in told.items():
+        cell.acknowledged[known.id] = bool(data.y[i])
+        cell.engine.report(known.id, cell.acknowledged[known.id])
+    cell.play(60)
+    cell.finish()
+    with DataEngine.open(place.store()) as again:
+        for i, known in told.items():
+            outcome.must(again.decide(data.X[i], decision_id=known.id) == known, f"{known.id} is answered otherwise")
+
+
+def failing_disk(outcome: Outcome, place: Place) -> None:
+    """A disk whose syncs fail."""
+    hung_disk(outcome, place, "fail")
+
+
+def run_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
+    """A sync that hangs for two seconds under a cell's loop."""
+    cell = _before_a_disk(outcome, place)
+    with _syncs("hang"):
+        threading.Timer(2.0, SYNC.write_text, [""]).start()
+        cycles = list(cell.engine.run(ReplayCell(stream(), np.arange(60, 90)), 30))
+    outcome.must(any(c.decision.reason is Reason.NO_STORE for c in cycles), "a part was decided on over a hung disk")
+    cell.acknowledged |= {c.decision.id: c.success for c in cycles if c.success is not None}
+    cell.play(60)
+    cell.finish()
+
+
+def end(url: str, hung: bool) -> None:
+    """What `closed_while_hung` and `unclosed` have a process of their own do."""
+    cell = _before_a_disk(Outcome(), Place(url))
+    if hung:
+        SYNC.write_text("hang")
+        _unsynced(cell, 60)
+        with contextlib.suppress(StoreError):
+            cell.timed(cell.engine.close)
+    print(json.dumps([cell.acknowledged, asdict(cell.outcome)]), flush=True)
+
+
+def closed_while_hung(outcome: Outcome, place: Place, hung: bool = True) -> None:
+    """A process that ends while a sync hangs."""
+    begin, code = time.monotonic(), f"from tests.slow.faults.kinds import end; end({place.url!r}, {hung})"
+    with _syncs("") if hung else contextlib.nullcontext():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    outcome.must(time.monotonic() - begin < 60, "a hung disk kept the process from ending")
+    outcome.must(hung or not done.stderr, f"it said at its end: {done.stderr}")
+    acknowledged, seen = json.loads(done.stdout.splitlines()[-1])
+    with DataEngine.open(place.store()) as again:
+        outcome.labels, outcome.lost = outcome.labels + len(acknowledged), outcome.lost + missing(again.store, acknowledged)
+    for name in ("injected", "wrong", "raised", "told"):
+        setattr(outcome, name, getattr(outcome, name) + seen[name])
+    outcome.longest = max(outcome.longest, seen["longest"])
+
+
+def unclosed(outcome: Outcome, place: Place) -> None:
+    """A process that ends and does not close its engine."""
+    closed_while_hung(outcome, place, hung=False)
+
+
+def served_over_a_hung_disk(outcome: Outcome, place: Place) -> None:
+    """A served cell whose disk's syncs hang."""
+    folder, x, good = Path(f"{place.url}.served"), stream().X.tolist(), stream().y.tolist()
+    folder.mkdir()
+    cell = Cell(replace(place, url=str(folder / "probe.db")), outcome)  # which times what is asked
+    with started(folder, "--reducer", "pca") as server:
+        first = server.ask("/decide", {"trace": x[0], "request": "first"})
+        server.ask("/report", {"id": first["id"], "success": good[0]})
+        with _syncs("hang"):
+            outcome.injected += 1
+            told = cell.timed(lambda: server.ask("/decide", {"trace": x[1], "request": "second"}))
+            outcome.must(told["action"] == Action.VERIFY, "a part goes on unchecked over a hung disk")
+            with contextlib.suppress(OSError):
+                cell.timed(lambda: server.ask("/report", {"id": told["id"], "success": good[1]}))
+                outcome.must(False, "a label was acknowledged on no disk")
+            outcome.must(server.ask("/healthz")["status"] == "degraded", "the server says that its disk is well")
+            with contextlib.suppress(OSError):  # it may say that it does not know, but not wait
+                cell.timed(lambda: server.ask("/status"))
+            begin = time.monotonic()
+            server.end()
+            outcome.must(time.monotonic() - begin < 60, "a hung disk kept the server from ending")
+    cell.engine.close()
+    with DataEngine.open(str(folder / "cell.db")) as again:
+        outcome.labels, outcome.lost = outcome.labels + 1, outcome.lost + missing(again.store, {first["id"]: bool(good[0])})
+
+
+def clock_set_back(outcome: Outcome, place: Place) -> None:
+    """The clock set back by an hour."""
+    cell, begin = Cell(place, outcome), time.time()
+    cell.play(BEFORE)
+    with _syncs("back"):
+        outcome.must(time.time() < begin, "the clock was not set back")
+        outcome.injected += 1
+        cell.play(BEFORE)
+        cell.engine.retrain()
+        cell.finish()
+
+
+def full_tmpfs(outcome: Outcome, place: Place) -> None:
+    """A tmpfs that is full while the journal is drained."""
+    folder = Path(f"{place.url}.tmpfs")
+    folder.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", folder], check=True)
+    try:
+        during(Cell(replace(place, url=str(folder / "engine.db")), outcome), _filled(folder / "filler"), away=True)
+    finally:
+        subprocess.run(["umount", folder], check=True)
+
+
+@contextlib.contextmanager
+def _filled(filler: Path) -> Iterator[None]:
+    with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+        while file.write(bytes(4096)) == 4096:
+            pass
+    yield
+    filler.unlink()
+
+
+def changed(outcome: Outcome, place: Place) -> None:
+    """A setting, a label or a correction changed by SQL while no engine runs."""
+    cell = Cell(place, outcome)
+    cell.play(60)
+    name, good = cell.acknowledged.popitem()
+    cell.engine.correct(name, not good)
+    cell.finish()
+    for i, sql in enumerate(CHANGES):
+        other = replace(place, url=f"{place.url}.{i}")
+        shutil.copy(place.url, other.url)
+        with contextlib.closing(sqlite3.connect(other.url)) as connection:
+            connection.row_factory = sqlite3.Row
+            row = connection.execute("SELECT * FROM label WHERE seq = 3").fetchone()
+            said = {"success": 1 - row["success"]}
+            connection.create_function("sum_of", 0, lambda row=dict(row) | said: row_sum("label", row))
+            connection.executescript(sql)
+            outcome.injected += 1
+        with DataEngine.open(other.store()) as again:
+            said = [again.decide(x) for x in stream().X[:20]]
+            outcome.must({(d.action, d.reason) for d in said} == {(Action.VERIFY, Reason.NO_STORE)}, f"decided on: {sql}")
+            again.report(said[0].id, True)
+            outcome.must("see `dengine verify`" in again.store_fault, f"nobody was told of: {sql}")
+            outcome.lost += missing(again.store, {said[0].id: True})
+        outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
+
+
+def flipped(file: Path, rng: np.random.Generator, size: int | None = None) -> None:
+    """One bit of a file other than it was; of its first `size` bytes."""
+    content = bytearray(file.read_bytes())
+    content[int(rng.integers(size or len(content)))] ^= 1 << int(rng.integers(8))
+    file.write_bytes(content)
+
+
+def flipped_store(outcome: Outcome, place: Place) -> None:
+    """A bit of the store's file flipped while no engine runs."""
+    cell, rng = Cell(place, outcome), np.random.default_rng(0)
+    cell.play(BEFORE + AFTER)
+    before = bounds(cell.engine)
+    cell.finish()
+    for i in range(FLIPS):
+        other = replace(place, url=f"{place.url}.{i}")
+        shutil.copy(place.url, other.url)
+        flipped(Path(other.url), rng)
+        outcome.injected += 1
+        with contextlib.suppress(StoreError), DataEngine.open(other.store()) as again:  # else it is refused, and said
+            same = bounds(again) == before and not missing(again.store, cell.acknowledged)
+            told = again.store_fault or any(event.kind == "damaged" for event in again.store.events())
+            outcome.must(same or bool(told), f"flip {i}: nobody is told of it")
+
+
+def put_back(outcome: Outcome, place: Place) -> None:
+    """The store's file put back from an older copy, and the journal deleted."""
+    cell = Cell(place, outcome)
+    cell.play(BEFORE)
+    cell.engine.flush()
+    with contextlib.closing(sqlite3.connect(place.url)) as connection:
+        connection.execute("VACUUM INTO ?", (f"{place.url}.copy",))
+    kept = dict(cell.acknowledged)
+    cell.play(DURING)
+    cell.engine.close()
+    for suffix in ("-wal", "-shm"):
+        Path(place.url + suffix).unlink(missing_ok=True)
+    Path(f"{place.url}.copy").replace(place.url)
+    Path(f"{place.url}.{place.cell}.journal").unlink()  # its head is enough
+    outcome.injected += 1
+    outcome.must([fault.table for fault in verify_history(place.url).faults] == ["ledger"], "verified, though cut off")
+    cell.engine, cell.acknowledged = DataEngine.open(place.store()), kept  # what was told since is lost, and that is said
+    cell.play(AFTER)
+    cell.finish()
+    with DataEngine.open(place.store(), reading=True) as again:
+        kinds = [event.kind for event in again.store.events()]
+        outcome.must(kinds.count("lost") == 1, f"it was told {kinds.count('lost')} times that the store was cut off")
+
+
+def second(outcome: Outcome, place: Place) -> None:
+    """A second engine on the cell, in another process."""
+    cell = Cell(place, outcome)
+    cell.play(BEFORE)
+    with DataEngine.open(place.store(), reading=True) as looking, contextlib.suppress(StoreError):
+        looking.decide(stream().X[0])
+        outcome.must(False, "an engine that was opened for reading decides")
+    code = "import sys; from dengine import DataEngine; from dengine.store import SqlStore; "
+    command = [sys.executable, "-c", f"{code}DataEngine.open(SqlStore(*sys.argv[1:]))", place.url, place.cell]
+    elsewhere = os.environ | {"XDG_STATE_HOME": f"{SYNC}-elsewhere"}  # as on another machine
+    done = subprocess.run(command, capture_output=True, text=True, env=elsewhere, timeout=120, check=False)
+    outcome.injected += 1
+    outcome.must(f"process {os.getpid()} on" in done.stderr and " owns " in done.stderr, "a second engine was let in")
+    cell.play(DURING)
+    cell.finish()
+
+
+def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
+    """Ids asked for again with their trace and with another's, and new ones, while the store is away.
+
+    stored : so many other ids are in the store.
+    """
+    cell, X = Cell(place, outcome), stream().X
+    cell.play(BEFORE)
+    nothing = cell.engine.decide(np.zeros(X.shape[1]))
+    for start in range(0, stored, 5000):
+        ids = (f"stored-{i}" for i in range(start, min(start + 5000, stored)))
+        cell.engine.store.take([StoredDecision(replace(nothing, id=id_), X[:1], 1, True, 0.0) for id_ in ids])
+    known = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
+    cell.engine.close()
+    cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
+    with away(place):
+        cell.play(1)
+        time.sleep(AWAY)
+        told = engine.decide(X[IDS], decision_id="new-0")  # which nobody knows yet to be new
+        outcome.must(told.reason is Reason.NO_STORE, "an id was taken that nobody could look up")
+    cell.until_back()
+    engine.know_ids()
+    with away(place):
+        outcome.injected += 1
+        cell.play(1)
+        time.sleep(AWAY)
+        decisions = [cell.timed(lambda i=i: engine.decide(X[IDS + i], decision_id=f"new-{i}")) for i in range(IDS)]
+        unknown = sum(each.reason is Reason.NO_STORE for each in decisions)
+        outcome.must(unknown <= 2, f"{unknown} of {IDS} new ids were taken for old ones")  # one in 500 at a million is
+        for i, each in enumerate(known):
+            for j in (i, i + 1):
+                told = cell.timed(lambda i=i, j=j: engine.decide(X[j], decision_id=f"part-{i}"))
+                outcome.must((told.action, told.reason) == (Action.VERIFY, Reason.NO_STORE), f"{each.id} got an answer")
+            with contextlib.suppress(StoreError):
+                engine.report(each.id, True)
+                outcome.must(False, f"a label was taken on {each.id}, which nobody could look up")
+        for each in decisions:
+            if each.action is Action.VERIFY and each.reason is not Reason.NO_STORE:
+                cell.timed(lambda each=each: engine.report(each.id, True))
+                cell.acknowledged[each.id] = True
+    cell.until_back()
+    for i, each in enumerate(known):
+        outcome.must(engine.decide(X[i], decision_id=each.id) == each, f"{each.id} is answered otherwise")
+        with contextlib.suppress(TraceError):
+            engine.decide(X[i + 1], decision_id=each.id)
+            outcome.must(False, f"{each.id} was taken for another part")
     cell.finish()
 
 
@@ -298,7 +621,8 @@ def forked(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-OF_STORES = (locked, full, no_room_for_versions, moved, replaced, deleted, unstorable, lost_journal)
-ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk)
-ON_SQLITE = (*OF_STORES, killed_executor, hung_executor, interrupted, forked)
-ON_POSTGRES = (frozen, cut_off)
+ON_SQLITE = (locked, moved, replaced, deleted, put_back, changed, flipped_store, unstorable)
+ON_SQLITE += (lost_journal, second, unclosed, closed_while_away, killed_executor, hung_executor, interrupted, forked)
+ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk, served_over_a_hung_disk)
+ON_DISKS += (full_tmpfs, clock_set_back)
+ON_POSTGRES = (frozen, closed_while_away, killed_server, cut_off, lost_journal, second, asked_again)

@@ -1,7 +1,6 @@
 """Malformed inputs of every kind: each is refused by an error of dengine's own, or its part is verified."""
 
 import io
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -9,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dengine import DataEngine, DengineError, Recipe, TraceSpec, load_dataset, open_store
-from dengine.cli import main
 from dengine.datasets.importing import import_labelled
 from dengine.export.cell_journal import read_journal
 from dengine.testing import toy_traces
+from tests.support.command_line import dengine
+from tests.support.exports import cell_journal
 
 from .damage import SAMPLES, anything, spoilt, traces, tries
 
@@ -42,7 +41,7 @@ WORDS = [*TYPED.split(), "", "\ud800", "a b", "x" * 300, "sqlite://", "none", "=
 COMMANDS = """status store.db --json
 export store.db --out model.ts --format torchscript
 import-labels cell.csv --store store.db --any-model
-data small.npz --samples 20 --fit cut --rate 500 --part part
+data small.npz --samples 20 --fit cut --rate-hz 500 --part part
 replay --data small.npz --reducer pca --alpha 0.1 --lower-bound 0.9 --repeats 1 --cycles 4 --seed 0
 compare --data small.npz --reducers pca --alphas 0.1 --intervals wilson --repeats 1 --cycles 4
 train --data small.npz --store trained.db --reducer pca --seed 0 --retrains 1 --audit-rate 0.1
@@ -94,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def journal(lines: bytes) -> bytes:
     """A cell program's journal of these lines, each with its sum."""
-    return b"\n".join([b"# dengine 3 abc", *(b"%s,%08x" % (each, zlib.crc32(each)) for each in lines.split(b"\n")), b""])
+    return cell_journal(*lines.split(b"\n"))
 
 
 @given(value=traces, which=st.integers(0, 2))
@@ -121,9 +120,7 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(engines, va
 
 @given(value=anything, trace=traces, x=SOUND, how=st.integers(0, 3), good=st.booleans())
 @tries(2.0)
-def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(
-    engines, value, trace, x, how: int, good: bool
-) -> None:
+def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, value, trace, x, how: int, good) -> None:
     calls: list[Callable[[], Any]] = [
         lambda: engines[0].report(value, good),
         lambda: engines[0].report(value, False, trace=x),
@@ -175,7 +172,7 @@ def test_odd_arrays_and_labels_are_imported_or_refused(labels: list[Any], X: Any
 
 
 def must_be_one_line(words: list[str]) -> None:
-    done = CliRunner().invoke(main, words)
+    done = dengine(*words)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     errors = sum(line.startswith("Error: ") for line in done.output.splitlines())

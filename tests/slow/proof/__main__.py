@@ -20,36 +20,24 @@ from .pieces import Piece, finish
 from .replays import noise_cases, planted_cases
 from .report import write_report
 
-CHUNK = 10  # seeds a piece
 QUICK = ("conv", "pca", "rocket")
 CASES = {"planted": planted_cases, "noise": noise_cases}
-PARTS = ("null", "counts", "certificate", "planted", "noise", "collapse", "garbage")
-
-
-def in_pieces(kind: str, settings: dict[str, Any], repeats: int, chunk: int = CHUNK) -> list[Piece]:
-    """The seeds 0 .. repeats - 1 of one configuration."""
-    return [Piece(kind, settings, tuple(range(a, min(a + chunk, repeats)))) for a in range(0, repeats, chunk)]
+PARTS = ("null", "counts", "certificate", "planted", "noise", "garbage")
 
 
 def pieces_of(part: str, repeats: int) -> list[Piece]:
-    """All pieces of one part."""
+    """All pieces of one part: of each configuration the seeds from 0 on."""
     if part in CASES:
-        return [
-            piece
-            for case in CASES[part]()
-            for piece in in_pieces(
-                part, {"case": case}, max(2, round(case.share * repeats)), {"umap": 1, "rocket": 2}.get(case.reducer, CHUNK)
-            )
-        ]
-    count, chunk, settings = {
-        "null": (max(2, repeats // 20), 1, [{"reducer": "conv", "data": "insertion"}]),
-        "counts": (max(2, repeats // 5), CHUNK, _product(reducer=QUICK, data=("white noise", "insertion"), p=(0.8,))),
-        "certificate": (max(2, repeats // 10), CHUNK, _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
-        "garbage": (max(1, repeats // 40), 1, _product(reducer=QUICK)),
-        "collapse": (min(30, max(2, repeats // 4)), 5, _product(guarantee=("local", "pooled"), stops=("some", "all"))),
+        cases = [(case, max(2, round(case.share * repeats))) for case in CASES[part]()]
+        return [Piece(part, {"case": case}, seed) for case, n in cases for seed in range(n)]
+    n, settings = {
+        "null": (max(2, repeats // 20), [{"reducer": "conv", "data": "insertion"}]),
+        "counts": (max(2, repeats // 5), _product(reducer=QUICK, data=("white noise", "insertion"), p=(0.8,))),
+        "certificate": (max(2, repeats // 10), _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
+        "garbage": (max(1, repeats // 40), _product(reducer=QUICK)),
     }[part]
-    pieces = [piece for each in settings for piece in in_pieces(part, each, count, chunk)]
-    return pieces + (in_pieces(part, {"reducer": "umap"}, 1) if part == "garbage" else [])
+    pieces = [Piece(part, each, seed) for each in settings for seed in range(n)]
+    return [*pieces, Piece(part, {"reducer": "umap"})] if part == "garbage" else pieces
 
 
 def _product(**axes: Iterable[Any]) -> list[dict[str, Any]]:

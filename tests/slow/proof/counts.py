@@ -82,7 +82,7 @@ def count_noise(recipe: Recipe, noise: Noise, seed: int) -> NDArray[np.float64]:
 
 def _easy(model: ModelPrediction, easy: NDArray[np.bool_], queries: NDArray[np.float32]) -> NDArray[np.int64]:
     """How many of each query's neighbours are easy: the same balls, counted with other labels."""
-    labels = model.index.ring.labels[1, : len(easy)]
+    labels = model.index.labels[1, : len(easy)]
     kept = labels.clone()
     labels.copy_(torch.from_numpy(easy.astype(np.float32)))
     counted, _ = model.count(queries)

@@ -2,8 +2,8 @@
 
     >>> done = finish(pieces, Path("out/proof"), jobs=2)
 
-A piece is a function's name in `FUNCTIONS`, its settings and a range of seeds. It is kept under these and a hash of the
-sources of dengine and of this folder: other code, other pieces.
+A piece is a function's name in `FUNCTIONS`, its settings and a seed. It is kept under these and a hash of the sources of
+dengine and of this folder: other code, other pieces.
 """
 
 import hashlib
@@ -19,7 +19,6 @@ from joblib import Memory, Parallel, delayed
 import dengine
 
 from .certificate import ever_wrong
-from .collapse import collapse
 from .counts import count_noise, relabelled, white_noise
 from .garbage import garbage
 from .replays import judge
@@ -58,17 +57,16 @@ FUNCTIONS: dict[str, Callable[..., Row | list[Row]]] = {
     "counts": counted,
     "certificate": certified,
     "garbage": garbage,
-    "collapse": collapse,
 }
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some seeds of one configuration. kind : in `FUNCTIONS`.  settings : of its function."""
+    """A seed of one configuration. kind : in `FUNCTIONS`.  settings : of its function."""
 
     kind: str
     settings: Row = field(hash=False)
-    seeds: tuple[int, ...] = ()
+    seed: int = 0
 
     @property
     def name(self) -> str:
@@ -86,8 +84,8 @@ def sources_digest() -> str:
 
 def run_piece(piece: Piece, sources: str) -> list[Row]:
     """Every row of a piece, with its seed; sources : part of what it is kept under."""
-    found = [(seed, FUNCTIONS[piece.kind](seed=seed, **piece.settings)) for seed in piece.seeds]
-    return [{"seed": seed} | row for seed, rows in found for row in (rows if isinstance(rows, list) else [rows])]
+    found = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
+    return [{"seed": piece.seed} | row for row in (found if isinstance(found, list) else [found])]
 
 
 def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None] = print) -> list[tuple[Piece, list[Row]]]:
@@ -99,6 +97,7 @@ def finish(pieces: list[Piece], out: Path, jobs: int, tell: Callable[[str], None
     done: list[tuple[Piece, list[Row]]] = []
     for piece, rows in zip(pieces, every, strict=True):
         done.append((piece, rows))
-        minutes = (time.perf_counter() - begin) / 60
-        tell(f"[{len(done)}/{len(pieces)}] {piece.kind}: {piece.name}; {minutes:.1f} min")
+        if len(done) == len(pieces) or pieces[len(done)].name != piece.name:
+            minutes = (time.perf_counter() - begin) / 60
+            tell(f"[{len(done)}/{len(pieces)}] {piece.kind}: {piece.name}; {minutes:.1f} min")
     return done

@@ -25,17 +25,10 @@ HEADS = {
         "for parts after. Verdicts in brackets are of rows that promise nothing.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
-    "null": (
-        "The null test",
-        "Labels independent of the trace, four in five good: certain decisions of a replay.",
-    ),
+    "null": ("The null test", "Labels independent of the trace, four in five good: certain decisions of a replay."),
     "counts": ("Count-only statistic", "Mean z^2 of the balls' counts under labels of noise; honest counting: 0.8 to 1.3."),
     "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
     "garbage": ("Garbage accepted", "Share accepted with the novelty gate, and without it; last, certain of clean parts."),
-    "collapse": (
-        "Collapse at cycle 800, over at 1100",
-        "Bad parts accepted in it; cycles until nothing was; cycles after it until half as much was accepted as before.",
-    ),
 }
 
 
@@ -79,13 +72,6 @@ def certificate_row(settings: Row, rows: list[Row]) -> Row:
     return {"streams": n, **share_row(sum(r["wrong"] for r in rows), n, settings["alpha"])}
 
 
-def collapse_row(settings: Row, rows: list[Row]) -> Row:
-    """Means, and in how many runs either never happened."""
-    out: Row = {key: _mean(r[key] for r in rows) for key in ("usual", "bad_accepts", "quiet_after", "back_after")}
-    out |= {"runs": len(rows), "worst bad_accepts": max(r["bad_accepts"] for r in rows)}
-    return out | {f"never {key}": sum(np.isnan(r[f"{key}_after"]) for r in rows) for key in ("quiet", "back")}
-
-
 def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
     """A row a kind."""
     means = pd.DataFrame(rows).groupby("kind", sort=False)[["gated", "open"]].mean()
@@ -98,7 +84,6 @@ ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
     "null": null_row,
     "counts": counts_row,
     "certificate": certificate_row,
-    "collapse": collapse_row,
     "garbage": garbage_rows,
 }
 

@@ -45,9 +45,6 @@ def worse_than_allowed(replays: int) -> float:
     return broken([judge(seed, JUST_BEYOND) for seed in range(replays)], "accepted_failure", 0.2) / replays
 
 
-# ------------------------------------------------------------------------------------------------ the honest engine
-
-
 @pytest.mark.parametrize(("reducer", "seeds"), [("conv", SEEDS), ("pca", 2 * SEEDS)])  # the plane of pca has fewer balls
 def test_labels_of_noise_are_counted_as_chance_says(reducer: str, seeds: int) -> None:
     assert HONEST[0] <= z2(reducer, seeds) <= HONEST[1]
@@ -76,8 +73,6 @@ def test_it_would_be_seen_in_the_other_spaces() -> None:
 def test_where_every_part_is_just_beyond_the_tolerance_hardly_any_replay_accepts(proof_repeats: int) -> None:
     assert worse_than_allowed(max(5, proof_repeats)) <= 0.2
 
-
-# ---------------------------------------------------------------------------------------------------- six mutations
 
 Mutation = Callable[[pytest.MonkeyPatch], None]
 

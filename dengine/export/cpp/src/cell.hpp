@@ -27,8 +27,9 @@ class Cell {
             [this](const std::string& id, bool success) { repeat(id, success); });
     }
 
-    // The decision on a part, which only the model knows of yet. Whatever fails in the model, the part is verified.
-    Record look(std::vector<float> samples, std::string part) {
+    // The decision on a part, whose label may come: it is in the journal, and waits. Whatever fails in the model, the part
+    // is verified.
+    Decision decide(std::vector<float> samples, std::string part, std::string& id) {
         Record record;
         record.id = run_ + '-' + std::to_string(++count_);
         record.part = std::move(part);
@@ -41,13 +42,8 @@ class Cell {
             fault = first_line(error);
             record.decision = unknown("model_error");
         }
-        return record;
-    }
-
-    // A part whose label may come: it is in the journal, and waits.
-    Decision decide(std::vector<float> samples, std::string part, std::string& id) {
-        if (!model->learns) return look(std::move(samples), std::move(part)).decision;
-        Record record = look(std::move(samples), std::move(part));
+        const Decision decision = record.decision;
+        if (!model->learns) return decision;
         try {
             if (journal_) journal_->part(record);
         } catch (const Fault&) {
@@ -55,7 +51,6 @@ class Cell {
             throw;
         }
         id = record.id;
-        const Decision decision = record.decision;
         remember(std::move(record));
         return decision;
     }
@@ -86,15 +81,6 @@ class Cell {
             throw Fault(DENGINE_BAD_LABEL, id + " was to be verified and cannot stop the system; say label ID 0");
         }
         label(id, false);
-    }
-
-    // The part that `look` decided on last, with its label where it is known, as the lines without ids tell it.
-    void keep(Record record) {
-        if (journal_) journal_->part(record);  // written before it is counted
-        const std::optional<bool> label = std::exchange(record.label, std::nullopt);
-        const std::string id = record.id;
-        remember(std::move(record));
-        if (label) take(parts_.at(id), *label);
     }
 
     Decision unknown(const std::string& reason) const {
@@ -170,8 +156,6 @@ class Cell {
 
     // A line of the journal.
     void restore(Record&& record) {
-        const std::optional<bool> label = std::exchange(record.label, std::nullopt);
-        const std::string id = record.id;
         try {
             if (record.decision.action == REJECT) {
                 model->settle();
@@ -184,7 +168,6 @@ class Cell {
             model->drop();
         }
         remember(std::move(record));
-        if (label) take(parts_.at(id), *label);
     }
 
     void repeat(const std::string& id, bool success) {

@@ -1,4 +1,5 @@
-// CRC-32 of a block of bytes, as zlib's crc32 and IEEE 802.3 have it: it finds any one cut or changed line of a journal.
+// CRC-32 of a block of bytes, as zlib's crc32 and IEEE 802.3 have it: it finds a line of a journal that
+// was cut or changed, and, run on from line to line, one that is missing or moved.
 #pragma once
 
 #include <array>
@@ -18,11 +19,15 @@ inline constexpr std::array<std::uint32_t, 256> TABLE = [] {
     return table;
 }();
 
-// Eight lower-case hexadecimal digits.
-inline std::string hex(std::string_view bytes) {
-    std::uint32_t c = 0xFFFFFFFF;
+// Of what stands before, and these bytes behind it; 0 before the first.
+inline std::uint32_t onward(std::uint32_t before, std::string_view bytes) {
+    std::uint32_t c = ~before;
     for (const unsigned char byte : bytes) c = TABLE[(c ^ byte) & 0xff] ^ c >> 8;
-    c ^= 0xFFFFFFFF;
+    return ~c;
+}
+
+// Eight lower-case hexadecimal digits.
+inline std::string hex(std::uint32_t c) {
     std::string out;
     for (int shift = 28; shift >= 0; shift -= 4) out += "0123456789abcdef"[c >> shift & 0xf];
     return out;

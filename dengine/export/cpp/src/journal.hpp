@@ -1,11 +1,11 @@
 // What became of parts, a line each, after a first line that names the export it belongs to:
 //
-//   # dengine 3 SUM
+//   # dengine 4 SUM
 //   part,ID,LABEL,PART,ACTION,PREDICTED,REASON,LOWER,UPPER,N_SUCCESS,N_FAILURE,SAMPLE,SAMPLE,...,CRC
 //   label,ID,LABEL,CRC
 //
-// LABEL is 1, 0 or nothing, CRC the CRC-32 of all that stands before its comma. A `part` line is there when a part was decided
-// on; its label follows in a `label` line, however late, or stands in it already. A rejected part has no samples: it went
+// LABEL is 1 or 0, and nothing in a `part` line, CRC the CRC-32 of the first line and of all lines up to here, each without
+// its own CRC and the comma before it: a line that is missing, doubled or moved is noticed. A `part` line is there when a part was decided on; its label follows in a `label` line, however late. A rejected part has no samples: it went
 // back to the bin. An accepted one without a label is not counted by its line: the next decision does, as confirmed where
 // the file says that all stops are reported, as silent where it does not. So each line is there before it is counted, and a
 // restarted cell that reads them again is where it was. `dengine import-labels` takes them into a store.
@@ -13,6 +13,9 @@
 // A label is on the disk (fdatasync) when it is acknowledged; a decision is handed to the operating system, and reaches
 // the disk with the next label. A last line without its end was being written when the process was killed: it was never
 // acknowledged, and is cut off. Anything else that does not fit is damage, and is refused with its number.
+//
+// A small file beside it, PATH.head, has the number of its lines and the last CRC, so that lines which are missing at its end
+// are noticed too. It is written after the line, in place: where the process is killed in between, it is a line behind.
 #pragma once
 
 #include <fcntl.h>
@@ -65,17 +68,17 @@ class Journal {
     Journal(const Journal&) = delete;
     Journal& operator=(const Journal&) = delete;
 
-    // A part that was decided on last, with its label where that is known already.
+    // A part that was decided on last.
     void part(const Record& record) {
         const Decision& decision = record.decision;
-        std::string line = "part," + record.id + ',' + (record.label ? (*record.label ? "1" : "0") : "") + ',' + record.part + ',';
+        std::string line = "part," + record.id + ",," + record.part + ',';
         line += model_.actions.at(decision.action) + ',' + model_.actions.at(record.predicted) + ',' + decision.reason + ',' +
                 written(decision.lower) + ',' + written(decision.upper) + ',' + written(decision.n_success) + ',' +
                 written(decision.n_failure);
         if (decision.action != REJECT) {
             for (const float x : record.samples) line += ',' + written(x);
         }
-        append(line, record.label.has_value());
+        append(line, false);
     }
 
     void label(const std::string& id, bool success) { append("label," + id + (success ? ",1" : ",0"), true); }
@@ -84,22 +87,25 @@ class Journal {
 
   private:
     void reread(const OnPart& on_part, const OnLabel& on_label) {
-        const std::string head = "# dengine 3 " + model_.sum;
+        const std::string head = "# dengine 4 " + model_.sum;
         std::ifstream in(path_, std::ios::binary);
         std::string line;
+        std::vector<std::uint32_t> lines;
         for (number_ = 1; std::getline(in, line); ++number_) {
             const bool cut = in.eof();  // the file ends before the line does
             // Labels that a newer export already holds must not be counted twice.
             if (number_ == 1 && line != head && !(cut && head.starts_with(line))) {
-                fail("belongs to another export, or to another program; take it in with dengine import-labels, and name a new "
-                     "journal");
+                fail("belongs to another export, release or program; take it in with its own dengine import-labels, and name "
+                     "a new journal");
             }
             if (cut) break;
+            if (number_ == 1) crc_ = crc32::onward(0, line);
             if (number_ > 1 && !take(line, on_part, on_label)) {
-                fail("is damaged in line " + std::to_string(number_) + "; take its earlier lines in with dengine "
-                     "import-labels after cutting it there, and name a new journal");
+                fail("is damaged in line " + std::to_string(number_) + ", or a line before it is missing; take its earlier "
+                     "lines in with dengine import-labels, and name a new journal");
             }
             size_ += static_cast<off_t>(line.size()) + 1;
+            lines.push_back(crc_);
         }
         const off_t found = ::lseek(file_, 0, SEEK_END);
         if (found < size_) fail("cannot be read");
@@ -108,14 +114,48 @@ class Journal {
                      " bytes were dropped, nothing in it had been acknowledged";
             if (::ftruncate(file_, size_) != 0) fail("cannot be shortened: " + reason());
         }
-        if (size_ == 0) write(head + '\n', true);
+        if (size_ == 0) {
+            write(head + '\n', true);
+            crc_ = crc32::onward(0, head);
+            number_ = 2;  // of the next line, as after reading one
+        } else {
+            compare(lines);
+        }
+        note();
+    }
+
+    // What the head knows of a journal whose lines have these CRCs.
+    void compare(const std::vector<std::uint32_t>& lines) {
+        std::ifstream in(path_ + ".head", std::ios::binary);
+        long long known = 0;
+        std::string crc;
+        const std::string end = "; lines may have been removed at its end, or lost with the power";
+        if (!(in >> known >> crc)) {
+            add(path_ + ".head, which knows how long the journal is, is missing or cannot be read" + end);
+        } else if (known < 1 || known > static_cast<long long>(lines.size()) ||
+                   crc32::hex(lines[static_cast<std::size_t>(known - 1)]) != crc) {
+            add(path_ + " does not hold line " + std::to_string(known) + ", which its head knows" + end);
+        }
+    }
+
+    void add(const std::string& what) { notice += (notice.empty() ? "" : ". ") + what; }
+
+    // The head: how many lines there are, and the CRC of all of them. It may not cost the cell a label.
+    void note() {
+        const std::string head = std::to_string(number_ - 1) + ' ' + crc32::hex(crc_);
+        const int file = ::open((path_ + ".head").c_str(), O_WRONLY | O_CREAT | O_CLOEXEC, 0644);
+        if (file < 0) return;
+        const std::string text = head + std::string(31 - head.size(), ' ') + '\n';
+        if (::pwrite(file, text.data(), text.size(), 0) < 0) errno = 0;
+        ::close(file);
     }
 
     bool take(std::string_view line, const OnPart& on_part, const OnLabel& on_label) {
         const bool is_part = line.starts_with("part,");
         if (!is_part && !line.starts_with("label,")) return false;
         const auto comma = line.rfind(',');
-        if (crc32::hex(line.substr(0, comma)) != line.substr(comma + 1)) return false;
+        crc_ = crc32::onward(crc_, line.substr(0, comma));
+        if (crc32::hex(crc_) != line.substr(comma + 1)) return false;
         line = line.substr(line.find(',') + 1, comma - line.find(',') - 1);
         if (is_part) return take_part(line, on_part);
         bool more = true;
@@ -125,36 +165,40 @@ class Journal {
         return true;
     }
 
-    // The decision with its own numbers, of its own time, and its label.
+    // The decision with its own numbers, of its own time.
     bool take_part(std::string_view line, const OnPart& on_part) {
         bool more = true;
         const auto word = [&] { return more ? take_word(line, more) : std::string_view(); };
         Record record;
         record.id = word();
-        const auto label = word();
+        if (word() != "") return false;
         record.part = word();
         const auto action = position(model_.actions, word()), predicted = position(model_.actions, word());
         record.decision.reason = word();
         const bool numbers = parse(word(), record.decision.lower) && parse(word(), record.decision.upper) &&
                              parse(word(), record.decision.n_success) && parse(word(), record.decision.n_failure);
         if (!numbers || action < 0 || predicted < 0 || position(model_.reasons, record.decision.reason) < 0) return false;
-        if (label != "" && label != "0" && label != "1") return false;
         record.decision.action = action;
         record.predicted = predicted;
-        if (label != "") record.label = label == "1";
-        if (action == REJECT && label == "" && !more) {
+        if (action == REJECT && !more) {
             on_part(std::move(record));
             return true;
         }
         Input input;
-        parse_line(line, {}, model_.shape, input);
+        parse_line(line, model_.shape, input);
         if (!more || !input.fault.empty() || action == REJECT) return false;
         record.samples = std::move(input.samples);
         on_part(std::move(record));
         return true;
     }
 
-    void append(const std::string& line, bool on_disk) { write(line + ',' + crc32::hex(line) + '\n', on_disk); }
+    void append(const std::string& line, bool on_disk) {
+        const auto crc = crc32::onward(crc_, line);
+        write(line + ',' + crc32::hex(crc) + '\n', on_disk);
+        crc_ = crc;
+        ++number_;
+        note();
+    }
 
     // All of it, or nothing of it.
     void write(const std::string& text, bool on_disk) {
@@ -183,5 +227,6 @@ class Journal {
     int file_ = -1;
     off_t size_ = 0;
     long long number_ = 0;
+    std::uint32_t crc_ = 0;  // of all lines so far
     bool broken_ = false;
 };

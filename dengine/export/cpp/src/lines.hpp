@@ -1,10 +1,8 @@
-// Traces in: a CSV line or a block of little-endian float32. Several channels follow one another.
+// Traces in: numbers with commas between. Several channels follow one another.
 #pragma once
 
 #include <bit>
 #include <cstddef>
-#include <istream>
-#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -16,8 +14,7 @@ static_assert(std::endian::native == std::endian::little, "binary traces are lit
 struct Input {
     std::string part;  // its number; empty where it is unknown
     std::vector<float> samples;
-    std::optional<bool> success;  // the label, where one was given
-    std::string fault;            // why the line cannot be read; empty where it can
+    std::string fault;  // why the line cannot be read; empty where it can
 };
 
 inline std::string_view trimmed(std::string_view word) {
@@ -71,49 +68,21 @@ struct Shape {
     bool takes(std::size_t n) const { return n == size() || (any_length && n > 0 && n % channels == 0); }
 };
 
-// What a line begins with, in this order.
-struct Columns {
-    bool part = false, label = false;
-};
-
-// `[part,][label,]sample,sample,...`; a label is 1 (success), 0 (failure) or empty (unknown).
-inline void parse_line(std::string_view line, Columns columns, const Shape& shape, Input& input) {
+// `sample,sample,...`
+inline void parse_line(std::string_view line, const Shape& shape, Input& input) {
     input = {};
     bool more = true;
-    if (columns.part) input.part = take_word(line, more);
-    if (!is_part(input.part)) input.fault = "expected a part's number in UTF-8 without control characters";
-    if (columns.label && more) {
-        const auto word = take_word(line, more);
-        if (word != "" && word != "0" && word != "1") {
-            input.fault = "expected a label of 1, 0 or nothing, got " + quoted(word);
-        }
-        if (word != "") input.success = word == "1";
-    }
-    const std::size_t first = 1 + columns.part + columns.label;
     while (more) {
         const auto word = take_word(line, more);
         float value = 0.0F;
         if (parse(word, value)) {
             input.samples.push_back(value);
         } else if (input.fault.empty()) {
-            const auto column = std::to_string(first + input.samples.size());
+            const auto column = std::to_string(1 + input.samples.size());
             input.fault = "expected a number in column " + column + ", got " + quoted(word);
         }
     }
     if (input.fault.empty() && !shape.takes(input.samples.size())) {
         input.fault = "expected " + std::to_string(shape.size()) + " samples, got " + std::to_string(input.samples.size());
     }
-}
-
-// The next block of `expected` float32; false at the end.
-inline bool next_block(std::istream& in, std::size_t expected, Input& input) {
-    input.fault.clear();
-    input.samples.resize(expected);
-    in.read(reinterpret_cast<char*>(input.samples.data()), static_cast<std::streamsize>(expected * sizeof(float)));
-    if (in.gcount() == 0) return false;
-    if (!in) {
-        const auto bytes = std::to_string(expected * sizeof(float));
-        input.fault = "expected " + bytes + " bytes, got " + std::to_string(in.gcount());
-    }
-    return true;
 }

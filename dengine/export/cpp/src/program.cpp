@@ -9,18 +9,6 @@
 // TRACE is numbers with commas between, or a file: NAME.f32 of little-endian float32, any other of numbers as text. What
 // cannot be done is answered with `error WHY`, a trace that cannot be read with verify,malformed; the program goes on and
 // ends with exit code 1. So does a model that must not be used. `ok` means: on the disk, where there is a journal.
-//
-// The lines of the earlier program are still understood, and answered without ID:
-//
-//   dengine-cell model.ts < traces.csv                      one trace a line, samples separated by commas
-//   dengine-cell model.ts --binary < traces.f32             blocks of little-endian float32, a trace each
-//   dengine-cell model.ts --learn --journal cell.csv < labelled.csv    a line begins with its label: 1, 0 or nothing
-//   dengine-cell model.ts --parts ...                       a line begins with its part's number, before any label
-//
-// --learn takes in, after the decision on a trace, what became of its part. Where that was to verify, the label is what was
-// found. Where it was to accept, 0 is a stop, 1 a confirmation, and nothing is silence until the next decision, which
-// counts as the file says. A rejected part went back to the bin, so its label is not read. Without --learn no silence
-// counts.
 #include <chrono>
 #include <csignal>
 #include <cstdio>
@@ -38,22 +26,13 @@ constexpr std::streamoff LARGEST = 64 << 20;  // bytes of a trace's file
 
 struct Options {
     std::string model, journal, key;
-    bool binary = false, learn = false, parts = false;
-
-    bool earlier() const { return binary || learn || parts; }
 };
 
 static std::optional<Options> parse_options(int argc, char** argv) {
     Options options;
     for (int i = 1; i < argc; ++i) {
         const std::string word = argv[i];
-        if (word == "--binary") {
-            options.binary = true;
-        } else if (word == "--learn") {
-            options.learn = true;
-        } else if (word == "--parts") {
-            options.parts = true;
-        } else if (word == "--journal" && i + 1 < argc) {
+        if (word == "--journal" && i + 1 < argc) {
             options.journal = argv[++i];
         } else if (word == "--key" && i + 1 < argc) {
             options.key = argv[++i];
@@ -63,9 +42,7 @@ static std::optional<Options> parse_options(int argc, char** argv) {
             options.model = word;
         }
     }
-    const bool words = options.learn || options.parts;  // stand beside the samples in a line
-    const bool kept = options.learn || !options.earlier() || options.journal.empty();
-    return !options.model.empty() && !(words && options.binary) && kept ? std::optional(options) : std::nullopt;
+    return options.model.empty() ? std::nullopt : std::optional(options);
 }
 
 static void say(const std::string& line) {
@@ -74,8 +51,8 @@ static void say(const std::string& line) {
 }
 
 static void print(const std::string& id, const std::string& action, const Decision& decision, double microseconds) {
-    std::string line = id + action + ',' + decision.reason + ',' + written(decision.lower) + ',' + written(decision.upper) + ',' +
-                       written(decision.n_success) + ',' + written(decision.n_failure);
+    std::string line = (id.empty() ? "-" : id) + ',' + action + ',' + decision.reason + ',' + written(decision.lower) + ',' +
+                       written(decision.upper) + ',' + written(decision.n_success) + ',' + written(decision.n_failure);
     for (const float z : decision.embedding) line += ',' + written(z);
     say(line + ',' + written(microseconds));
 }
@@ -85,10 +62,10 @@ class Answers {
   public:
     explicit Answers(Cell& cell) : cell_(cell), model_(*cell.model) {}
 
-    // `decide [PART] TRACE`, `label ID 0|1`, `stop ID`; a line of another kind is left alone.
-    bool command(const std::string& line) {
+    void answer(const std::string& line) {
+        ++number_;
         const std::vector<std::string> words = split(line);
-        if (words.empty() || (words[0] != "decide" && words[0] != "label" && words[0] != "stop")) return false;
+        if (words.empty()) return;
         try {
             if (words[0] == "decide") {
                 decide(words);
@@ -96,42 +73,22 @@ class Answers {
                 if (words.size() != 3 || (words[2] != "0" && words[2] != "1")) throw Fault(DENGINE_BAD_CALL, "expected label ID 0|1");
                 cell_.label(words[1], words[2] == "1");
                 say("ok " + words[1]);
-            } else {
+            } else if (words[0] == "stop") {
                 if (words.size() != 2) throw Fault(DENGINE_BAD_CALL, "expected stop ID");
                 cell_.stop(words[1]);
                 say("ok " + words[1]);
+            } else {
+                throw Fault(DENGINE_BAD_CALL, "expected decide, label or stop, got " + quoted(words[0]));
             }
         } catch (const std::exception& error) {
             ++refused;
             say(std::string("error ") + error.what());
         }
-        tell_of_faults();
-        return true;
+        if (cell_.fault.empty()) return;
+        std::fprintf(stderr, "dengine: line %lld: the model failed: %s\n", number_, cell_.fault.c_str());
+        cell_.fault.clear();
     }
 
-    // A trace without an id, of the earlier program; `learn`: with its label.
-    void trace(Input& input, const std::string& id, bool learn) {
-        if (!input.fault.empty()) return malformed(input.fault, id);
-        const auto begin = std::chrono::steady_clock::now();
-        Record record = cell_.look(std::move(input.samples), input.part);
-        const std::chrono::duration<double, std::micro> elapsed = std::chrono::steady_clock::now() - begin;
-        print(id, model_.actions.at(record.decision.action), record.decision, elapsed.count());
-        if (!learn) {
-            model_.drop();
-        } else if (record.decision.action == ACCEPT || (record.decision.action == VERIFY && input.success)) {
-            record.label = input.success;
-            cell_.keep(std::move(record));
-        }
-        tell_of_faults();
-    }
-
-    void malformed(const std::string& why, const std::string& id, const std::string& reason = "malformed") {
-        ++refused;
-        std::fprintf(stderr, "dengine: trace %lld is %s: %s\n", number, reason.c_str(), why.c_str());
-        print(id, model_.actions[0], cell_.unknown(reason), 0.0);
-    }
-
-    long long number = 0;  // of the line
     int refused = 0;
 
   private:
@@ -151,21 +108,27 @@ class Answers {
             if (words.size() == 3) input.part = words[1];
             if (!is_part(input.part)) input.fault = "expected a part's number in UTF-8, without commas";
         }
-        if (!input.fault.empty()) return malformed(input.fault, "-,");
+        if (!input.fault.empty()) return refuse(input.fault, "malformed");
         const auto begin = std::chrono::steady_clock::now();
         try {
             std::string id;
             const Decision decision = cell_.decide(std::move(input.samples), input.part, id);
             const std::chrono::duration<double, std::micro> elapsed = std::chrono::steady_clock::now() - begin;
-            print((id.empty() ? "-" : id) + ',', model_.actions.at(decision.action), decision, elapsed.count());
+            print(id, model_.actions.at(decision.action), decision, elapsed.count());
         } catch (const Fault& fault) {
-            malformed(fault.what(), "-,", "journal_error");  // no label of it could be kept: it is verified
+            refuse(fault.what(), "journal_error");  // no label of it could be kept: it is verified
         }
+    }
+
+    void refuse(const std::string& why, const std::string& reason) {
+        ++refused;
+        std::fprintf(stderr, "dengine: trace %lld is %s: %s\n", number_, reason.c_str(), why.c_str());
+        print("", model_.actions[0], cell_.unknown(reason), 0.0);
     }
 
     void read(const std::string& word, Input& input) {
         float number = 0.0F;
-        if (word.find(',') != std::string::npos || parse(word, number)) return parse_line(word, {}, model_.shape, input);
+        if (word.find(',') != std::string::npos || parse(word, number)) return parse_line(word, model_.shape, input);
         std::ifstream file(word, std::ios::binary | std::ios::ate);
         const std::streamoff size = file ? static_cast<std::streamoff>(file.tellg()) : -1;
         if (size < 0 || size > LARGEST) {
@@ -180,7 +143,7 @@ class Answers {
         std::string numbers;  // one line of it
         for (const auto& each : split(text)) numbers += (numbers.empty() || numbers.back() == ',' ? "" : ",") + each;
         while (!numbers.empty() && numbers.back() == ',') numbers.pop_back();
-        parse_line(numbers, {}, model_.shape, input);
+        parse_line(numbers, model_.shape, input);
     }
 
     void take_floats(const std::string& bytes, Input& input) {
@@ -191,37 +154,16 @@ class Answers {
         input.fault = "expected " + expected + " bytes, got " + std::to_string(bytes.size());
     }
 
-    void tell_of_faults() {
-        if (cell_.fault.empty()) return;
-        std::fprintf(stderr, "dengine: line %lld: the model failed: %s\n", number, cell_.fault.c_str());
-        cell_.fault.clear();
-    }
-
     Cell& cell_;
     Model& model_;
+    long long number_ = 0;  // of the line
 };
 
 static int run(const Options& options) {
     Cell cell(open_model(options.model, options.key), options.journal);
     if (!cell.notice().empty()) std::fprintf(stderr, "dengine: %s\n", cell.notice().c_str());
-    Model& model = *cell.model;
-    if (options.learn && !model.learns) throw Fault(DENGINE_BAD_CALL, "a model in ONNX learns nothing; export TorchScript");
     Answers answers(cell);
-    const Columns columns{options.parts, options.learn};
-    Input input;
-    for (answers.number = 1; options.binary; ++answers.number) {
-        if (!next_block(std::cin, model.shape.size(), input)) break;
-        answers.trace(input, "", false);
-    }
-    for (std::string line; !options.binary && std::getline(std::cin, line);) {
-        if (trimmed(line).empty()) continue;
-        if (options.earlier() || !answers.command(line)) {
-            parse_line(line, columns, model.shape, input);
-            if (!options.earlier() && !options.journal.empty()) input.fault = "expected decide, label or stop beside a journal";
-            answers.trace(input, "", options.learn);
-        }
-        ++answers.number;
-    }
+    for (std::string line; std::getline(std::cin, line);) answers.answer(line);
     return answers.refused > 0 ? 1 : 0;
 }
 
@@ -231,7 +173,7 @@ int main(int argc, char** argv) {
     const auto options = parse_options(argc, argv);
     if (!options) {
         std::fprintf(stderr,
-                     "usage: %s MODEL [--key FILE] [--journal FILE] [--binary | [--parts] [--learn]] < LINES\n"
+                     "usage: %s MODEL [--key FILE] [--journal FILE] < LINES\n"
                      "  decide [PART] TRACE | label ID 0|1 | stop ID\n", PROGRAM);
         return 2;
     }

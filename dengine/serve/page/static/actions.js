@@ -7,10 +7,14 @@ const at = (id) => document.getElementById(id);
 let asked = null;
 let from = null;
 let after = () => {};
+let owner = { name: "", operates: true };
+
+export const ownedBy = (me) => { owner = me; };
+export const looksOnly = () => !owner.operates;
 
 export function button(id, title, action, off = false, ...marks) {
   // action : title, what; path and body of the request; fields that are asked for; done, what is said of an answer.
-  return el("button", { type: "button", id, class: action.quiet ? null : "main", disabled: off, "data-asks": JSON.stringify(action.body ?? {}), onclick: () => open(id, action) }, ...marks, title);
+  return el("button", { type: "button", id, class: action.quiet ? null : "main", disabled: off || looksOnly(), "data-asks": JSON.stringify(action.body ?? {}), onclick: () => open(id, action) }, ...marks, title);
 }
 
 function field({ name, label, options, ...given }) {
@@ -27,9 +31,10 @@ function open(id, action) {
   at("confirm-what").textContent = action.what;
   at("confirm-failed").textContent = "";
   at("confirm-fields").replaceChildren(...(action.fields ?? []).map(field));
-  at("confirm-author").value = localStorage.getItem("dengine_author") ?? "";
+  at("confirm-author").value = owner.name || (localStorage.getItem("dengine_author") ?? "");
+  at("confirm-author").closest(".field").hidden = owner.name !== ""; // the token has a name
   at("confirm").showModal();
-  (at("confirm-fields").querySelector("input, select") ?? at("confirm-author")).focus();
+  (at("confirm-fields").querySelector("input, select") ?? at(owner.name ? "confirm-do" : "confirm-author")).focus();
 }
 
 function body() {
@@ -49,7 +54,7 @@ async function submit(event) {
     const answer = await post(asked.path, said);
     const file = answer.headers.get("content-disposition");
     const text = file ? await save(answer, file.match(/filename="([\w.]+)"/)[1]) : asked.done?.(await answer.clone().json()) ?? (await answer.json()).text;
-    localStorage.setItem("dengine_author", said.author);
+    if (!owner.name) localStorage.setItem("dengine_author", said.author);
     at("confirm").close();
     say(text);
     after();

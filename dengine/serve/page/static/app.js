@@ -1,6 +1,6 @@
 // The page keeps itself new: told of a change it asks the server again, and puts in the parts of the view that differ.
 
-import { begin } from "./actions.js";
+import { begin, ownedBy } from "./actions.js";
 import { drawAll, goOverMap } from "./charts.js";
 import { el } from "./dom.js";
 import { Problem, get, listen } from "./server.js";
@@ -58,8 +58,9 @@ async function exchangeAll() {
   const rests = [];
   const ask = (path) => get(path, rests);
   try {
-    const doing = await ask(view === "overview" ? "status?watch=true" : "status");
-    header(doing);
+    const [doing, me] = await Promise.all([ask(view === "overview" ? "status?watch=true" : "status"), ask("me")]);
+    ownedBy(me);
+    header(doing, me);
     const { title, shown } = await VIEWS[view](ask, new URLSearchParams(location.search), doing);
     exchange(shown);
     document.title = `${title} · ${doing.cell === "cell" ? "" : `Cell ${doing.cell} · `}dengine`;
@@ -89,11 +90,12 @@ function put(id, children, kind) {
   if (kind) at(id).className = kind;
 }
 
-function header(doing) {
+function header(doing, me) {
   const mode = modeOf(doing);
   put("cell", [doing.cell === "cell" ? "" : `Cell ${doing.cell}`]);
   put("mode", [el("span", { class: "visually-hidden" }, "Mode: "), ...modeWord(mode)], `mode ${mode}`);
   put("banner", warnings(doing));
+  put("me", [me.name && `Logged in: ${me.name}. `, me.operates ? "" : "A viewer's token: it looks, and changes nothing."]);
 }
 
 function exchange(shown) {

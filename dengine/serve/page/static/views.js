@@ -17,7 +17,7 @@ const VERDICT = { kept: "Tolerance kept", open: "Not decided yet", broken: "Tole
 const MODES = { decides: "Decides", learns: "Learning", shadow: "Verifying all", safe: "Safe mode" };
 const BY = {
   "every outcome": (bad) => `Every outcome is known: ${number(bad.wrong)} of ${number(bad.known)} were bad.`,
-  audits: (bad, stops) => `By audits alone: ${number(bad.wrong)} of ${number(bad.known)} were bad; the ${number(stops)} system stops are not among these.`,
+  audits: (bad, stops) => `By audits alone: ${number(bad.wrong)} of ${number(bad.known)} were bad; system stops, not among these: ${number(stops)}.`,
   "": (bad, stops) => `Only the ${number(stops)} system stops are known so far; audits would bound it.`,
 };
 

@@ -1,0 +1,59 @@
+"""Decisions, labels and reports as tests make them, and into a store, as a journal brings them."""
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dengine.records import Action, Decision, Reason, RetrainReport, Source
+from dengine.store import NewLabel, SqlStore, StoredDecision
+
+
+def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
+    return Decision(name, action, action, 0.2, 1.0, 1, 0, ((0.1, 0.2), (0.3, 0.4)), version, reason, False, 1.0)
+
+
+def trace(seed: int = 0, shape: tuple[int, ...] = (2, 30)) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def label(name: str, success: bool = True, silent: int = 0, source: Source = Source.VERIFICATION) -> NewLabel:
+    return NewLabel(name, success, source, 0, None, silent)
+
+
+def report(version: int, accepted: bool = True) -> RetrainReport:
+    return RetrainReport(version, 0.25, 100, 60, accepted, "improved" if accepted else "the gate held")
+
+
+def execute(file: Path, *statements: str) -> None:
+    """Behind a store's back."""
+    with sqlite3.connect(file) as connection:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def put_decision(
+    store: SqlStore, decision: Decision, trace: np.ndarray, content_hash: int = 1, quarantined: bool = False
+) -> None:
+    """A decision and its trace, (C, T) or (T,)."""
+    values = np.array(trace, dtype=np.float32, ndmin=2)
+    store.take([StoredDecision(decision, values, content_hash, quarantined, store.clock())])
+
+
+def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
+    """Labels of decisions that are there; returns their numbers, in the order given."""
+    now, taken = store.clock() if labels else 0.0, []
+    for label in labels:
+        held = store.get_decision(label.decision_id, trace=False)
+        taken.append(replace(label, time=now, content_hash=held.content_hash, decided=held.time))
+    numbers = dict(store.take(taken))
+    return [numbers[label.decision_id] for label in labels]
+
+
+def put_label(
+    store: SqlStore, name: str, success: bool, source: Source = Source.VERIFICATION, version: int = 0,
+    point: np.ndarray | None = None, *, silent: int = 0,
+) -> int:  # fmt: skip
+    """One label; returns its number."""
+    return put_labels(store, NewLabel(name, success, source, version, point, silent))[0]
