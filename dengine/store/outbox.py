@@ -153,6 +153,7 @@ class Outbox:
         ]
         for thread in self._threads:
             thread.start()
+        self._begin_learning()  # now, or a first fault may come before it
 
     def hold_to_ledger(self, since: int | None = None) -> None:
         """Look whether what is read from the store is as its ledger has it; where it is not, everything is verified.
@@ -367,14 +368,19 @@ class Outbox:
         """The decision that an id has; None: it is new. StoreError where that is not known: it stays unrecorded."""
         with self._changed:
             self._unrecorded.discard(decision_id)
-            if self._taken is None and self._journal is not None and not self._learning and not self._blocked:
-                self._learning = True  # in a thread of its own: meanwhile ids are looked up one by one
-                threading.Thread(target=self._keep_learning, name="dengine-ids", daemon=True).start()
+        self._begin_learning()
         try:
             return None if self._is_new(decision_id) else self.find(decision_id)
         except StoreError:
             self._unrecorded.add(decision_id)
             raise
+
+    def _begin_learning(self) -> None:
+        """Learn which ids are taken in a thread of its own: meanwhile ids are looked up one by one."""
+        with self._changed:
+            if self._taken is None and self._journal is not None and not self._learning and not self._blocked:
+                self._learning = True
+                threading.Thread(target=self._keep_learning, name="dengine-ids", daemon=True).start()
 
     def _keep_learning(self) -> None:
         try:
