@@ -42,31 +42,31 @@ def _logistic(x: Floats) -> Floats:
     return np.asarray(1.0 / (1.0 + np.exp(-x)))
 
 
-def _soft(u: Floats, _t: Floats, lb: float) -> Floats:
-    return _logistic(np.log(lb / (1.0 - lb)) + 0.5 + 2.0 * u)  # at u = -0.25 just at the tolerance
+def _odds(lb: float) -> float:
+    return float(np.log(lb / (1.0 - lb)))
 
 
-def _step(u: Floats, _t: Floats, lb: float) -> Floats:
-    return np.select([u > 0.2, u > -0.6], [1.0 - 0.3 * (1.0 - lb), 1.0 - 1.4 * (1.0 - lb)], 0.05)
-
-
-def _drifting(u: Floats, t: Floats, lb: float) -> Floats:
-    return np.where(u > -0.5 + t, 1.0 - 0.3 * (1.0 - lb), 0.5)
-
-
-def _jumping(u: Floats, t: Floats, lb: float) -> Floats:
-    return np.where(u > np.where(t < 0.5, -0.5, 0.3), 1.0 - 0.3 * (1.0 - lb), 0.5)
+def _good(u: Floats, above: Floats | float, lb: float, else_: float = 0.5) -> Floats:
+    """Well within the tolerance above a place, far beyond it elsewhere."""
+    return np.where(u > above, 1.0 - 0.3 * (1.0 - lb), else_)
 
 
 TRUTHS: dict[str, Truth] = {  # u, time in [0, 1), LB -> p
-    "just beyond": lambda u, _t, lb: np.full_like(u, lb - 0.02),  # everywhere: whatever is accepted breaks the tolerance
-    "soft": _soft,
-    "step": _step,
-    "moderate": lambda u, _t, _lb: np.select([u > 0.0, u > -0.5], [0.97, 0.75], 0.02),
-    "drifting": _drifting,
-    "jumping": _jumping,
-    "bad few": lambda u, _t, lb: np.where(u > 0.0, 1.0 - 0.3 * (1.0 - lb), 0.3),
-}
+    "sharp": lambda u, _t, _lb: np.where(u > 0.0, 0.995, 0.02),
+    "soft": lambda u, _t, lb: _logistic(_odds(lb) + 0.5 + 2.0 * u),  # at u = -0.25 just at the tolerance
+    "step": lambda u, _t, lb: np.select([u > 0.2, u > -0.6], [1.0 - 0.3 * (1.0 - lb), 1.0 - 1.4 * (1.0 - lb)], 0.05),
+    "mesa": lambda u, _t, lb: np.where(np.abs(u) < 0.5, 1.0 - 0.5 * (1.0 - lb), 0.3),
+    "edge": lambda u, _t, lb: np.where(u > -0.2, 1.0 - 1.1 * (1.0 - lb), 0.1),  # all that is good is just beyond
+    "trap": lambda u, _t, lb: np.select([u > 0.1, u > -0.6], [1.0 - 0.1 * (1.0 - lb), 1.0 - 3.2 * (1.0 - lb)], 0.05),
+    "staircase": lambda u, _t, lb: 1.0 - (1.0 - lb) * np.array([8.0, 4.0, 2.0, 1.2, 0.8, 0.4, 0.2, 0.1])[
+        np.clip((4.0 * (u + 1.0)).astype(int), 0, 7)
+    ].clip(max=0.98 / (1.0 - lb)),
+    "just beyond": lambda u, _t, lb: np.full_like(u, lb - 0.02),  # everywhere: whatever passes breaks the tolerance
+    "bad few": lambda u, _t, lb: _good(u, 0.0, lb, 0.3),
+    "drifting": lambda u, t, lb: _good(u, t - 0.5, lb),
+    "jumping": lambda u, t, lb: _good(u, np.where(t < 0.5, -0.5, 0.3), lb),
+    "seasons": lambda u, t, lb: _good(u, 0.4 * np.sin(2.0 * np.pi * 3.0 * t), lb),
+}  # fmt: skip
 
 
 def traces(u: Floats, rng: np.random.Generator) -> Floats:
@@ -78,12 +78,17 @@ def traces(u: Floats, rng: np.random.Generator) -> Floats:
     )
 
 
-def planted(truth: str, n: int, lower_bound: float, seed: int, rate: float = 0.5) -> Stream:
-    """A stream of n traces. truth : a name in `TRUTHS`; "noise" and "parts" have the success rate `rate` everywhere."""
+def planted(truth: str, n: int, lower_bound: float, seed: int, rate: float = 0.5, order: str = "drawn") -> Stream:
+    """A stream of n traces. truth : a name in `TRUTHS`; "noise" and "parts" have the success rate `rate` everywhere.
+
+    order : "drawn", or by u, "best first" or "worst first".
+    """
     rng = np.random.default_rng([seed, 11])
     if truth == "parts":
         return _parts(n, rate, rng)
     u = rng.uniform(-1.0, 1.0, n)
+    if order != "drawn":
+        u = np.sort(u)[:: -1 if order == "best first" else 1]
     t = np.arange(n) / n
     p = np.full(n, rate) if truth == "noise" else TRUTHS[truth](u, t, lower_bound)
     X = traces(u, rng)
@@ -96,9 +101,14 @@ def planted(truth: str, n: int, lower_bound: float, seed: int, rate: float = 0.5
 
 
 def _parts(n: int, rate: float, rng: np.random.Generator) -> Stream:
-    """Every part comes `REPEATS` times, in random order; its label is drawn once, at the rate, whatever its trace."""
+    """Every part comes `REPEATS` times, in random order; its label is drawn once, at the rate, whatever its trace.
+
+    Its success probability is the rate when it comes first, and what is known of it by then when it comes again.
+    """
     m = -(-n // REPEATS)
     number = rng.permutation(np.repeat(np.arange(m), REPEATS))[:n]
     X = traces(rng.uniform(-1.0, 1.0, m), rng)[number] + rng.normal(0.0, 0.1, (n, SAMPLES))
     y = (rng.random(m) < rate).astype(np.int8)[number]
-    return Stream(Dataset(X.astype(np.float32), y, name="parts", part=number.astype(np.str_)), np.full(n, rate))
+    p = y.astype(np.float64)
+    p[np.unique(number, return_index=True)[1]] = rate
+    return Stream(Dataset(X.astype(np.float32), y, name="parts", part=number.astype(np.str_)), p)
