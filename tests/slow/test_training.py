@@ -5,7 +5,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -82,31 +82,6 @@ def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, mo
     monkeypatch.setattr(SqlStore, "put_version", slow)
     row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
     assert row["retrain_p50_s"] >= 0.4
-
-
-@pytest.mark.parametrize(
-    ("on", "change", "expected"),
-    [
-        ([0, 0, 0, 1, 1, 0], 2, (2, 2)),
-        ([0, 0, 1, 1, 0, 0], 2, (1, 2)),
-        ([1, 0, 0, 0, 0, 0], 2, (None, None)),  # a false alarm before the change is none of it
-        ([0, 0, 0, 0, 1, 1], 2, (3, None)),
-    ],
-)
-def test_an_alarm_is_counted_from_the_change_and_lasts_until_it_is_off(on: list, change: int, expected: tuple) -> None:
-    assert load("compare_drift").alarm_and_back(np.array(on, dtype=bool), change) == expected
-
-
-def test_a_change_is_marked_at_the_first_cycle_that_it_touches() -> None:
-    # Counted from 1: of 800 cycles the second half begins with the 401st; wear is nought in the first.
-    changes = {"nominal": None, "wear": 2, "variant": 401, "bias_jump": 401}
-    assert {name: load("compare_drift").first_change(name, 800) for name in changes} == changes
-
-
-def test_escapes_are_shares_of_the_parts_that_were_passed_on() -> None:
-    log = SimpleNamespace(false_positive=np.array([0, 0, 0, 1, 0]), finished=np.array([1, 0, 1, 0, 0]))
-    assert load("compare_drift").escapes(log, slice(None)) == pytest.approx(1000 / 3)
-    assert np.isnan(load("compare_drift").escapes(log, slice(1, 2)))
 
 
 def test_a_stream_that_is_there_is_compared_under_drift_without_a_simulator(run, make_data, tmp_path, monkeypatch) -> None:

@@ -22,7 +22,7 @@ from .report import write_report
 
 QUICK = ("conv", "pca", "rocket")
 CASES = {"planted": planted_cases, "noise": noise_cases}
-PARTS = ("null", "counts", "certificate", "planted", "noise", "garbage")
+PARTS = ("null", "certificate", "planted", "noise", "garbage")
 
 
 def pieces_of(part: str, repeats: int) -> list[Piece]:
@@ -32,7 +32,6 @@ def pieces_of(part: str, repeats: int) -> list[Piece]:
         return [Piece(part, {"case": case}, seed) for case, n in cases for seed in range(n)]
     n, settings = {
         "null": (max(2, repeats // 20), [{"reducer": "conv", "data": "insertion"}]),
-        "counts": (max(2, repeats // 5), _product(reducer=QUICK, data=("white noise", "insertion"), p=(0.8,))),
         "certificate": (max(2, repeats // 10), _product(stream=STREAMS, propensity=PROPENSITIES, alpha=(0.1,))),
         "garbage": (max(1, repeats // 40), _product(reducer=QUICK)),
     }[part]

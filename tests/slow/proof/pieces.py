@@ -19,7 +19,6 @@ from joblib import Memory, Parallel, delayed
 import dengine
 
 from .certificate import ever_wrong
-from .counts import count_noise, relabelled, white_noise
 from .garbage import garbage
 from .replays import judge
 
@@ -35,15 +34,6 @@ def null(seed: int, reducer: str, data: str) -> Row:
     return {"cycles": len(X), "certain": int((dengine.replay((X, y), recipe, 100 + seed).action != "verify").sum())}
 
 
-def counted(seed: int, reducer: str, data: str, p: float) -> Row:
-    """The count-only statistic of one model."""
-    noise = white_noise(500, p, seed)
-    if data == "insertion":
-        noise = relabelled(dengine.load_dataset("insertion").X[:, ::10], 500, p, seed)
-    z2 = count_noise(dengine.Recipe.load(reducer), noise, seed)
-    return {"balls": len(z2), "sum_z2": float(z2.sum())}
-
-
 def certified(seed: int, stream: str, propensity: float, alpha: float) -> Row:
     """In how many of `STREAMS` the bound was ever wrong."""
     share = ever_wrong(stream, propensity, alpha, STREAMS, 2000, seed)
@@ -54,7 +44,6 @@ FUNCTIONS: dict[str, Callable[..., Row | list[Row]]] = {
     "null": null,
     "noise": judge,
     "planted": judge,
-    "counts": counted,
     "certificate": certified,
     "garbage": garbage,
 }

@@ -25,7 +25,6 @@ HEADS = {
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
     "null": ("The null test", "Labels independent of the trace, four in five good: certain decisions of a replay."),
-    "counts": ("Count-only statistic", "Mean z^2 of the balls' counts under labels of noise; honest counting: 0.8 to 1.3."),
     "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
     "garbage": ("Garbage accepted", "Share accepted with the novelty gate, and without it; last, certain of clean parts."),
 }
@@ -59,12 +58,6 @@ def null_row(settings: Row, rows: list[Row]) -> Row:
     return {"replays": len(rows), "cycles": rows[0]["cycles"], "certain": str(certain), "mean": _mean(certain)}
 
 
-def counts_row(settings: Row, rows: list[Row]) -> Row:
-    """Mean z^2 over all balls."""
-    balls = sum(r["balls"] for r in rows)
-    return {"runs": len(rows), "balls": balls, "mean z^2": sum(r["sum_z2"] for r in rows) / max(1, balls)}
-
-
 def certificate_row(settings: Row, rows: list[Row]) -> Row:
     """Share of streams in which the bound was ever wrong."""
     n = sum(r["streams"] for r in rows)
@@ -81,7 +74,6 @@ ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
     "planted": replay_row,
     "noise": replay_row,
     "null": null_row,
-    "counts": counts_row,
     "certificate": certificate_row,
     "garbage": garbage_rows,
 }
