@@ -23,9 +23,8 @@ from ..store.records import Labelled
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which work in the executor is given up
-SWAP_SECONDS = 0.05  # kept for labels that came in meanwhile, the swap, the commit
+STEPS = 0.7  # of the budget, after which no step begins: each costs little, and a model that lacks some decides less
 LATE = "ended by the clock, before its last step"
-MARGIN = 1.2  # the tail grows a little with each retrain
 
 Clock = Callable[[], float]
 
@@ -111,14 +110,10 @@ class TrainedOn:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a retrain may use: seconds of wall time, and optimiser steps; None: no limit.
-
-    reserve : seconds kept for what follows the last step; the default serves until that was measured.
-    """
+    """What a retrain may use: seconds of wall time, and optimiser steps; None: no limit."""
 
     budget: float | None = None
     max_steps: int | None = None
-    reserve: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -126,21 +121,20 @@ class Trained:
     """The outcome of a training.
 
     model : to swap in; None: dropped.  reason : why, in words.
-    seconds : of the whole.  tail : of what followed the last step, the next retrain's reserve.
-    seq : the labels it was trained on.  begin : when, by the retrainer's clock.
+    seconds : of the training.  begin : when work on it began, by the retrainer's clock.
+    seq : the labels it was trained on.
     """
 
     model: EngineModel | None
     reason: str
     n_steps: int = 0
     seconds: float = 0.0
-    tail: float = 0.0
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     begin: float = 0.0
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class Retrainer:
-    """Trains candidates on a window, in line or beside the cell, and keeps time for what follows the last step.
+    """Trains candidates on a window, in line or beside the cell.
 
     clock : in seconds; it must pickle for a process executor.
     """
@@ -151,11 +145,9 @@ class Retrainer:
         self._began = 0.0  # monotonic seconds
         self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
 
-    def train(self, current: EngineModel) -> Trained:
-        """Train a successor of the current model, in line."""
-        begin, data = self.clock(), self.window.snapshot()
-        trained = train_candidate(current.successor(), data, self.limits, self.clock)
-        return self._measured(replace(trained, begin=begin))
+    def train(self, current: EngineModel, begin: float) -> Trained:
+        """Train a successor of the current model, in line; begin : when work on it began."""
+        return replace(train_candidate(current.successor(), self.window.snapshot(), self.limits, self.clock), begin=begin)
 
     def start(self, current: EngineModel) -> bool:
         """Train a successor of the current model beside the cell; False without an executor that takes work."""
@@ -180,7 +172,7 @@ class Retrainer:
             trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # recorded, and the old version goes on answering
             trained = Trained(None, self._failed(future, error), seq=self._seq)
-        return self._measured(replace(trained, begin=self.clock() - trained.seconds))
+        return replace(trained, begin=self.clock() - trained.seconds)
 
     def _failed(self, future: Future[Trained], error: Exception) -> str:
         """Why a training is dropped; an executor that died or hangs is of no more use."""
@@ -195,11 +187,6 @@ class Retrainer:
             what = f"not done after {time.monotonic() - self._began:.0f} s in the executor."
         return f"dropped: RuntimeError: {what} Retrains are in line from now on."
 
-    def _measured(self, trained: Trained) -> Trained:
-        if trained.model is not None:
-            self.limits = replace(self.limits, reserve=SWAP_SECONDS + MARGIN * trained.tail)
-        return trained
-
 
 def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
     """Train a successor on the data; a plain function, so that any executor can run it.
@@ -208,7 +195,7 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
     """
     torch.set_num_threads(1)  # per thread, and first thing in each
     begin = clock()
-    deadline = None if limits.budget is None else begin + max(0.0, limits.budget - limits.reserve)
+    deadline = None if limits.budget is None else begin + STEPS * limits.budget
     stop = StopRule(deadline, limits.max_steps, clock)
     n_steps, reason = 0, ""
     try:
@@ -223,8 +210,7 @@ def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, cloc
         model, reason = None, f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell: it is recorded
         model, reason = None, _dropped(error)
-    end = clock()
-    return Trained(model, reason, n_steps, end - begin, end - (stop.asked_at or begin), seq=data.seq, begin=begin)
+    return Trained(model, reason, n_steps, clock() - begin, seq=data.seq)
 
 
 def _dropped(error: Exception) -> str:

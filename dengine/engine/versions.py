@@ -306,8 +306,9 @@ class ModelVersions:
         """Train and swap, in line."""
         self.collect(HUNG)
         self.store_waiting()
+        begin = self.clock()
         self._begin_counting()
-        candidate = Candidate(self.retrainer.train(self.newest), self.newest, self.version, self.clock)
+        candidate = Candidate(self.retrainer.train(self.newest, begin), self.newest, self.version, self.clock)
         self._candidate, self._news = candidate, None
         self._advance(to_the_end=True)
         return self._news or candidate.report  # it is stored, and waits for the labels since
@@ -321,7 +322,8 @@ class ModelVersions:
             self.store_waiting()
         except StoreError:  # told by the outbox; the labels wait in its journal
             return None
-        return None if self.outbox.fault else self.start_retrain()
+        ahead = self.retrainer.executor is not None and self._ahead is not None and not self._ahead.done()
+        return None if self.outbox.fault or ahead else self.start_retrain()  # beside the cell, which need not wait for it
 
     @property
     def swapping(self) -> bool:

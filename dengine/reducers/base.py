@@ -41,22 +41,19 @@ class StopRule:
     """When an iterative fit must stop; asked before each step.
 
     deadline : reading of `clock` after which no step may begin; None: time decides nothing, so that a seed repeats exactly.
-    asked_at : reading of `clock` when last asked; after the fit, the end of its last step.
     late : whether the deadline ended the fit.
     """
 
     deadline: float | None = None
     max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
-    asked_at: float | None = None
     late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
         """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
-        self.asked_at = self.clock()
         if self.max_steps is not None and step >= self.max_steps:
             return True
-        self.late = self.deadline is not None and step >= least and self.asked_at >= self.deadline
+        self.late = self.deadline is not None and self.clock() >= self.deadline and step >= least
         return self.late
 
 
