@@ -282,17 +282,20 @@ class SqlStore:
         query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, same)).order_by(LABEL.c.seq)
         query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
         query = query.where(LABEL.c.seq.between(*((rows[0].seq, rows[-1].seq) if rows else (1, 0))))
-        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
-            if row.seq not in at or not is_sound(TRACE.name, dict(zip(TRACE.c.keys(), row, strict=False))):
+        names = TRACE.c.keys()
+        for *values, seq in connection.execute(query.execution_options(yield_per=CHUNK)):
+            row = dict(zip(names, values, strict=True))
+            if seq not in at or not is_sound(TRACE.name, row):
                 continue
-            if not kept.any():
-                traces = np.empty((len(rows), row.channels, row.samples), dtype=np.float32)
-            if (row.channels, row.samples) != traces.shape[1:]:
-                shapes = sorted({traces.shape[1:], (row.channels, row.samples)})
+            shape = row["channels"], row["samples"]
+            if not len(traces):
+                traces = np.empty((len(rows), *shape), dtype=np.float32)
+            if shape != traces.shape[1:]:
+                shapes = sorted({traces.shape[1:], shape})
                 raise StoreError(
                     f"Expected one shape in a cell's store, found {shapes}; give each kind a cell_id of its own."
                 )
-            traces[at[row.seq]], kept[at[row.seq]] = unpack(row.data).reshape(row.channels, row.samples), True
+            traces[at[seq]], kept[at[seq]] = unpack(row["data"]).reshape(shape), True
         labels = [row.success for row in rows]
         if not all(label in (0, 1) for label in labels):
             raise StoreError("Expected labels that are True or False, found another: the store is damaged; restore a copy.")
