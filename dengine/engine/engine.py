@@ -16,7 +16,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from signal import SIGINT
 from types import FrameType
@@ -325,9 +325,13 @@ class DataEngine:
             unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
             known = self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_)
             known = self._outbox.decided(known)
-            # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
-            if id_ is not None and not self._outbox.secure() and known.decision.action is not Action.VERIFY:
-                known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
+            try:
+                if id_ is not None:
+                    self._outbox.secure()
+            except NotTakenError:
+                # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
+                if known.decision.action is not Action.VERIFY:
+                    known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
             self._feedback.decided(known)
         return known.decision
 
@@ -354,7 +358,8 @@ class DataEngine:
             reason = Reason.NO_STORE if self._outbox.away else Reason.LATE
             x = as_agreed(trace, self.trace, False)
             known = self._outbox.decided(self._maker.decide(x, number, None, self.version, reason, id_))
-        self._outbox.secure()
+        with suppress(NotTakenError):
+            self._outbox.secure()
         return decided_before(known, trace, self.trace)
 
     def agree_on(self, trace: TraceSpec, inferred: bool = False) -> TraceSpec:
@@ -398,7 +403,7 @@ class DataEngine:
         self._outbox.check()
         with self._alone:
             self._versions.collect()
-            known = self._outbox.find(id_) or self._lost_stop(id_, said, trace, part)
+            known = self._outbox.find(id_, told=True) or self._lost_stop(id_, said, trace, part)
             self._feedback.report(known, said)
             return None if known.quarantined else self._versions.work(self.recipe)
 
@@ -509,7 +514,7 @@ class DataEngine:
 
     def flush(self, wait: float | None = None) -> None:
         """Return when all that is known so far is on the disk; NotTakenError after `wait` seconds, None: the store's."""
-        self._feedback.store_waiting(secure=False)
+        self._feedback.store_waiting()
         self._outbox.flush(wait)
         self._feedback.arrive()
 

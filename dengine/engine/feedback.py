@@ -15,9 +15,9 @@ from contextlib import suppress
 from ..errors import StoreError
 from ..records import Action, Decision, Reason, Source, source_of
 from ..store.outbox import Outbox
-from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision, already_reported
+from ..store.records import LATE_STOP, SAFE_MODE_BEGAN, SAFE_MODE_ENDED, NewLabel, StoredDecision, already_reported
 from .settings import SettingsInForce
-from .versions import ModelVersions, Point
+from .versions import ModelVersions
 
 log = logging.getLogger("dengine")
 RECENT = 50  # decisions that the share of novel ones fades over
@@ -42,10 +42,8 @@ class Feedback:
         self.outbox, self.versions, self.settings = outbox, versions, settings
         self.on_safe_mode = on_safe_mode
         self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
-        self._waiting: list[tuple[StoredDecision, NewLabel]] = []  # confirmed, not stored
-        self._numberless: dict[str, tuple[StoredDecision, bool]] = {}  # learned, and not numbered by the store yet
-        self._doubtful: dict[str, tuple[StoredDecision, NewLabel, Point | None]] = {}  # not known to be taken
-        self._arrived_late: dict[str, bool] = {}  # of those, which were
+        self._waiting: dict[str, tuple[StoredDecision, NewLabel]] = {}  # confirmed, not on their way into the store
+        self._unsynced: dict[str, bool] = {}  # learned, and not known to be on the disk
         # Decisions that asked for a check of which nothing was reported, each behind its number.
         self._owed: dict[str, tuple[int, Decision]] = {}
         self._decisions = 0
@@ -86,13 +84,11 @@ class Feedback:
         while self._went_on:
             known = self._went_on.pop(next(iter(self._went_on)))
             if self._stops_all:
-                label, point = self._label(known, True, Source.CONFIRMED)
-                self._learn(known, label, point)
-                self._waiting.append((known, label))
+                self._waiting[known.decision.id] = known, self._learn(known, True, Source.CONFIRMED)
             else:
                 self._unobserved += 1
         if len(self._waiting) >= 100:  # so many confirmed parts wait for a report
-            self.store_waiting(secure=False)
+            self.store_waiting()
         self.announce()
 
     def _count_overdue(self) -> None:
@@ -114,77 +110,51 @@ class Feedback:
         self._told_novel = self._novel > (0.5 if self._told_novel else NEARLY_ALL)
 
     def report(self, known: StoredDecision, success: bool) -> None:
-        """Take in a report; it is in the journal before anything else changes."""
-        id_ = known.decision.id
-        confirmed = known.source is Source.CONFIRMED or id_ in self._numberless
+        """Take in a report, and return once it is on the disk; NotTakenError where it is not."""
+        id_, untrue = known.decision.id, False
         self.arrive()
-        if self._arrived_late.get(id_) is success:
-            return
-        source = source_of(id_, known.decision.action, known.decision.audit, success)
-        if confirmed and source is Source.STOP:
-            self._take_back(known)
-            return
-        late = [each for each in self._waiting if each[0].decision.id == id_]  # it was taken for confirmed
-        self._waiting = [each for each in self._waiting if each[0].decision.id != id_]
-        label: NewLabel | None = None
-        try:
-            self.store_waiting()
-            if id_ in self._doubtful:
-                known, label, point = self._doubtful[id_]
-                if label.success is not success:
-                    raise already_reported(id_, (label.success, label.source), (success, source))
-            else:
-                label, point = self._label(known, success, source, int(self._was_unobserved(known)))
-            self.outbox.labels([(known, label)])
-        except Exception as error:
-            self._waiting += late  # it still waits as it did
-            if label is not None and isinstance(error, StoreError):
-                self._doubtful[id_], self._unobserved = (known, label, point), 0
-            raise
-        self._doubtful.pop(id_, None)
-        self._take_in(known, label, point, bool(late))
-        if late:
-            with suppress(StoreError):  # then it is told anew when the store is back
+        if self._unsynced.get(id_) is not success:  # else it is said again, and learned already
+            untrue = self._take_in(known, success)
+        self._unsynced[id_] = success
+        self.outbox.secure()
+        del self._unsynced[id_]
+        if untrue:
+            with suppress(StoreError):  # then it is put right when the store is back
                 self.outbox.drain()
         self.arrive()
         self.announce()
 
-    def _take_back(self, known: StoredDecision) -> None:
-        """A part stopped the system after its confirmation went into the journal: what that taught is put right."""
-        label = NewLabel(known.decision.id, False, Source.STOP, self.versions.version, None)
+    def _take_in(self, known: StoredDecision, success: bool) -> bool:
+        """Learn a label, which goes into the journal; whether the part was taken for confirmed until now, and was not."""
+        made = known.decision
+        source = source_of(made.id, made.action, made.audit, success)
+        if known.source is not None:
+            stands, now = (bool(known.success), known.source), (success, source)
+            if (stands, now) != LATE_STOP:
+                raise already_reported(made.id, stands, now)
+            self.store_waiting()
+            self._taken_back = True
+            self.outbox.labels([(known, NewLabel(made.id, False, source, self.versions.version, None))])
+            return True
+        untrue = self._waiting.pop(made.id, None) is not None
         self.store_waiting()
-        self._taken_back = True  # even where it is not known to be taken
-        self.outbox.labels([(known, label)])
-        with suppress(StoreError):  # then it is put right when the store is back
-            self.outbox.drain()
-        self.arrive()
-        self.announce()
-
-    def _take_in(self, known: StoredDecision, label: NewLabel, point: Point | None, untrue: bool) -> None:
-        """Learn what is in the journal."""
-        self._went_on.pop(known.decision.id, None)
-        self._owed.pop(known.decision.id, None)
-        self._untrue |= self.versions.overdue.pop(known.decision.id, None) is not None
-        if known.quarantined:
-            return
         if untrue:
             self.versions.unlearn(known)
-        self._learn(known, label, point)
-        self._numberless[known.decision.id] = known, label.success
-        self._untrue |= untrue
+        label = self._learn(known, success, source)
+        self.outbox.labels([(known, label)])
+        self._went_on.pop(made.id, None)
+        self._owed.pop(made.id, None)
+        overdue = self.versions.overdue.pop(made.id, None) is not None
+        self._untrue |= untrue or overdue
+        return untrue
 
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
         for id_, seq in self.outbox.arrived():
-            if id_ in self._doubtful:  # it was taken after all, among later ones
-                known, label, point = self._doubtful.pop(id_)
-                self._take_in(known, label, point, False)
-                self._arrived_late[id_], self._untrue = label.success, True
-            if id_ in self._numberless:
-                self.versions.keep(*self._numberless.pop(id_), seq)
+            self.versions.keep(id_, seq)
         if (self._untrue or self._taken_back) and self.outbox.drained and not self.outbox.fault:
             if self._waiting:  # else the rule would forget them
-                self.store_waiting(secure=False)
+                self.store_waiting()
             else:
                 self._put_right()
 
@@ -197,14 +167,12 @@ class Feedback:
             self._untrue, self._taken_back = untrue, taken_back
             log.exception("the rule is told anew when the store is back")
 
-    def store_waiting(self, secure: bool = True) -> None:
-        """Put the labels of confirmed parts into the journal; secure : wait until they are on the disk."""
-        if not self._waiting:
-            return
-        self.outbox.labels(self._waiting, secure)
-        self._numberless |= {known.decision.id: (known, True) for known, _ in self._waiting}
-        self._waiting = []
-        self.arrive()
+    def store_waiting(self) -> None:
+        """Put the labels of confirmed parts into the journal, without waiting."""
+        if self._waiting:
+            self.outbox.labels(self._waiting.values())
+            self._waiting.clear()
+            self.arrive()
 
     def store_all(self) -> None:
         """Have every label in the store, and its number; StoreError where the store is away."""
@@ -216,20 +184,16 @@ class Feedback:
         self.outbox.drain()
         self.arrive()
 
-    def _was_unobserved(self, known: StoredDecision) -> bool:
-        """Whether an accepted part was counted among the unobserved before its label came."""
-        counted = known.decision.action is Action.ACCEPT and known.decision.id not in self._went_on and not self._stops_all
-        return counted and known.decision.model_version >= self.settings.now.policy_since
-
-    def _label(self, known: StoredDecision, success: bool, source: Source, less: int = 0) -> tuple[NewLabel, Point | None]:
-        point = None if known.quarantined else self.versions.reference_point(known)
-        stored = point if self.versions.newest.keeps_references else None
-        unobserved = 0 if known.quarantined else self._unobserved - less
-        return NewLabel(known.decision.id, success, source, self.versions.version, stored, unobserved), point
-
-    def _learn(self, known: StoredDecision, label: NewLabel, point: Point | None) -> None:
-        self._unobserved = 0
-        self.versions.learn(known, label.success, point, label.silent)
+    def _learn(self, known: StoredDecision, success: bool, source: Source) -> NewLabel:
+        """Tell rule and references what became of a part; returns its label."""
+        made, version, point, silent = known.decision, self.versions.version, None, 0
+        if not known.quarantined:
+            counted = made.action is Action.ACCEPT and made.id not in self._went_on and not self._stops_all
+            # It was counted among the unobserved before its label came.
+            silent = self._unobserved - (counted and made.model_version >= self.settings.now.policy_since)
+            self._unobserved = 0
+            point = self.versions.learn(known, success, silent)
+        return NewLabel(made.id, success, source, version, point, silent)
 
     def begin_policy(self) -> None:
         """Go on under another policy. What was accepted under the last one and not heard of stays unheard of."""

@@ -107,7 +107,8 @@ class ModelVersions:
         self.overdue: dict[str, Decision] = {}  # what the rule was told of as wrong: their checks are owed for too long
         self._trained_on: TrainedOn | None = None
         self._newest = 0  # number that a version ever had; after damage an earlier one may answer
-        self._waiting: dict[str, int] = {}  # by decision, the numbers that references have until the store gives one
+        # What was learned, by decision, and the number that a reference has until the store gives one; 0: it is none.
+        self._waiting: dict[str, tuple[StoredDecision, bool, int]] = {}
         self._provisional = itertools.count(-1, -1)
         self._news: RetrainReport | None = None
         self._candidate: Candidate | None = None
@@ -167,24 +168,21 @@ class ModelVersions:
         self.answering, self.version, self._newest = model, number, max(number, self._newest)
         self._trained_on = trained_on
 
-    def reference_point(self, known: StoredDecision) -> Point | None:
-        """Where a decided trace lies as a reference of the version that answers; None without one, and where it fails."""
-        if self.answering is None:
-            return None
-        # What this very version embedded when it decided need not be embedded again.
-        embedding = known.decision.embedding if known.decision.model_version == self.version else None
-        return self.answering.place_safely(known.trace, known.content_hash, embedding)
-
-    def learn(self, known: StoredDecision, success: bool, point: Point | None, unobserved: int) -> None:
-        """Take in what became of a part: tell the rule, and make the trace a reference."""
-        made = known.decision
+    def learn(self, known: StoredDecision, success: bool, unobserved: int) -> Point | None:
+        """Take in what became of a part: tell the rule, and make the trace a reference; returns its place, where kept."""
+        made, model, point = known.decision, self.answering, None
         if made.model_version >= self.evidence.since:
             how = ACTIONS.index(made.predicted), made.looked
             self.newest.tell_safely(made.lower, made.upper, success, made.reason is Reason.NOVEL, unobserved, *how)
-        if point is not None:
-            number = self._waiting[known.decision.id] = next(self._provisional)
-            self.newest.add_safely(point, int(success), known.content_hash, number)
+        number = 0 if model is None else next(self._provisional)
+        self._waiting[made.id] = known, success, number
+        if model is not None:
+            # What this very version embedded when it decided need not be embedded again.
+            embedding = made.embedding if made.model_version == self.version else None
+            point = model.place_safely(known.trace, known.content_hash, embedding)
+            model.add_safely(point, int(success), known.content_hash, number)
         self.new_labels += self.fleet is None  # a product's labels are counted in their order, when they are kept
+        return point if self.newest.keeps_references else None
 
     def owe(self, made: Decision) -> None:
         """Tell the rule that a part was decided wrongly, whichever way: its check was not reported in time."""
@@ -198,16 +196,19 @@ class ModelVersions:
 
     def unlearn(self, known: StoredDecision) -> None:
         """Take out the reference of a part whose label waits for the store: it was not what happened."""
-        if (number := self._waiting.pop(known.decision.id, None)) is not None:
+        *_, number = self._waiting.pop(known.decision.id)
+        if number:
             self.newest.change_reference(number, known.content_hash, None)
         self.new_labels -= self.fleet is None
 
-    def keep(self, known: StoredDecision, success: bool, seq: int) -> None:
-        """Give a label that is stored to the next retrain."""
-        if (number := self._waiting.pop(known.decision.id, None)) is not None:
-            self.newest.renumber_reference(number, seq)
-        keep = self.retrainer.window.add if self.fleet is None else self.fleet.keep
-        keep(known.trace, int(success), known.content_hash, seq)
+    def keep(self, decision_id: str, seq: int) -> None:
+        """Give a label that was learned, and is stored by now, to the next retrain."""
+        if decision_id in self._waiting:
+            known, success, number = self._waiting.pop(decision_id)
+            if number:
+                self.newest.renumber_reference(number, seq)
+            keep = self.retrainer.window.add if self.fleet is None else self.fleet.keep
+            keep(known.trace, int(success), known.content_hash, seq)
 
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
@@ -389,8 +390,7 @@ class ModelVersions:
                 return False
             self.store_waiting()
             candidate.learn(self.retrainer.window)
-            candidate.storing, limit = self._store(candidate), self.outbox.limit
-            candidate.until = np.inf if limit is None else time.monotonic() + limit
+            candidate.storing, candidate.until = self._store(candidate), time.monotonic() + self.outbox.limit
         storing = candidate.storing
         if not to_the_end and not storing.done() and (storing.running() or time.monotonic() < candidate.until):
             return False

@@ -159,9 +159,9 @@ class Journal:
                 return
             begin += 1 + (at if at >= 0 else len(block) - len(MARK))
 
-    def mark(self, drained: int, newest: tuple[int, str] | None) -> None:
+    def mark(self, newest: tuple[int, str] | None) -> None:
         """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
-        self.drained, self.newest = drained, newest
+        self.newest = newest
         with self._told():
             os.pwrite(self._fd, self._header(), 0)
         if newest is None:

@@ -8,12 +8,13 @@ and one that is slow are the same to the cell. Without a journal (in memory, for
 from __future__ import annotations
 
 import logging
+import math
 import os
 import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
 from hashlib import blake2b
@@ -25,14 +26,15 @@ from numpy.typing import NDArray
 
 from ..errors import NotTakenError, StoreError
 from ..records import RetrainReport
-from .journal import HEADER, LostJournalError, Record, forked, from_bytes, to_bytes
-from .records import LATE_STOP, Event, NewLabel, StoredDecision, already_reported, as_text
+from .journal import HEADER, Journal, LostJournalError, Record, forked, from_bytes, to_bytes
+from .records import Event, NewLabel, StoredDecision, as_text
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
+PATIENT = 1e9  # seconds: nobody waits so long
 LINGER = 0.05  # seconds that a decision waits for company before it is written, and before the store takes it
 BEAT = 1.0  # seconds between two tries of what failed
 CHECK = 0.1  # seconds that opening waits for SQLite's own check; of a larger store, that is done while the cell runs
@@ -41,18 +43,19 @@ COMMIT = 2.0  # seconds beyond `wait` for a commit that is under way by then, fo
 CLOSE = 5.0  # seconds that closing may take
 CHUNK = 500  # records that the store takes at once
 MOST = 1_000  # of the newest decisions, which are known without asking
-UNWRITTEN = 10_000  # decisions in memory while the disk does not answer; later ones are verified, and not recorded
+UNWRITTEN = 10_000  # records in memory while the disk does not answer; later decisions are verified, and not recorded
 
 
 class TakenIds:
     """Ids that decisions have, in 2 MB however many: a Bloom filter.
 
     It may take a new id for a taken one, never the reverse: one in 500 of new ids at a million taken ones.
+    complete : whether all were added.
     Source: Bloom (1970), CACM 13(7).
     """
 
     def __init__(self, ids: Iterable[str] = ()) -> None:
-        self._bytes = np.zeros(2**21, dtype=np.uint8)
+        self._bytes, self.complete = np.zeros(2**21, dtype=np.uint8), False
         self.add(*ids)
 
     def add(self, *ids: str) -> None:
@@ -81,37 +84,34 @@ class Outbox:
 
     def __init__(self, store: SqlStore, window: int, owning: bool = True, patient: bool = False) -> None:
         self.store, self._window = store, window
-        self.limit = None if patient else store.wait
-        self._reading, self._pid, self._closed, self._ending = not owning, os.getpid(), False, False
+        self.limit = PATIENT if patient or store.wait is None else store.wait
+        self._reading, self._pid, self._closed = not owning, os.getpid(), False
+        self._changed = threading.Condition(threading.RLock())  # guards all that follows
         self._recent: OrderedDict[str, StoredDecision] = OrderedDict()
         self._taken: TakenIds | None = None
-        self._made: TakenIds | None = None  # the same, not complete until it is that one
-        self._learning = False  # which ids are taken
         self._unrecorded: set[str] = set()  # ids that were answered, and are recorded under no decision of theirs
         self._arrived: list[tuple[str, int]] = []
-        self._changed = threading.Condition(threading.RLock())  # guards all that follows
+        # Of what is not drained: the decisions, each by its offset once it is in the journal; labels with their places.
+        self._decisions: dict[str, StoredDecision | int] = {}
+        self._labels: dict[str, tuple[NewLabel, int]] = {}
+        self._times: deque[float] = deque()  # when each record was appended
         self._unwritten: deque[Record] = deque()
-        self._open: dict[str, StoredDecision] = {}  # decisions that are not synced yet
-        self._where: dict[str, int] = {}  # offsets in the journal of those that are not drained
-        self._labels: dict[str, tuple[NewLabel, int]] = {}  # not drained, with their places
-        self._times: deque[float] = deque()  # when each record that is not drained was appended
         self._appended = self._synced = self._drained = 0  # how many records so far
-        self._wanted = self._tries = 0  # place that somebody waits for to be synced; tries that failed
-        self._drains = 0  # callers that wait for the store to have everything
+        self._to_sync = self._to_drain = 0  # places that somebody waits for
+        self._tries = 0  # to sync, that failed
         self._jobs: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
-        self._sync_began: float | None = None
+        self._sync_began = math.inf
         self._stuck = self._away = self.doubt = ""  # why the journal, why the store, took nothing; what is not as written
+        self._threads: list[threading.Thread] = []  # one writes, one drains, one learns
         self._journal = store.own() if owning else None
         if self._journal is not None:
-            self._begin()
+            self._begin(self._journal)
         elif store.wait is not None:
             self._doubt_it(store.database.damage())
             self.hold_to_ledger()
 
-    def _begin(self) -> None:
+    def _begin(self, journal: Journal) -> None:
         """Have the store take what an earlier process left, and begin."""
-        journal = self._journal
-        assert journal is not None
         try:
             # Before the store takes anything.
             known, database = [each for each in (journal.newest, journal.head) if each is not None], self.store.database
@@ -126,15 +126,14 @@ class Outbox:
                 self._appended, self._synced = self._appended + 1, self._synced + 1
                 self._times.append(time.monotonic())
                 if isinstance(record := from_bytes(blob), StoredDecision):
-                    self._where[record.decision.id] = at  # a later one of an id is in the place of an earlier one
+                    self._decisions[record.decision.id] = at  # a later one of an id is in the place of an earlier one
             while not self.drained:
-                self._take()
+                self._take(journal)
             if journal.dropped:
                 text = f"{journal.dropped} bytes at its end were dropped: a process was killed as it wrote them"
                 self._note("journal", text)
             if journal.damaged:
                 self._note("journal", f"{journal.damaged} records that are not as they were written were left out")
-            journal.newest = self.store.database.newest
             journal.clear()
             self.store.database.on_entry = self._mark
             self._mark()
@@ -147,13 +146,10 @@ class Outbox:
             raise
         self._arrived.clear()  # what is resumed from the store knows them
         self.store.before_use = self._settle
-        self._threads = [
-            threading.Thread(target=work, name=f"dengine-{name}", daemon=True)
-            for name, work in (("journal", self._keep_writing), ("store", self._keep_draining))
-        ]
-        for thread in self._threads:
-            thread.start()
-        self._begin_learning()  # now, or a first fault may come before it
+        works = {"journal": self._keep_writing, "store": self._keep_draining, "ids": self._keep_learning}
+        for name, work in works.items():
+            self._threads.append(threading.Thread(target=work, args=(journal,), name=f"dengine-{name}", daemon=True))
+            self._threads[-1].start()
 
     def hold_to_ledger(self, since: int | None = None) -> None:
         """Look whether what is read from the store is as its ledger has it; where it is not, everything is verified.
@@ -176,7 +172,7 @@ class Outbox:
         """Note the ledger's newest entry in the journal, a drained one or not: a store that was cut off is told by that."""
         with self._changed, suppress(StoreError):  # what is wrong with the journal, its next record tells
             if self._journal is not None:
-                self._journal.mark(self._journal.drained, self.store.database.newest)
+                self._journal.mark(self.store.database.newest)
 
     # How it is doing
 
@@ -187,10 +183,8 @@ class Outbox:
 
     @property
     def _hung(self) -> str:
-        began = self._sync_began
-        if not self._stuck and began is not None and self.limit is not None and time.monotonic() - began > self.limit:
-            return f"the disk has not answered for {time.monotonic() - began:.1f} s."
-        return self._stuck
+        seconds = time.monotonic() - self._sync_began
+        return self._stuck or (f"the disk has not answered for {seconds:.1f} s." if seconds > self.limit else "")
 
     @property
     def lag(self) -> float:
@@ -206,8 +200,8 @@ class Outbox:
     @property
     def _blocked(self) -> str:
         """Why the store cannot be written, or asked, at present."""
-        late = self.limit is not None and self.lag > max(LATE, self.limit)
-        return self._hung or self._away or (f"no answer from the store for {self.lag:.1f} s." if late else "")
+        late = f"no answer from the store for {self.lag:.1f} s." if self.lag > max(LATE, self.limit) else ""
+        return self._hung or self._away or late
 
     @property
     def usable(self) -> bool:
@@ -232,73 +226,29 @@ class Outbox:
             if (first := self._recent.get(id_)) is not None:
                 return first
             self._unrecorded.discard(id_)
-            if len(self._open) >= UNWRITTEN:
+            if len(self._unwritten) >= UNWRITTEN:
                 self._unrecorded.add(id_)
-                return made
-            self._append([made])
-            self._remember(made)
+            else:
+                self._append([made])
         return made
 
     def amend(self, item: StoredDecision) -> StoredDecision:
         """Put a decision in the place of its id's, which nobody was told; returns that one if it is on the disk by now."""
         with self._changed:
             first = self._recent[item.decision.id]
-            if item.decision.id not in self._open:
+            if not isinstance(self._decisions.get(item.decision.id), StoredDecision):
                 return first
             made = replace(item, time=first.time, trace=first.trace)
             self._append([made])
-            self._remember(made)
         return made
 
-    def _remember(self, made: StoredDecision) -> None:
-        self._recent[made.decision.id] = made
-        if self._made is not None:
-            self._made.add(made.decision.id)
-        if len(self._recent) > MOST:
-            self._recent.popitem(last=False)
-
-    def secure(self) -> bool:
-        """Wait until all that was decided so far is on the disk; False where that takes too long."""
-        if self._journal is None:
-            return True
-        with suppress(StoreError):
-            self._wait_synced(self._appended)
-            return True
-        return False
-
-    def labels(self, labels: Sequence[tuple[StoredDecision, NewLabel]], secure: bool = True) -> None:
-        """Record labels of decisions; where secure, they are on the disk when this returns. Numbers come with `arrived`.
-
-        ReportError for a second label of a decision, but for the stop of a part that was confirmed. StoreError where they
-        are not known to be taken: the same again is harmless, the opposite is a ReportError.
-        """
+    def labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        """Record labels of decisions, without waiting. Their numbers come with `arrived`."""
+        now = self.store.clock
         with self._changed:
-            fresh: list[Record] = []
-            place = 0
-            for known, label in labels:
-                id_, now = known.decision.id, (label.success, label.source)
-                first, at = self._labels.get(id_, (None, 0))
-                stands = None if known.source is None else (bool(known.success), known.source)
-                if stands is None and first is not None and first.success != label.success:
-                    stands = first.success, first.source
-                late = (stands, now) == LATE_STOP
-                if stands is not None and not late:
-                    raise already_reported(id_, stands, now)
-                if first is None or (late and first.success):
-                    hash_, when = known.content_hash, self.store.clock()
-                    fresh.append(replace(label, time=when, content_hash=hash_, decided=known.time))
-                place = max(place, at)
-            if fresh:
-                place = self._append(fresh)
-        if secure:
-            self._wait_synced(place)
-        with self._changed:
-            for _, label in labels:
-                self._say(label)
-
-    def _say(self, label: NewLabel) -> None:
-        if (known := self._recent.get(label.decision_id)) is not None:
-            self._recent[label.decision_id] = replace(known, success=label.success, source=label.source)
+            self._append(
+                [replace(label, time=now(), content_hash=of.content_hash, decided=of.time) for of, label in labels]
+            )
 
     def event(self, kind: str, text: str) -> None:
         """Record what happened, without waiting."""
@@ -309,31 +259,46 @@ class Outbox:
         """Begin to commit a retrain; its `result` is the version's number."""
         return self._put(lambda: self.store.put_version(report, last_seq, state))
 
-    def _append(self, records: Sequence[Record]) -> int:
-        """Take records; returns the place of the last."""
-        if self._journal is None:
-            self._arrived += self.store.take(records)
-            return 0
-        now, self._appended = time.monotonic(), self._appended + len(records)
-        for place, record in enumerate(records, self._appended - len(records) + 1):
-            self._times.append(now)
+    def _append(self, records: Sequence[Record]) -> None:
+        """Take records, and know of them."""
+        arrived = self.store.take(records) if self._journal is None else []
+        for record in records:
+            self._appended += 1
             if isinstance(record, StoredDecision):
-                self._open[record.decision.id] = record
-                self._where.pop(record.decision.id, None)
+                self._recent[record.decision.id] = self._decisions[record.decision.id] = record
+                if self._taken is not None:
+                    self._taken.add(record.decision.id)
+                if len(self._recent) > MOST:
+                    self._recent.popitem(last=False)
             elif isinstance(record, NewLabel):
-                self._labels[record.decision_id] = record, place
-        self._unwritten.extend(records)
-        self._changed.notify_all()
-        return self._appended
+                self._labels[record.decision_id] = record, self._appended
+        if self._journal is None:
+            self._synced = self._drained = self._appended
+            self._was_taken(records, arrived)
+        else:
+            self._times += [time.monotonic()] * len(records)
+            self._unwritten += records
+            self._changed.notify_all()
 
-    def _wait_synced(self, place: int, wait: float | None = None) -> None:
-        """Return when the records up to a place are on the disk. NotTakenError where that takes too long, or fails.
+    def _was_taken(self, records: Sequence[Record], arrived: Sequence[tuple[str, int]]) -> None:
+        """The store has these, and gave their labels numbers."""
+        self._arrived += arrived
+        for record in records:
+            if isinstance(record, StoredDecision):
+                self._decisions.pop(record.decision.id, None)
+            elif isinstance(record, NewLabel):
+                self._labels.pop(record.decision_id, None)
+                if (known := self._recent.get(record.decision_id)) is not None:
+                    self._recent[record.decision_id] = replace(known, success=record.success, source=record.source)
 
-        wait : seconds at most; None: the limit.
+    def secure(self, seconds: float | None = None) -> None:
+        """Return when all that was told is on the disk. NotTakenError where that takes too long, or fails.
+
+        seconds : to wait at most; None: the limit.
         """
-        limit = self.limit if wait is None else wait
+        limit = self.limit if seconds is None else seconds
         with self._changed:
-            self._wanted, tries = max(self._wanted, place), self._tries
+            self._to_sync, tries = (place := self._appended), self._tries
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._synced >= place or self._tries > tries, limit)
             if self._synced < place:
@@ -345,22 +310,25 @@ class Outbox:
 
     # What the engine asks
 
-    def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away."""
+    def find(self, decision_id: str, told: bool = False) -> StoredDecision | None:
+        """Return a decision; None where it is unknown. StoreError where it can't be looked up, for the store is away.
+
+        told : with its label as soon as that was told; else once it is on the disk.
+        """
         with self._changed:
             if decision_id in self._unrecorded:
                 raise StoreError(
                     f"Expected a decision that is recorded, got {decision_id!r}, which could not be looked up, and was "
                     "verified unrecorded; decide on the part again."
                 )
-            known = self._recent.get(decision_id) or self._open.get(decision_id)
-            if known is None and self._journal is not None and decision_id in self._where:
-                record = from_bytes(self._journal.read(self._where[decision_id]))
-                known = record if isinstance(record, StoredDecision) else None
+            known: Any = self._recent.get(decision_id) or self._decisions.get(decision_id)
+            if isinstance(known, int) and self._journal is not None:
+                known = from_bytes(self._journal.read(known))
             label, place = self._labels.get(decision_id, (None, 0))
+            label = label if told or place <= self._synced else None
         if known is None and not self._is_new(decision_id):
-            known = self.ask(lambda: self.store.get_decision(decision_id), commit=0.0)
-        if known is not None and known.source is None and label is not None and place <= self._synced:
+            known = self.ask(lambda: self.store.get_decision(decision_id))
+        if known is not None and label is not None:
             known = replace(known, success=label.success, source=label.source)
         return known
 
@@ -368,40 +336,34 @@ class Outbox:
         """The decision that an id has; None: it is new. StoreError where that is not known: it stays unrecorded."""
         with self._changed:
             self._unrecorded.discard(decision_id)
-        self._begin_learning()
         try:
             return None if self._is_new(decision_id) else self.find(decision_id)
         except StoreError:
             self._unrecorded.add(decision_id)
             raise
 
-    def _begin_learning(self) -> None:
-        """Learn which ids are taken in a thread of its own: meanwhile ids are looked up one by one."""
-        with self._changed:
-            if self._taken is None and self._journal is not None and not self._learning and not self._blocked:
-                self._learning = True
-                threading.Thread(target=self._keep_learning, name="dengine-ids", daemon=True).start()
-
-    def _keep_learning(self) -> None:
-        try:
-            self.know()
-        except StoreError:  # the next id tries it again
-            self._learning = False
+    def _keep_learning(self, journal: Journal) -> None:
+        """Learn which ids are taken, when the store is there: meanwhile ids are looked up one by one."""
+        while not self._closed:
+            try:
+                self.know()
+                break
+            except StoreError:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closed, BEAT)
 
     def know(self) -> None:
         """Learn which ids are taken by now, a second for a million, so that in an outage new ones are known to be new."""
-        if self._taken is not None:
-            return
         with self._changed:
-            self._made = made = TakenIds([*self._recent, *self._open, *self._where])
-        for ids in self.store.decision_ids():
+            taken = self._taken = self._taken or TakenIds([*self._recent, *self._decisions])
+        for ids in () if taken.complete else self.store.decision_ids():
             with self._changed:
-                made.add(*ids)
-        self._taken = made
+                taken.add(*ids)
+        taken.complete = True
 
     def _is_new(self, decision_id: str) -> bool:
         """Whether an id is taken for certain by no decision; False where that is not known."""
-        return self._taken is not None and not self._taken.may_hold(decision_id)
+        return self._taken is not None and self._taken.complete and not self._taken.may_hold(decision_id)
 
     def forget(self, decision_id: str) -> None:
         """Look a decision up in the store the next time: what was known of it here is no longer so."""
@@ -409,8 +371,6 @@ class Outbox:
 
     def arrived(self) -> list[tuple[str, int]]:
         """The numbers that the store has given labels, by their decisions; each once."""
-        if not self._arrived:
-            return []
         with self._changed:
             arrived, self._arrived = self._arrived, []
         return arrived
@@ -425,45 +385,33 @@ class Outbox:
         with self._changed:
             if self.drained:
                 return
-            place = self._appended
-            self._wanted, self._drains = max(self._wanted, place), self._drains + 1
+            self._to_sync = self._to_drain = place = self._appended
             self._changed.notify_all()
-            try:
-                if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
-                    self._away = f"no answer from the store within {self.limit:g} s."
-            finally:
-                self._drains -= 1
+            if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
+                self._away = f"no answer from the store within {self.limit:g} s."
             if self._drained < place:
                 raise self._is_away()
 
     def _is_away(self) -> StoreError:
         return StoreError(f"The store is away: {self._blocked} Labels wait in its journal; try this again when it is back.")
 
-    def flush(self, wait: float | None = None) -> None:
-        """Return when all that is known so far is in the store, or, where that is away, on the disk in the journal.
+    def flush(self, seconds: float | None = None) -> None:
+        """Return when all that is known so far is in the store, or, where that is away, on the disk: see `secure`."""
+        self.secure(seconds)
+        with suppress(StoreError):
+            self.drain()
 
-        wait : seconds that the disk may take; None: the limit.
-        """
-        if self._journal is not None:
-            self._wait_synced(self._appended, wait)
-            with suppress(StoreError):
-                self.drain()
+    def ask(self, work: Callable[[], T]) -> T:
+        """Call the store with the time limit; StoreError where it is away."""
+        return self.result(self._put(work))
 
-    def ask(self, work: Callable[[], T], commit: float = COMMIT) -> T:
-        """Call the store with the time limit; StoreError where it is away.  commit : seconds more that it may run."""
-        return work() if self._journal is None else self.result(self._put(work), commit)
-
-    def result(self, future: Future[T], commit: float = COMMIT) -> T:
+    def result(self, future: Future[T]) -> T:
         """What a call to the store returned. StoreError where it takes too long: it is given up, unless it commits."""
-        for wait in (self.limit, commit):
-            try:
-                return future.result(wait)
-            except TimeoutError:
-                if future.done():  # the call's own
-                    raise
-            if future.cancel():
-                break
-        raise StoreError(f"no answer from the store within {self.limit:g} s.")
+        if not wait([future], self.limit).done and not future.cancel():
+            wait([future], COMMIT)
+        if future.cancelled() or not future.done():
+            raise StoreError(f"no answer from the store within {self.limit:g} s.")
+        return future.result()
 
     def _put(self, work: Callable[[], T]) -> Future[T]:
         future: Future[T] = Future()
@@ -487,47 +435,41 @@ class Outbox:
         """Write everything, to the journal what the store does not take, and let it go within seconds; once."""
         if not self.usable:
             return
-        if self._journal is None:
-            self.store.close()
-            self._closed = True
-            return
         self.flush()
         with self._changed:
             self._changed.wait_for(lambda: self.drained or bool(self._away), CLOSE)
-            self._closed = self._ending = True
+            self._closed = True
             self._changed.notify_all()
-        for thread in self._threads:
+        for thread in self._threads[:2]:
             thread.join(CLOSE)
-        if self.drained and not self._threads[1].is_alive():
+        if self.drained and not any(thread.is_alive() for thread in self._threads[:2]):
             self.store.close()
-        else:
+        elif self._journal is not None:
             log.warning("the store was left, its journal %s holds what it lacks: %s", self._journal.path, self.fault)
             self.store.let_go()  # else its lease on the cell would outlive the engine
-        self._journal.close()
+            self._journal.close()
 
     # The thread that writes the journal
 
-    def _keep_writing(self) -> None:
+    def _keep_writing(self, journal: Journal) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._unwritten or self._ending)
-                self._changed.wait_for(lambda: self._wanted > self._synced or self._ending, LINGER)
+                self._changed.wait_for(lambda: self._unwritten or self._closed)
+                self._changed.wait_for(lambda: self._to_sync > self._synced or self._closed, LINGER)
                 if not (batch := list(self._unwritten)):
                     return
                 self._sync_began = time.monotonic()
             try:
-                self._write(batch)
+                self._write(journal, batch)
             except Exception as error:  # whatever it is, the cell goes on, and this thread too
                 with self._changed:
-                    self._stuck, self._tries, self._sync_began = str(error), self._tries + 1, None
+                    self._stuck, self._tries, self._sync_began = str(error), self._tries + 1, math.inf
                     self._changed.notify_all()
-                    if self._ending:
+                    if self._closed:
                         return
                     self._changed.wait(BEAT)
 
-    def _write(self, batch: Sequence[Record]) -> None:
-        journal = self._journal
-        assert journal is not None
+    def _write(self, journal: Journal, batch: Sequence[Record]) -> None:
         if journal.end > 8 << 20:
             with self._changed:  # a cell that never pauses would fill the disk
                 if self._changed.wait_for(lambda: journal.empty, LINGER):
@@ -544,24 +486,23 @@ class Outbox:
         with self._changed:
             for record, at in zip(batch, offsets, strict=True):
                 self._unwritten.popleft()
-                if isinstance(record, StoredDecision) and self._open.get(record.decision.id) is record:
-                    self._where[record.decision.id] = at
-                    del self._open[record.decision.id]
+                if isinstance(record, StoredDecision) and self._decisions.get(record.decision.id) is record:
+                    self._decisions[record.decision.id] = at
             self._synced += len(batch)
-            self._stuck, self._sync_began = "", None
+            self._stuck, self._sync_began = "", math.inf
             self._changed.notify_all()
 
     # The thread that drains it into the store
 
-    def _keep_draining(self) -> None:
+    def _keep_draining(self, journal: Journal) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._jobs or self._drained < self._synced or self._ending)
-                self._changed.wait_for(lambda: self._jobs or self._drains or self._ending, LINGER)
+                self._changed.wait_for(lambda: self._jobs or self._drained < self._synced or self._closed)
+                self._changed.wait_for(lambda: self._jobs or self._to_drain > self._drained or self._closed, LINGER)
                 job = self._jobs.popleft() if self._jobs else None
             try:
                 while self._drained < self._synced:
-                    self._take()
+                    self._take(journal)
                 self._away = ""
             except Exception as error:  # whatever it is, the cell goes on, and this thread too
                 if not self._away:
@@ -572,35 +513,28 @@ class Outbox:
             if job is not None:
                 self._run(*job)
             with self._changed:
-                if self._ending and (self._away or self._drained == self._synced) and not self._jobs:
+                if self._closed and (self._away or self._drained == self._synced) and not self._jobs:
                     return
                 if self._away:
-                    self._changed.wait_for(lambda: self._jobs or self._ending, BEAT)
+                    self._changed.wait_for(lambda: self._jobs or self._closed, BEAT)
 
-    def _take(self) -> None:
+    def _take(self, journal: Journal) -> None:
         """Have the store take a piece of what is synced."""
-        journal = self._journal
-        assert journal is not None
         with self._changed:
             n = min(CHUNK, self._synced - self._drained)
         found = [(at, end, from_bytes(blob)) for at, end, blob in islice(journal.records(), n)]
-        with self._changed:
+        with self._changed:  # without the decisions that another one is in the place of
             records = [
                 record
                 for at, _, record in found
-                if not isinstance(record, StoredDecision) or self._where.get(record.decision.id) == at
+                if not isinstance(record, StoredDecision) or self._decisions.get(record.decision.id) == at
             ]
-        arrived, newest = self.store.take(records), self.store.database.newest
+        arrived = self.store.take(records)
         with self._changed:
-            journal.mark(found[-1][1], newest)
-            self._arrived += arrived
-            for record in records:
-                if isinstance(record, StoredDecision):
-                    self._where.pop(record.decision.id, None)
-                elif isinstance(record, NewLabel):
-                    self._labels.pop(record.decision_id, None)
-                    self._say(record)
-            for _ in range(min(n, len(self._times))):
+            journal.drained = found[-1][1]
+            self._mark()
+            self._was_taken(records, arrived)
+            for _ in range(n):
                 self._times.popleft()
             self._drained += n
             self._changed.notify_all()

@@ -508,12 +508,6 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
     known = [cell.timed(lambda i=i: cell.engine.decide(X[i], decision_id=f"part-{i}")) for i in range(IDS)]
     cell.engine.close()
     cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
-    with away(place):
-        cell.play(1)
-        time.sleep(AWAY)
-        told = engine.decide(X[IDS], decision_id="new-0")  # which nobody knows yet to be new
-        outcome.must(told.reason is Reason.NO_STORE, "an id was taken that nobody could look up")
-    cell.until_back()
     engine.know_ids()
     with away(place):
         outcome.injected += 1
