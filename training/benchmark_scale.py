@@ -18,10 +18,9 @@ import numpy as np
 from common import POLICY, noisy, options, tell, wall_time
 from rich.progress import track
 
-from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, load_dataset
+from dengine import Action, DataEngine, Dataset, Decision, Reason, Recipe, Source, load_dataset
 from dengine.folds import content_hash
-from dengine.store.journal import labelled
-from dengine.store.records import StoredDecision
+from dengine.store.records import NewLabel, StoredDecision
 
 CHUNK = 5000
 
@@ -35,7 +34,8 @@ def fill(engine: DataEngine, data: Dataset, n: int) -> None:
         records: list[Any] = []
         for i, (x, good, hash_) in enumerate(zip(X, y, content_hash(X), strict=True), start):
             trace = np.array(x, np.float32, ndmin=2)
-            records += labelled(StoredDecision(_verified(f"import-{i}"), trace, hash_, False, 0.0), good)
+            records.append(StoredDecision(_verified(f"import-{i}"), trace, hash_, False, 0.0))
+            records.append(NewLabel(f"import-{i}", bool(good), Source.VERIFICATION, 0, None, content_hash=hash_))
         engine.store.take(records)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,15 +20,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..decision.policy import Policy
 from ..engine.decide import as_part
 from ..engine.engine import DataEngine
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, RetrainReport, TraceSpec, trace_in
-from ..store.journal import Record, labelled
+from ..records import REASONS, Action, Decision, Reason, RetrainReport, TraceSpec, as_success, source_of, trace_in
 from ..store.opening import UNHURRIED, opening
-from ..store.records import StoredDecision
+from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
 from .loading import TABLES
@@ -108,31 +108,62 @@ def import_labelled(
     """
     data = load_dataset(dataset, **form_in(store, dataset))
     engine = DataEngine.open_or_create(store, seed, wait=UNHURRIED, recipe=recipe, allow_import=allow_import)
-    counts = Counter[str]()
     try:
         agreed = engine.agree_on(data.spec)
         must_agree(data, agreed)
-        gate, traces, kept = TraceGate(agreed), as_traces(data.X, agreed), engine.store
-        verified = list(zip(_verified(traces, data), traces, data.y, strict=True))
-        for start in range(0, len(data), CHUNK):
-            records: list[Record] = []
-            for (own, decision), x, label in verified[start : start + CHUNK]:
-                if kept.get_decision(decision.id) is not None:
-                    counts["known"] += 1
-                    continue
-                fault = gate(torch.from_numpy(x))[0]
-                if fault:  # a bad one is kept, but never given to training
-                    decision = replace(decision, reason=REASONS[fault])
-                made = StoredDecision(decision, x.copy(), own, bool(fault), kept.clock())
-                records += labelled(made, label)
-                counts["quarantined" if fault else "imported"] += 1
-            kept.take(records)
-            if on_traces is not None:
-                on_traces(min(CHUNK, len(data) - start))
+        traces = as_traces(data.X, agreed)
+        parts = list(zip(_verified(traces, data), traces, map(as_success, data.y), strict=True))
+        report = import_parts(engine.store, parts, agreed, engine.policy, on_traces)
     finally:
         if isinstance(store, str | os.PathLike):
             engine.close()
-    return ImportReport(counts["imported"], counts["quarantined"], counts["known"], engine.resumed)
+    return replace(report, resumed=engine.resumed)
+
+
+def import_parts(
+    store: SqlStore,
+    parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
+    spec: TraceSpec,
+    policy: Policy,
+    on_traces: Callable[[int], None] | None,
+) -> ImportReport:
+    """Put parts, each with its decision, its trace (C, T) and its label, None where nothing was heard of it, into a store.
+
+    A part has a second row where its label came later. The report counts labels.
+    """
+    gate, counts, silent = TraceGate(spec), Counter[str](), 0
+    if counts_silence := policy.stops == "some":
+        since = int(store.settings().get("policy_since", 0))
+        silent = len(store.unreported_accepts(since)) - store.silent_total(since)
+    for start in range(0, len(parts), CHUNK):
+        made: dict[str, StoredDecision] = {}
+        labels: list[NewLabel] = []
+        for decision, trace, label in parts[start : start + CHUNK]:
+            fault, hash_ = gate(torch.from_numpy(trace))
+            held = made.get(decision.id) or store.get_decision(decision.id)
+            if held is not None and held.source is not None:  # a forgotten one has a label too
+                if label is not None:
+                    counts["known" if label == held.success else "contradicted"] += 1
+                continue
+            if (known := held) is None:
+                propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
+                reason = REASONS[fault] if fault else decision.reason  # a bad one is kept, but never given to training
+                new = replace(decision, reason=reason, propensity=propensity)
+                known = StoredDecision(new, trace.copy(), own_hash(hash_, decision.part), bool(fault), store.clock())
+                made[decision.id] = known
+            if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
+                silent += (label is None) - (held is not None)
+            if label is not None:
+                source = source_of(decision.id, decision.action, decision.audit, label)
+                of = decision.id, label, source, 0, None, 0 if fault else silent
+                labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
+                silent = silent if fault else 0
+                counts["quarantined" if fault else "imported"] += 1
+        store.take([*made.values(), *labels])
+        if on_traces is not None:
+            on_traces(min(CHUNK, len(parts) - start))
+    taken = counts["imported"], counts["quarantined"], counts["known"]
+    return ImportReport(*taken, resumed=True, contradicted=counts["contradicted"])
 
 
 def train_until_done(engine: DataEngine, retrains: int) -> Iterator[RetrainReport]:
@@ -146,13 +177,12 @@ def train_until_done(engine: DataEngine, retrains: int) -> Iterator[RetrainRepor
             return
 
 
-def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[tuple[int, Decision]]:
-    """For each of the traces (n, C, T) the hash that it goes by, and the decision that verified it."""
+def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
+    """For each of the traces (n, C, T) the decision that verified it."""
     times = Counter[int]()
     parts = [None] * len(data) if data.part is None else [as_part(part) for part in data.part.tolist()]
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
         id_ = f"import-{hash_ & (2**64 - 1):016x}-{times[hash_]}"  # equal traces within one file are events of their own
         times[hash_] += 1
         nothing = (0.0, 1.0, 0, 0, None, 0)
-        decision = Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part)
-        yield own_hash(hash_, part), decision
+        yield Decision(id_, Action.VERIFY, Action.VERIFY, *nothing, Reason.NO_MODEL, False, 1.0, part)

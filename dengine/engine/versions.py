@@ -410,7 +410,8 @@ class ModelVersions:
             candidate.report = replace(candidate.report, version=self.next_number, accepted=True)
             candidate.trained_on = TrainedOn(candidate.seq, self.corrected_to, int(candidate.seq[-1]))
             state = self._state(model, candidate.trained_on)
-        return self.outbox.version(candidate.report, self.retrainer.window.newest_seq, state)
+        report, last = candidate.report, self.retrainer.window.newest_seq
+        return self.outbox.begin(lambda: self.store.put_version(report, last, state))
 
     def _swap(self, candidate: Candidate) -> None:
         model, self._news = candidate.model, candidate.report

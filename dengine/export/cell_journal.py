@@ -17,26 +17,21 @@ from __future__ import annotations
 import logging
 import os
 import zlib
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..datasets.dataset import must
-from ..datasets.importing import CHUNK, ImportReport
-from ..decision.policy import Policy
+from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError
-from ..folds import own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, TraceSpec, source_of, trace_in
+from ..records import Action, Decision, Reason, TraceSpec, trace_in
 from ..store.opening import opening
-from ..store.records import NewLabel, StoredDecision
-from ..traces import TraceGate, as_trace
+from ..traces import as_trace
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -210,8 +205,8 @@ def import_journal(
             of = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"
             do = "name the store that it came from, or say --any-model if it is right"
             raise DataError(f"Expected a journal of a model that was exported from this store, {of}; {do}.")
-        lines = _with_known_outcomes(journal, policy.stops)
-        report = _import_lines(opened, lines, spec, policy, on_traces)
+        parts = [(line.decision, line.trace, line.label) for line in _with_known_outcomes(journal, policy.stops)]
+        report = import_parts(opened, parts, spec, policy, on_traces)
     opened.close()
     return replace(report, cut=journal.cut, aside=journal.aside)
 
@@ -231,44 +226,3 @@ def _with_known_outcomes(journal: Journal, stops: str) -> list[JournalLine]:
         if line is not journal.waits
         and not (line.decision.action is Action.ACCEPT and late.get(line.decision.id) == line.late)
     ]
-
-
-def _import_lines(
-    store: SqlStore, lines: list[JournalLine], spec: TraceSpec, policy: Policy, on_traces: Callable[[int], None] | None
-) -> ImportReport:
-    gate, counts = TraceGate(spec), Counter[str]()
-    looks = [gate(torch.from_numpy(line.trace)) for line in lines]
-    counts_silence = policy.stops == "some"
-    since = int(store.settings().get("policy_since", 0))
-    silent = len(store.unreported_accepts(since)) - store.silent_total(since) if counts_silence else 0
-    for start in range(0, len(lines), CHUNK):
-        labels: list[NewLabel] = []
-        for line, (fault, hash_) in zip(lines[start : start + CHUNK], looks[start : start + CHUNK], strict=True):
-            decision, label = line.decision, line.label
-            held = store.get_decision(decision.id)
-            if held is None:
-                propensity = 1.0 if decision.predicted is Action.VERIFY else policy.audited_share
-                reason = REASONS[fault] if fault else decision.reason
-                new = replace(decision, reason=reason, propensity=propensity)
-                known = StoredDecision(new, line.trace, own_hash(hash_, decision.part), bool(fault), store.clock())
-                store.take([known])
-            elif held.source is not None:  # a forgotten one has a label too
-                if label is not None:
-                    counts["known" if label == held.success else "contradicted"] += 1
-                continue
-            else:
-                known = held
-            if counts_silence and decision.action is Action.ACCEPT:  # one held without a label was counted as silent
-                silent += (label is None) - (held is not None)
-            if label is not None:
-                source = source_of(decision.id, decision.action, decision.audit, label)
-                of = decision.id, label, source, 0, None, 0 if fault else silent
-                labels.append(NewLabel(*of, store.clock(), known.content_hash, known.time))
-                silent = silent if fault else 0
-                counts["quarantined" if fault else "imported"] += 1
-        store.take(labels)
-        if on_traces is not None:
-            on_traces(min(CHUNK, len(lines) - start))
-    store.flush()
-    taken = counts["imported"], counts["quarantined"], counts["known"]
-    return ImportReport(*taken, resumed=True, contradicted=counts["contradicted"])

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import StoreError
-from ..records import Decision, Source, as_success
+from ..records import Decision
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
 LENGTH = struct.Struct("<I")  # of a record's JSON text, before it; the samples of a trace or a point follow it
@@ -41,15 +41,14 @@ Record = StoredDecision | NewLabel | Event
 
 def to_bytes(record: Record) -> bytes:
     """Return a record as a journal keeps it: its row in JSON, and the samples of its trace or point."""
-    rest: bytes | None = None
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
-        rest = pack(record.trace)
+        samples = pack(record.trace)
     else:
         row = to_row(record)
-        rest = row.pop("point", None)
+        samples = row.pop("point", None) or b""
     text = json.dumps([type(record).__name__, row]).encode()
-    return LENGTH.pack(len(text)) + text + (rest or b"")
+    return LENGTH.pack(len(text)) + text + samples
 
 
 def from_bytes(blob: bytes) -> Record:
@@ -69,12 +68,6 @@ def from_bytes(blob: bytes) -> Record:
             f"Expected a record of a journal, got what cannot be read ({error}); "
             "open the store with the dengine that wrote it."
         ) from error
-
-
-def labelled(item: StoredDecision, success: Any, source: Source = Source.VERIFICATION) -> list[Record]:
-    """A decision that was labelled when it was made, as a recording is that is imported."""
-    of = item.decision.id, as_success(success), source, item.decision.model_version, None, 0
-    return [item, NewLabel(*of, item.time, item.content_hash, item.time)]
 
 
 class Journal:
@@ -97,7 +90,7 @@ class Journal:
         self._digest = bytes(16)
         self._fd = _locked(path)
         try:
-            with self._told():
+            with _using(self.path):
                 self._scan()
                 os.ftruncate(self._fd, self.end)
                 self._begin()
@@ -105,13 +98,6 @@ class Journal:
             os.close(self._fd)
             raise
         _OPEN.add(self)
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise _unusable(self.path, error) from error
 
     @property
     def empty(self) -> bool:
@@ -128,7 +114,7 @@ class Journal:
             offsets.append(self.end + len(framed))
             digest = _digest(digest, record)
             framed += FRAME.pack(MARK, len(record), zlib.crc32(record), digest) + record
-        with self._told():
+        with _using(self.path):
             if (written := os.pwrite(self._fd, framed, self.end)) < len(framed):
                 raise OSError(f"only {written} of {len(framed)} bytes were written")
             SYNC(self._fd)
@@ -162,7 +148,7 @@ class Journal:
     def mark(self, newest: tuple[int, str] | None) -> None:
         """Note what the store holds by now; without a sync, for to give it a record twice is harmless."""
         self.newest = newest
-        with self._told():
+        with _using(self.path):
             os.pwrite(self._fd, self._header(), 0)
         if newest is None:
             return
@@ -175,7 +161,7 @@ class Journal:
 
     def clear(self) -> None:
         """Forget all records; the store holds them now."""
-        with self._told():
+        with _using(self.path):
             os.ftruncate(self._fd, HEADER)
             self.drained = self.end = HEADER
             self._digest, self.damaged = bytes(16), 0
@@ -185,7 +171,7 @@ class Journal:
         """Make the lost file anew, with what is not drained where it was."""
         lost, self._fd = self._fd, _locked(self.path)
         try:
-            with self._told():
+            with _using(self.path):
                 os.pwrite(self._fd, os.pread(lost, self.end - self.drained, self.drained), self.drained)
                 self._begin()
         except StoreError:
@@ -197,7 +183,7 @@ class Journal:
     def close(self) -> None:
         """Give the cell free. The file stays: what it knows of the ledger is compared by the next engine."""
         if self._fd >= 0:
-            with self._told():
+            with _using(self.path):
                 os.ftruncate(self._fd, HEADER if self.empty else self.end)
             self.let_go()
 
@@ -280,14 +266,21 @@ def _digest(before: bytes, record: bytes) -> bytes:
     return blake2b(before + record, digest_size=16).digest()
 
 
+@contextmanager
+def _using(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        do = "free some space there, or make its folder writable"
+        raise StoreError(f"Could not use the journal {path}: {error}; {do}.") from error
+
+
 def _locked(path: Path) -> int:
     """Open and lock a file that is still the one at its path once the lock is held."""
     while True:
-        try:
+        with _using(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        except OSError as error:
-            raise _unusable(path, error) from error
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(fd), path.lstat()):
@@ -361,7 +354,3 @@ def owned_by(holder: str, name: str) -> StoreError:
         f"Expected a cell that no other engine runs on, but {holder} owns {name}; "
         "close that engine first, or give this one a cell_id of its own."
     )
-
-
-def _unusable(path: Path, error: OSError) -> StoreError:
-    return StoreError(f"Could not use the journal {path}: {error}; free some space there, or make its folder writable.")

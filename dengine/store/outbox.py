@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import replace
@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import NotTakenError, StoreError
-from ..records import RetrainReport
 from .journal import HEADER, Journal, LostJournalError, Record, forked, from_bytes, to_bytes
 from .records import Event, NewLabel, StoredDecision, as_text
 
@@ -255,10 +254,6 @@ class Outbox:
         with self._changed:
             self._append([Event(0, self.store.clock(), as_text(kind), as_text(text))])
 
-    def version(self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None) -> Future[int]:
-        """Begin to commit a retrain; its `result` is the version's number."""
-        return self._put(lambda: self.store.put_version(report, last_seq, state))
-
     def _append(self, records: Sequence[Record]) -> None:
         """Take records, and know of them."""
         arrived = self.store.take(records) if self._journal is None else []
@@ -321,9 +316,10 @@ class Outbox:
                     f"Expected a decision that is recorded, got {decision_id!r}, which could not be looked up, and was "
                     "verified unrecorded; decide on the part again."
                 )
-            known: Any = self._recent.get(decision_id) or self._decisions.get(decision_id)
-            if isinstance(known, int) and self._journal is not None:
-                known = from_bytes(self._journal.read(known))
+            held: Any = self._recent.get(decision_id) or self._decisions.get(decision_id)
+            if isinstance(held, int) and self._journal is not None:
+                held = from_bytes(self._journal.read(held))
+            known: StoredDecision | None = held
             label, place = self._labels.get(decision_id, (None, 0))
             label = label if told or place <= self._synced else None
         if known is None and not self._is_new(decision_id):
@@ -403,7 +399,7 @@ class Outbox:
 
     def ask(self, work: Callable[[], T]) -> T:
         """Call the store with the time limit; StoreError where it is away."""
-        return self.result(self._put(work))
+        return self.result(self.begin(work))
 
     def result(self, future: Future[T]) -> T:
         """What a call to the store returned. StoreError where it takes too long: it is given up, unless it commits."""
@@ -413,7 +409,8 @@ class Outbox:
             raise StoreError(f"no answer from the store within {self.limit:g} s.")
         return future.result()
 
-    def _put(self, work: Callable[[], T]) -> Future[T]:
+    def begin(self, work: Callable[[], T]) -> Future[T]:
+        """Begin to call the store; `result` ends it."""
         future: Future[T] = Future()
         if self._journal is None:
             future.set_result(work())

@@ -18,9 +18,8 @@ from hypothesis.extra import numpy as hnp
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
 from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision
-from dengine.store.journal import labelled
 from tests.support.plans import plans
-from tests.support.stores import decision, execute, label, put_decision, put_label, put_labels, report, trace
+from tests.support.stores import decision, execute, label, labelled, put_decision, put_label, put_labels, report, trace
 
 
 def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:

@@ -41,6 +41,12 @@ def put_decision(
     store.take([StoredDecision(decision, values, content_hash, quarantined, store.clock())])
 
 
+def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLabel]:
+    """A decision that was labelled when it was made."""
+    said = label(item.decision.id, bool(success))
+    return [item, replace(said, time=item.time, content_hash=item.content_hash, decided=item.time)]
+
+
 def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     """Labels of decisions that are there; returns their numbers, in the order given."""
     now, taken = store.clock() if labels else 0.0, []

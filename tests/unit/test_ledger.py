@@ -20,12 +20,11 @@ from dengine.errors import StoreError
 from dengine.export import make_key
 from dengine.records import Action, Decision, Reason, Source
 from dengine.store import Change, NewLabel, SqlStore, StoredDecision, verify_history
-from dengine.store.journal import labelled
 from dengine.store.ledger import KEY_VARIABLE, START, entry_digest, row_sum, rows_digest
 from dengine.store.schema import CHAINED
 from tests.support.command_line import dengine
 from tests.support.exports import trained
-from tests.support.stores import decision, execute, put_decision, put_label, put_labels, report
+from tests.support.stores import decision, execute, labelled, put_decision, put_label, put_labels, report
 
 TABLES = ("decision", "trace", "label", "model_version", "event", "correction", "ledger", "setting")
 T = 200
