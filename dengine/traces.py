@@ -164,14 +164,15 @@ def _as_agreed(x: NDArray[np.float32], spec: TraceSpec) -> NDArray[np.float32]:
 class TraceGate(nn.Module):
     """A trace's faults and its content hash, scripted: one implementation for the engine and the exported file."""
 
+    quantum: Tensor
     weights: Tensor
 
     def __init__(self, spec: TraceSpec) -> None:
         super().__init__()
         self.limit = float("inf") if spec.limit is None else float(spec.limit)
         self.clamp = float(CLAMP)
-        self.quantum = float(QUANTUM)
         self.not_finite, self.constant, self.saturated = NOT_FINITE, CONSTANT, SATURATED
+        self.register_buffer("quantum", torch.tensor(QUANTUM))  # a plain number becomes one at each product
         self.register_buffer("weights", torch.from_numpy(hash_weights(spec.channels * spec.samples)))
 
     def forward(self, x: Tensor) -> tuple[int, int]:
@@ -193,7 +194,7 @@ class TraceGate(nn.Module):
             reason = self.saturated
         if not max(high, -low) <= self.clamp:  # a NaN among them tells nothing of the others
             x = x.clamp(-self.clamp, self.clamp)
-        steps = (x.flatten() * self.quantum).floor_().to(torch.int64)  # exact in float32: the quantum is a power of two
+        steps = (x.view(-1) * self.quantum).floor_().to(torch.int64)  # exact in float32: the quantum is a power of two
         return reason, int(torch.dot(steps, self.weights).item())
 
 

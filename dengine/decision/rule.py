@@ -402,7 +402,7 @@ class RadiusNeighbours(nn.Module):
         distances = self.ring.squared_distances(z, part)
         n_success, n_failure = self.ring.count_near(distances, self.radius, self.fraction)
         if self.scored:
-            score = float(z[:, 0].mean().item())
+            score = float(z.select(1, 0).mean().item())
             return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
         if action == 0 and self.reject_fraction > 0.0:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..decision.rule import script
 from ..errors import TraceConflictError, TraceError, shortened
-from ..folds import audited, own_hash, part_hash
-from ..model.base import NOTHING_KNOWN, EngineModel, Prediction
+from ..folds import audited, part_hash
+from ..model.base import EngineModel, Prediction
 from ..records import LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
 from ..store.records import StoredDecision
 from ..traces import TraceGate, as_agreed, first_contract
@@ -62,14 +62,19 @@ class DecisionMaker:
 
         unasked : why the part is verified whatever the model says; None: it is asked, where there is one.
         """
-        looked = None if model is None or unasked is not None else _look(x, part, model, self._limit)
-        fault, content, said = looked or (*self._gate(torch.from_numpy(x)), None)
-        hash_ = own_hash(content, part)
-        reason = REASONS[fault] if fault else unasked
-        if reason is not None:
-            said = replace(NOTHING_KNOWN, reason=reason)
-        elif said is None:
-            said = _predict(x, hash_, model)
+        number, said = None if part is None else part_hash(part), None
+        if model is not None and unasked is None:
+            try:
+                fault, content, said = model.look(x, number, self._gate, self._limit)
+                if said is not None and not 0.0 <= said.lower <= said.upper <= 1.0:  # a NaN is refused too
+                    raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {said.lower} and {said.upper}.")
+            except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
+                log.exception("the model failed on a trace; the part is verified")
+                said, unasked = None, Reason.MODEL_ERROR
+        if said is None:
+            fault, content = self._gate(torch.from_numpy(x))
+            reason = REASONS[fault] if fault else unasked or Reason.NO_MODEL
+            said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, reason)
         certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
         audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
         decision = Decision(
@@ -87,6 +92,7 @@ class DecisionMaker:
             propensity=rate if certain else 1.0,
             part=part,
         )
+        hash_ = content if number is None else number
         return StoredDecision(decision, x.copy(), hash_, fault != 0, self._clock())  # the caller may change his own
 
     def lost_accept(self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str) -> StoredDecision:
@@ -95,34 +101,6 @@ class DecisionMaker:
         rate = self._settings.audited_share
         made = replace(item.decision, action=accept, predicted=accept, reason=Reason.CERTAIN, propensity=rate)
         return replace(item, decision=made)
-
-
-def _look(x: NDArray[np.float32], part: str | None, model: EngineModel, limit: float) -> tuple[int, int, Prediction] | None:
-    try:
-        looked = model.look(x, None if part is None else part_hash(part), limit)
-        return looked and (*looked[:2], _checked(looked[2]))
-    except Exception:  # `_predict` says why
-        return None
-
-
-def _predict(x: NDArray[np.float32], hash_: int, model: EngineModel | None) -> Prediction:
-    if model is None:
-        return NOTHING_KNOWN
-    try:
-        return _checked(model.predict_one(x, hash_))
-    except Exception:  # no exception inside a model reaches the cell: it becomes VERIFY, recorded
-        log.exception("the model failed on a trace; the part is verified")
-        return replace(NOTHING_KNOWN, reason=Reason.MODEL_ERROR)
-
-
-def _checked(prediction: Prediction) -> Prediction:
-    """A prediction as every store can keep it; ValueError for counts or bounds that are none."""
-    for n in (prediction.n_success, prediction.n_failure):
-        if not isinstance(n, int) or not 0 <= n < 2**63:
-            raise ValueError(f"Expected counts as whole numbers from 0 to below 2**63, got {shortened(n)}.")
-    if not 0.0 <= prediction.lower <= prediction.upper <= 1.0:  # a NaN is refused too
-        raise ValueError(f"Expected bounds 0 <= lower <= upper <= 1, got {prediction.lower} and {prediction.upper}.")
-    return prediction
 
 
 def decided_before(known: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:

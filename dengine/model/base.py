@@ -10,9 +10,10 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ..decision.policy import Policy
@@ -27,8 +28,7 @@ Embedding = tuple[tuple[float, ...], ...]  # (K, d)
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(NamedTuple):
     """What a model says of one trace; fields as in `Decision`."""
 
     action: Action
@@ -40,7 +40,8 @@ class Prediction:
     reason: Reason
 
 
-NOTHING_KNOWN = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, Reason.NO_MODEL)
+Gate = Callable[[Any], tuple[int, int]]  # a trace (C, T) -> fault, content hash
+Looked = tuple[int, int, Prediction | None]  # fault, content hash, what a model says of a trace without a fault
 
 
 @runtime_checkable
@@ -101,12 +102,13 @@ class EngineModel(ABC):
     def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
 
-    def look(self, x: NDArray[np.float32], part: int | None, limit: float) -> tuple[int, int, Prediction] | None:
-        """`TraceGate` and `predict_one` in one call: fault, content hash, prediction. None: it takes one after the other.
+    def look(self, x: NDArray[np.float32], part: int | None, gate: Gate, limit: float) -> Looked:
+        """Fault and content hash of one trace (C, T), and what it says of it where there is no fault.
 
-        part : the hash of its part's number; None: it goes by its content.  limit : of the sensor's range.
+        part : the hash of its part's number; None: it goes by its content.  gate : `TraceGate` by the sensor's `limit`.
         """
-        return None
+        fault, content = gate(torch.from_numpy(x))
+        return fault, content, None if fault else self.predict_one(x, content if part is None else part)
 
     @abstractmethod
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
@@ -255,8 +257,8 @@ class RivalAdapter(EngineModel):
         action = Action(self.model.decide(X)[0])
         reason = Reason.UNCERTAIN if action is Action.VERIFY else Reason.CERTAIN
         counts = int(n_success), int(n_failure)
-        if counts != (n_success, n_failure):
-            raise ValueError(f"Expected whole numbers of labels, got {shortened((n_success, n_failure))}.")
+        if counts != (n_success, n_failure) or not all(0 <= n < 2**63 for n in counts):
+            raise ValueError(f"Expected whole numbers of labels below 2**63, got {shortened((n_success, n_failure))}.")
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
     def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:

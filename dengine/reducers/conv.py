@@ -77,7 +77,8 @@ class ConvEncoder(Features):
     def averaged(self, x: Tensor) -> Tensor:
         """(B, C, T) raw -> (B, C, L), one scale a channel."""
         if self.average > 1:
-            x = nn.functional.avg_pool2d(x[..., self.head :], [1, self.average])  # half the time of a mean over an axis
+            x = x[..., self.head :] if self.head > 0 else x
+            x = nn.functional.avg_pool2d(x, [1, self.average])  # half the time of a mean over an axis
         return torch.addcmul(self.shift, x, self.scale)
 
     def windows_of_one(self, a: Tensor) -> Tensor:
