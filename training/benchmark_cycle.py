@@ -33,6 +33,9 @@ def measure(data: Dataset, recipe: Recipe, replays: int, repeats: int, umap_repe
     played = [replay(data, DataEngine(recipe=recipe, seed=seed), seed) for seed in range(replays)]
     whole = [LATE not in each.reason for one in played for each in one.retrains]
     print(f"All steps were taken in {sum(whole)} of {len(whole)} retrains of the replays.")
+    unhurried = [replay(data, recipe, seed) for seed in range(replays)]
+    certain = [sum(int((~each.verified).sum()) for each in some) for some in (played, unhurried)]
+    print(f"{certain[0]} decisions were certain; without a clock {certain[1]}.")
     engine = filled_engine(data, recipe)
     found = {
         f"retrain, all of {replays} replays": [each.seconds for one in played for each in one.retrains],

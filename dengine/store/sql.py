@@ -94,7 +94,7 @@ if TYPE_CHECKING:
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
-MOST_TRAINED = 100  # versions that wait in memory: about a megabyte each
+MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
 NAMED = 20  # decisions that an event names
 REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
