@@ -29,6 +29,7 @@ from .records import Reason as Reason
 from .records import RetrainReport as RetrainReport
 from .records import Source as Source
 from .records import TraceSpec as TraceSpec
+from .records import Window as Window
 from .reducers import REDUCERS as REDUCERS
 from .reducers import make_reducer as make_reducer
 from .reducers.base import CrossFitted as CrossFitted

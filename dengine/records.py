@@ -67,6 +67,7 @@ class Reason(StrEnum):
     SAFE_MODE = "safe_mode"  # everything is verified: what was accepted failed too often, or too much is novel
     NO_STORE = "no_store"  # the journal takes nothing, or whether the id is new cannot be looked up
     LATE = "late"  # the answer would have come too late: whoever asked verifies already
+    OUTSIDE = "outside"  # it leaves one of the operator's windows, whatever the model says
 
 
 ACTIONS, REASONS = tuple(Action), tuple(Reason)  # by position: the integers of exported files
@@ -130,6 +131,50 @@ class TraceSpec:
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
         different = not self.columns or len(set(self.columns)) == self.channels
         expect(different, f"{self.channels} different columns, one a channel", self.columns)
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """An operator's limits within a stretch of time, or of path; as text START:END:LOW:HIGH, where a limit may be empty,
+    and more of its fields, :channel=1:along=2:reject. SettingError for values that hold nothing.
+
+    start, end : in seconds from the first sample, both included; with `along` in that channel's unit.
+    low, high : that the samples there must keep, in their unit, both included; one may be infinite.
+    channel : theirs, from 0.  along : the channel that says where the tool is; None: time.
+    reject : what leaves it, or has no sample in the stretch, is rejected; else verified.
+    """
+
+    start: float
+    end: float
+    low: float = -math.inf
+    high: float = math.inf
+    channel: int = 0
+    along: int | None = None
+    reject: bool = False
+
+    def __post_init__(self) -> None:
+        numbers = all(map(is_number, (self.start, self.end, self.low, self.high)))
+        held = numbers and -math.inf < self.start <= self.end < math.inf and self.low <= self.high
+        held = held and (self.low, self.high) != (-math.inf, math.inf) and isinstance(self.reject, bool)
+        held = held and all(is_whole(each, 0, MOST) for each in (self.channel, self.along or 0))
+        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on", self)
+
+    def __str__(self) -> str:
+        said = [f"{repr(float(each)).removesuffix('.0')}" for each in (self.start, self.end, self.low, self.high)]
+        said += [f"channel={self.channel}"] * (self.channel > 0) + [f"along={self.along}"] * (self.along is not None)
+        return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
+
+    @classmethod
+    def parse(cls, text: str) -> Window:
+        """The window of a text; SettingError for one that is none."""
+        words = [word.partition("=") for word in text.split(":")]
+        try:
+            start, end, low, high = (word for word, _, _ in words[:4])
+            more: dict[str, Any] = {name: name == "reject" or int(value) for name, _, value in words[4:]}
+            return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
+        except (TypeError, ValueError) as error:
+            wanted = "a window START:END:LOW:HIGH, as 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
+            raise SettingError(f"Expected {wanted}, got {shortened(text)}: {error}") from error
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:

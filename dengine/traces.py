@@ -4,6 +4,7 @@ A wrong shape is a caller's bug and raises. A NaN, a dead or saturated sensor is
 """
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from .errors import TraceError, listed
+from .errors import TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
-from .records import FITS, REASONS, Reason, TraceSpec
+from .records import FITS, REASONS, Reason, TraceSpec, Window
 
 TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit)([ _\-.(\[].*)?", re.IGNORECASE)  # names of no channel
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
@@ -196,6 +197,39 @@ class TraceGate(nn.Module):
             x = x.clamp(-self.clamp, self.clamp)
         steps = (x.view(-1) * self.quantum).floor_().to(torch.int64)  # exact in float32: the quantum is a power of two
         return reason, int(torch.dot(steps, self.weights).item())
+
+
+class WindowGate(nn.Module):
+    """An operator's windows, scripted, for the engine and the exported file; SettingError where traces cannot hold them."""
+
+    limits: Tensor
+    channels: Tensor
+    action: Tensor
+    time: Tensor
+
+    def __init__(self, windows: Sequence[Window], spec: TraceSpec) -> None:
+        super().__init__()
+        for each in windows:
+            there = each.along is not None or (each.end >= 0.0 and each.start <= (spec.samples - 1) / spec.rate_hz)
+            there = there and max(each.channel, each.along or 0) < spec.channels
+            expect(there, f"a window within {spec.channels} x {spec.samples} samples at {spec.rate_hz:g} Hz", str(each))
+        self.watches = len(windows) > 0
+        rows = [(each.start, each.end, each.low, each.high) for each in windows]
+        pairs = [(each.channel, spec.channels if each.along is None else each.along) for each in windows]
+        self.register_buffer("limits", torch.tensor(rows, dtype=torch.float32).reshape(-1, 4, 1))
+        self.register_buffer("channels", torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2))
+        self.register_buffer("action", torch.tensor([1 + each.reject for each in windows], dtype=torch.int64))
+        self.register_buffer("time", torch.tensor([[i / spec.rate_hz for i in range(spec.samples)]]))  # a channel more
+
+    def forward(self, x: Tensor) -> int:
+        """(C, T) float32 -> 0 within every window, 1 outside of one, 2 outside of one that rejects."""
+        if not self.watches:
+            return 0
+        start, end, low, high = self.limits.unbind(1)  # (W, 1)
+        values, where = torch.cat([x, self.time])[self.channels].unbind(1)  # (W, T)
+        there = (where >= start) & (where <= end)
+        kept = there.any(1) & ~(there & ((values < low) | (values > high))).any(1)
+        return int(torch.where(kept, 0, self.action).max().item())
 
 
 LEAST = 10  # samples of a trace that sets a contract: 20 ms at 500 Hz, and a picture of nothing

@@ -197,13 +197,19 @@ _GUARANTEE = (
 _STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
 _AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
 _NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
+_WINDOWS = (
+    "Verify what leaves limits between two times, in s; LOW or HIGH may be empty; :reject rejects. Several; '' for none."
+)
+_WINDOW = "START:END:LOW:HIGH[:reject][:channel=1][:along=2]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
+_windows: Callable[..., Any] = lambda context, option, said: tuple(filter(None, said)) if said else None  # noqa: E731
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
     "guarantee": click.option("--guarantee", type=Known("guarantee", RULE), help=_GUARANTEE),
     "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
+    "windows": click.option("--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS),
 }
 SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}
 _REDUCER = "Every setting: by a reducer's name, from a TOML file, or with a reducer of your own.  [default: conv]"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 from numpy.typing import ArrayLike
 
 from ..errors import SettingError, expect
-from ..records import ACTIONS, Action, find_class, is_number, is_whole
+from ..records import ACTIONS, Action, Window, find_class, is_number, is_whole
 from .certificate import Certificate, Outcomes, certify
 from .intervals import INTERVALS, Bounds, level_of, normal_quantile
 
@@ -40,6 +40,8 @@ class Policy:
     label_within : decisions within which a verification or an audit is reported, at least 1; what is owed for longer counts
         as a wrong decision, in the certificate and in the evidence of a rule, until it is reported. Decisions, and not
         seconds: a cell that stands still owes nothing by that, and a replay repeats.
+    windows : an operator's limits beside the model, each a `Window`, or its text. What leaves one is verified, or rejected,
+        whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
     Raises SettingError for a value out of its range.
     """
 
@@ -51,6 +53,7 @@ class Policy:
     stops: Stops = "some"
     shadow: bool = False
     label_within: int = 1000
+    windows: tuple[Window, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
@@ -66,6 +69,9 @@ class Policy:
         expect(self.stops in get_args(Stops), f"stops {' or '.join(get_args(Stops))}", self.stops)
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
         expect(is_whole(self.label_within, 1, 10**9), "label_within of at least one decision", self.label_within)
+        windows = tuple(Window.parse(each) if isinstance(each, str) else each for each in self.windows)
+        expect(all(isinstance(each, Window) for each in windows), "windows to be of Window", self.windows)
+        object.__setattr__(self, "windows", windows)
         if self.guarantee == "pooled" and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(
                 "Expected audits, or stops='all', beside the pooled guarantee, which can claim nothing of parts that "
@@ -76,6 +82,11 @@ class Policy:
     def audited_share(self) -> float:
         """Share of certain decisions that are verified all the same: all of them in the shadow mode."""
         return 1.0 if self.shadow else self.audit_rate
+
+    @property
+    def limits(self) -> tuple[Window, ...]:
+        """The windows as they act: in the shadow mode none rejects."""
+        return tuple(replace(each, reject=each.reject and not self.shadow) for each in self.windows)
 
     @property
     def known_share(self) -> float:

@@ -124,16 +124,18 @@ class Corrections:
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
         now, versions = self._settings.now, self._versions
-        was = asdict(now.recipe.policy)
-        new = {name: value for name, value in asdict(policy).items() if value != was[name]}
+        was, wished = (
+            asdict(each) | {"windows": " ".join(map(str, each.windows)) or "none"} for each in (now.recipe.policy, policy)
+        )
+        new = {name: value for name, value in wished.items() if value != was[name]}
         if not new:
             return self._unchanged("policy", "The policy is in force already")
         own = now.model is not None  # a model that was handed in keeps its rule
-        idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within"}) if own else []
+        idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"}) if own else []
         if idle:
             raise SettingError(
                 f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
-                "change only audit_rate and stops."
+                "change only audit_rate, stops and windows."
             )
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
@@ -145,7 +147,7 @@ class Corrections:
         kind, text = "policy", "the policy's " + ", ".join(f"{name} {was[name]} -> {value}" for name, value in new.items())
         if list(new) == ["shadow"]:
             kind, text = "shadow", SHADOW[policy.shadow]
-        event = Change(kind, text, {"old": was, "new": asdict(policy)}, author, settings=settings.to_store())
+        event = Change(kind, text, {"old": was, "new": wished}, author, settings=settings.to_store())
         versions.set_policy(policy if anew else None, evidence, event)
         self._settings.change(settings)
         self._feedback.begin_policy()

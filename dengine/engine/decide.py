@@ -63,6 +63,7 @@ class DecisionMaker:
         unasked : why the part is verified whatever the model says; None: it is asked, where there is one.
         """
         number, said = None if part is None else part_hash(part), None
+        windows = self._settings.outside if unasked is None else None
         if model is not None and unasked is None:
             try:
                 fault, content, said = model.look(x, number, self._gate, self._limit)
@@ -75,11 +76,14 @@ class DecisionMaker:
             fault, content = self._gate(torch.from_numpy(x))
             reason = REASONS[fault] if fault else unasked or Reason.NO_MODEL
             said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, None, reason)
+        outside = 0 if fault or windows is None else windows(torch.from_numpy(x))
+        if outside:  # its place is kept, and nothing else of what the model says of it
+            said = Prediction(Action.VERIFY, 0.0, 1.0, 0, 0, said.embedding, Reason.OUTSIDE)
         certain, rate = said.action is not Action.VERIFY, self._settings.audited_share
         audit = certain and rate > 0.0 and bool(audited(np.array([content]), rate, self._settings.now.seed)[0])
         decision = Decision(
             id=decision_id or f"{self._run}-{next(self._count)}",
-            action=Action.VERIFY if audit else said.action,
+            action=Action.REJECT if outside == 2 else Action.VERIFY if audit else said.action,
             predicted=said.action,
             lower=said.lower,
             upper=said.upper,

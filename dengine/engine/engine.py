@@ -370,8 +370,9 @@ class DataEngine:
                     trace = self._outbox.ask(lambda: peers_trace(self.store)) or trace
             except StoreError:  # the cell's own first trace stands
                 log.exception("the product's contract of traces cannot be had")
+            settings = replace(self._settings.now, trace=trace, inferred=inferred)
             self._maker.agree_on(trace)
-            self._settings.change(replace(self._settings.now, trace=trace, inferred=inferred))
+            self._settings.change(settings)
             self._settings.save()
         return self.trace or trace
 
@@ -589,6 +590,7 @@ class DataEngine:
             raise ExportError(f"Expected a store as it was written, to export from: {self._outbox.doubt}")
         own, policy = self._versions.newest.exported(trace or self.trace), self.policy
         coin: dict[str, Any] = {"audit_rate": policy.audited_share, "seed": self.seed, "stops_all": policy.stops == "all"}
+        coin["windows"] = policy.limits
         about: dict[str, Any] = {"model_version": self.version, "recipe": self.recipe.to_toml()}
         return replace(own, note=self._outbox.event, **about, **coin)
 

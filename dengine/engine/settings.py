@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
 from ..decision.policy import Policy
+from ..decision.rule import script
 from ..errors import ImportRefusedError, SettingError, StoreError, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT, Recipe, described
 from ..records import TraceSpec, is_whole, trace_in
 from ..store.outbox import Outbox
+from ..traces import WindowGate
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -24,7 +26,7 @@ log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
-LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops")
+LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 
@@ -62,6 +64,8 @@ class EngineSettings:
             raise SettingError(f"Expected a seed of 0 or more, an integer of at most {SEEDS}, got {shortened(self.seed)}.")
         if not (self.trace is None or isinstance(self.trace, TraceSpec)):
             raise SettingError(f"Expected a TraceSpec as trace, got {self.trace!r}; TraceSpec(samples=1000) for one.")
+        if self.trace is not None:
+            WindowGate(self.recipe.policy.windows, self.trace)  # refused before it is in force
 
     def to_store(self) -> dict[str, str]:
         """As `SqlStore.save_settings` takes them."""
@@ -146,6 +150,8 @@ class EngineSettings:
             wished = {name: value for name, value in wished.items() if name not in ("reducer", "params")}
         # A program's settings are the same in the shadow mode, which a person begins and ends.
         counts = LOOP if self.model is not None else [name for name in have if name != "shadow"]
+        if not wished.get("windows"):  # these are an operator's, too
+            wished.pop("windows", None)
         other = sorted(name for name in wished if name in counts and wished[name] != have[name])
         if other:
             stored, got = (", ".join(f"{name} {values[name]}" for name in other) for values in (have, wished))
@@ -205,11 +211,12 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
     idle = [name for name in ("radius", "folds") if beside.get(name) is not None]
     idle += [] if reducer is None else ["reducer"]
     policy = beside.get("policy")
-    idle += [] if policy is None or replace(policy, audit_rate=0.0, stops="some", shadow=False) == Policy() else ["policy"]
+    counting = {"audit_rate": 0.0, "stops": "some", "shadow": False, "windows": ()}
+    idle += [] if policy is None or replace(policy, **counting) == Policy() else ["policy"]
     if idle:
         raise SettingError(
             f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have no effect; "
-            "set it on the model, or leave it out (of a policy audit_rate and stops alone count)."
+            "set it on the model, or leave it out (of a policy audit_rate, stops and windows alone count)."
         )
 
 
@@ -224,6 +231,7 @@ class SettingsInForce:
     """The settings in force, and the store's copy of them.
 
     now : they themselves.  audited_share : of certain decisions that are verified all the same.
+    outside : what the policy's windows say of a trace, as `WindowGate`; None where there are none.
     waiting : whether the store lacks them, and `save` is to be called again.
     """
 
@@ -234,7 +242,9 @@ class SettingsInForce:
 
     def change(self, settings: EngineSettings) -> None:
         """Go on under others."""
-        self.now, self.audited_share = settings, settings.recipe.policy.audited_share
+        policy, trace = settings.recipe.policy, settings.trace
+        self.now, self.audited_share = settings, policy.audited_share
+        self.outside = script(WindowGate(policy.limits, trace)).forward if policy.windows and trace is not None else None
 
     def save(self) -> None:
         """Store them; where the store is away, they wait."""

@@ -99,7 +99,8 @@ def prepared(
     if model.spaces.module() is None:
         raise ExportError(f"{model.name} cannot be scripted: it has no module; use conv, pca or rocket instead.")
     size = model.n_spaces, model.index.dim
-    decision = DecisionModule(source.trace, model.predictor, *size, source.audit_rate, source.seed, source.stops_all)
+    coin = source.audit_rate, source.seed
+    decision = DecisionModule(source.trace, model.predictor, *size, *coin, source.stops_all, source.windows)
     return source, decision
 
 

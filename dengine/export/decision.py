@@ -8,13 +8,13 @@ from torch import Tensor, nn
 
 from ..folds import COIN_BITS, MIX, audit_salt
 from ..model.neighbours import NOVEL, Predictor
-from ..records import FITS, REASONS, Reason, TraceSpec
-from ..traces import TraceGate, fitted
+from ..records import FITS, REASONS, Reason, TraceSpec, Window
+from ..traces import TraceGate, WindowGate, fitted
 
 One = tuple[int, int, float, float, int, int, Tensor]
 FIELDS = ("action", "reason", "lower", "upper", "n_success", "n_failure", "embedding")
 METHODS = ("decide", "learn", "stop", "settle", "safe_mode", "restore", "predicted", "drop", "n_references")
-AUDIT = REASONS.index(Reason.AUDIT)
+AUDIT, OUTSIDE = REASONS.index(Reason.AUDIT), REASONS.index(Reason.OUTSIDE)
 NOBODY = -1  # waits for a label
 
 
@@ -33,16 +33,16 @@ class DecisionModule(nn.Module):
 
     def __init__(
         self, spec: TraceSpec, predictor: Predictor, n_spaces: int, dim: int,
-        audit_rate: float, seed: int, stops_all: bool = False,
+        audit_rate: float, seed: int, stops_all: bool = False, windows: tuple[Window, ...] = (),
     ) -> None:  # fmt: skip
         super().__init__()
-        self.predictor, self.limit = predictor, TraceGate(spec).limit
+        self.predictor, self.limit, self.windows = predictor, TraceGate(spec).limit, WindowGate(windows, spec)
         self.channels, self.samples, self.fit = spec.channels, spec.samples, FITS.index(spec.fit)
         self.n_spaces, self.dim = n_spaces, dim
         self.audit_below, self.salt, self.audit_rate = int(audit_rate * 2**COIN_BITS), audit_salt(seed), float(audit_rate)
         self.mix, self.shift, self.mask = MIX, 63 - COIN_BITS, 2**COIN_BITS - 1
         self.stops_all = stops_all
-        self.audit_reason, self.novel_reason, self.nobody = AUDIT, NOVEL, NOBODY
+        self.audit_reason, self.novel_reason, self.outside_reason, self.nobody = AUDIT, NOVEL, OUTSIDE, NOBODY
         # Plain attributes: a scripted float that is assigned to an element of a tensor goes through float32.
         self.waits, self.alone, self.own, self.content, self.silent = NOBODY, 0, 0, 0, 0
         self.novel, self.lower, self.upper = False, 0.0, 1.0
@@ -66,6 +66,9 @@ class DecisionModule(nn.Module):
         """(C, T) and what the gate says -> the decision, which changes nothing; what the model alone would have done."""
         if fault != 0:
             return (0, fault, 0.0, 1.0, 0, 0, torch.full((self.n_spaces, self.dim), float("nan"))), 0
+        outside = self.windows(x)
+        if outside != 0:
+            return (2 * (outside - 1), self.outside_reason, 0.0, 1.0, 0, 0, self.predictor.embed(x)), 0
         alone, reason, lower, upper, n_success, n_failure, z = self.predictor(x, part if part != 0 else content)
         action = alone
         if alone != 0 and self.audit_below > 0 and self.toss(content ^ self.salt) < self.audit_below:
@@ -127,7 +130,9 @@ class DecisionModule(nn.Module):
         self.settle()
         fault, content = self.predictor.gate.check(x, self.limit)
         waits = action if fault == 0 else self.nobody
-        alone = action if reason != self.audit_reason else self.predictor.neighbours.rule.action(lower, upper)
+        alone = 0 if reason == self.outside_reason else action
+        if reason == self.audit_reason:
+            alone = self.predictor.neighbours.rule.action(lower, upper)
         self.wait(waits, alone, part, content, reason, lower, upper, self.predictor.embed(x))
 
     @torch.jit.export
@@ -153,9 +158,9 @@ class DecisionModule(nn.Module):
 
     def looked(self, action: int, alone: int) -> float:
         """`Decision.looked`."""
-        if alone == 0:
-            return 1.0
-        return self.audit_rate if action == 0 else 0.0
+        if action != 0:
+            return 0.0
+        return 1.0 if alone == 0 else self.audit_rate
 
     def count(
         self, lower: float, upper: float, novel: bool, z: Tensor, own: int, success: bool, alone: int, looked: float

@@ -31,6 +31,7 @@ from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
 from ..store.views import PastLabel
+from ..traces import WindowGate
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
@@ -369,6 +370,12 @@ def _not_finite(made: Decision, trace: NDArray[np.float32], found: Circumstances
     return f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded too far is."
 
 
+def _outside(made: Decision, trace: NDArray[np.float32], found: Circumstances) -> str:
+    x, windows = torch.from_numpy(trace), found.recipe.policy.windows
+    left = [str(each) for each in windows if WindowGate([each], found.spec)(x)]
+    return f": it leaves an operator's window, {' and '.join(left) or 'which is set no more'}, whatever the model says."
+
+
 WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
@@ -389,6 +396,7 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
         ": the cell's disk did not take it then, or could not say whether its id was new, so the model was not asked."
     ),
     Reason.LATE: lambda *_: ": whoever asked could wait no longer, and verified, so the model was not asked.",
+    Reason.OUTSIDE: _outside,
 }
 
 
@@ -600,7 +608,7 @@ def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None, found
     else:
         recorded, again = (made.n_success, made.n_failure), (around.n_success, around.n_failure)
         yield f"Neighbours: the references of version {made.model_version}, which answered, as they stood then."
-        if made.reason is not Reason.NOVEL and again != recorded:
+        if made.reason not in (Reason.NOVEL, Reason.OUTSIDE) and again != recorded:
             yield (
                 f"Counted again, the ball holds {again[0]} successes and {again[1]} failures; recorded were {recorded[0]} "
                 f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."

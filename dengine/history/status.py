@@ -58,6 +58,7 @@ class Span:
     """Consecutive decisions, and what happened meanwhile.
 
     first, last : times of the oldest and the newest; None where there is none.
+    outside : left an operator's window, and were verified or rejected without the model.
     verified : decided so, of which audits, novel, safe_mode, errors and quarantined were for these reasons.
     accepted, rejected : went on without a check.  stops : of the accepted, those known to be bad.
     bad_accepts : parts that it let pass or would have, by the policy's alpha.
@@ -72,6 +73,7 @@ class Span:
     verified: int
     audits: int
     novel: int
+    outside: int
     safe_mode: int
     errors: int
     quarantined: int
@@ -213,11 +215,12 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         verified=verified,
         audits=reasons[Reason.AUDIT],
         novel=reasons[Reason.NOVEL],
+        outside=reasons[Reason.OUTSIDE],
         safe_mode=reasons[Reason.SAFE_MODE],
         errors=reasons[Reason.MODEL_ERROR],
         quarantined=tally.by("quarantined")[True],
         accepted=outcomes.accepted,
-        rejected=outcomes.rejected,
+        rejected=tally.by("action")[Action.REJECT],
         stops=outcomes.stops,
         would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
         would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
@@ -282,11 +285,11 @@ STRETCHES = 120  # of a picture
 FEWEST = 20  # decisions of a stretch: a share of fewer jumps
 
 
-def course(store: SqlStore, recipe: Recipe, last: int) -> Course:
-    """Read what a picture is drawn from."""
+def course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
+    """Read what a picture is drawn from; by : as of `SqlStore.stretches`, of which the newest are drawn."""
     modes = [event for event in store.events() if event.kind in MODES]
-    n = max(1, min(STRETCHES, store.tally().count() // FEWEST))
-    return Course(store.stretches(n), store.versions(own=True), modes, 1.0 - recipe.policy.lower_bound, last)
+    stretches = store.stretches(max(1, min(STRETCHES, store.tally().count() // FEWEST)), **by)[-STRETCHES:]
+    return Course(stretches, store.versions(own=True), modes, 1.0 - recipe.policy.lower_bound, last)
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..decision.policy import Policy
 from ..errors import ExportError, SettingError, shortened
 from ..recipe import Recipe
-from ..records import Action, Reason, TraceSpec
+from ..records import Action, Reason, TraceSpec, Window
 from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 
 log = logging.getLogger("dengine")
@@ -276,7 +276,7 @@ class Exportable:
     """What an exporter starts from.
 
     model : fitted.  trace : the contract of its traces.  audit_rate, seed : of the audits' coin.
-    stops_all : whether silence until the next decision confirms an accepted part.
+    windows : an operator's, as they act.  stops_all : whether silence until the next decision confirms an accepted part.
     model_version, recipe : what the file says of the engine; 0 and "" without one.
     note : takes what is to be remembered of the export, a kind and a text, as `SqlStore.put_event`; None: nobody remembers.
     """
@@ -286,6 +286,7 @@ class Exportable:
     audit_rate: float = 0.0
     seed: int = 0
     stops_all: bool = False
+    windows: tuple[Window, ...] = ()
     model_version: int = 0
     recipe: str = ""
     note: Callable[[str, str], object] | None = None

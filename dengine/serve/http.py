@@ -56,6 +56,7 @@ BADS, AMONG = 10, 200  # newest bad parts that an explanation is drawn with, of 
 STATIC = Path(__file__).parent / "page" / "static"
 VIEWS = ("/", "/overview", "/map", "/part", "/history", "/actions")  # one file: its script shows the one that is asked for
 Limit = Annotated[int, Meta(ge=1, le=200)]
+Hours = Annotated[float, Meta(ge=0.0, le=1e7)]
 Beside = Callable[[CellService], AbstractAsyncContextManager[object]]
 
 
@@ -73,7 +74,7 @@ class HttpApi:
         traces = one, {"trace": [[0.1, 1.5, 2.25], [0.0, 0.2, 0.1]]}
         reports = {"id": "order-7", "success": True}, {"part": "P-1007", "success": False, "author": "Kim"}
         # A guarantee may be a class by name, and nothing that is asked over the network may have one imported.
-        policy = fields_of(Policy, "guarantee")
+        policy = fields_of(Policy, "guarantee") | {"windows": list[str]}
         return [
             Operation("POST", "/decide", self.decide, "Answer", raw="trace", examples=traces),
             Operation("POST", "/report", self.report, "Told", examples=reports),
@@ -217,10 +218,15 @@ class HttpApi:
         """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones."""
         return await self.service.look(lambda store: _explained(store, id_))
 
-    async def course(self) -> Json:
-        """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile."""
-        recipe = self.service.engine.recipe
-        return answer("Course", await self.service.look(lambda store: course(store, recipe, AMONG)))
+    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[int, Meta(ge=0, le=200)] = 0) -> Json:
+        """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile.
+
+        hours : of a shift, which is a stretch then, the newest of them; start : when one begins, in hours since 1970.
+        batch : likewise what parts' numbers begin with, so many characters.
+        """
+        recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
+        by = by if hours or batch else {}
+        return answer("Course", await self.service.look(lambda store: course(store, recipe, AMONG, **by)))
 
     async def embedding(self) -> Json:
         """Where the known and the newest parts lie for the model that answers."""

@@ -225,10 +225,13 @@ def tally_query(cell_id: str, last: int | None, since_version: int, within: int 
     return sa.select(*kind, sa.func.count().label("n"), *times).select_from(some.outerjoin(LABEL, of)).group_by(*kind)
 
 
-def stretches_query(cell_id: str, length: int) -> sa.Select[Any]:
-    """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`."""
+def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: int = 0) -> sa.Select[Any]:
+    """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`.
+
+    batch : by so many first characters of the parts' numbers instead; seconds : or by so many of time, from `start` on.
+    """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
-    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
+    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
     of = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
     accepted = every.c.action == Action.ACCEPT.value
@@ -236,5 +239,6 @@ def stretches_query(cell_id: str, length: int) -> sa.Select[Any]:
     which = (verified, novel, accepted, accepted & (SAID == 0))
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
-    stretch = every.c.number - every.c.number % length
-    return query.group_by(stretch).order_by(stretch)
+    name = sa.func.substr(every.c.part, 1, batch) if batch else sa.null()
+    timed = sa.func.floor((every.c.time - start) / seconds) if seconds else every.c.number - every.c.number % length
+    return query.add_columns(name).group_by(name if batch else timed).order_by(sa.func.max(every.c.number))

@@ -588,11 +588,14 @@ class SqlStore:
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
         return Tally(kinds, min(first, default=None), max(newest, default=None), max(label, default=None))
 
-    def stretches(self, n: int) -> list[Stretch]:
-        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter."""
+    def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
+        """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter.
+
+        by : of time, or of batches, instead: as of `stretches_query`.
+        """
         every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
-        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n))))
-        return [Stretch(int(row[0]), float(row[1]), *(int(each) for each in row[2:])) for row in rows]
+        rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n)), **by))
+        return [Stretch(*row) for row in rows]
 
     def verify(self, expect: str | None = None) -> HistoryReport:
         """Check this cell's history against its ledger. See `verify_history`."""

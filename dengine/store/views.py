@@ -136,7 +136,7 @@ class Tally:
             confirmed=done[accept, "good"],
             audited_accepts=audited[accept, "bad"] + audited[accept, "good"],
             audited_accepts_bad=audited[accept, "bad"],
-            rejected=actions[reject],
+            rejected=actions[reject] - self.count(lambda kind: (kind.action, kind.reason) == (reject, Reason.OUTSIDE)),
             audited_rejects=audited[reject, "bad"] + audited[reject, "good"],
             audited_rejects_good=audited[reject, "good"],
             forgotten_accepts=done[accept, "forgotten"],
@@ -149,7 +149,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Consecutive decisions.  n : of them.  last : time of the newest.
+    """Consecutive decisions, or those of a batch.  n : of them.  last : time of the newest.  batch : its name.
 
     verified, novel : decided so.  accepted, bad : went on without a check, and of these are known to be bad.
     """
@@ -160,3 +160,4 @@ class Stretch:
     novel: int
     accepted: int
     bad: int
+    batch: str | None = None

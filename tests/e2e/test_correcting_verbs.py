@@ -96,9 +96,11 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, lower bound 0.8" in said("status", store)
+    assert "windows none -> 0.2:0.4:-5:60:reject. Event" in said("policy", store, "--window", "0.2:0.4:-5:60:reject")
+    assert document("policy", store, "--window", "")["policy"]["windows"] == []
     shown = said("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
-    assert "interval wilson -> jeffreys. Event 2, by" in said("policy", store, "--interval", "jeffreys")
+    assert "interval wilson -> jeffreys. Event 4, by" in said("policy", store, "--interval", "jeffreys")
     assert said("policy", store, "--shadow", "on", "--author", "kim").startswith("Shadow mode: every part is verified")
     assert document("status", store)["shadow"] is True
     assert "already" in said("policy", store, "--shadow", "on")

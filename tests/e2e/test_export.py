@@ -20,7 +20,7 @@ from dengine.errors import ExportError, OutputError, TraceError
 from dengine.export import read_metadata
 from dengine.folds import content_fold
 from dengine.records import Action, Reason
-from tests.support.exports import LIMIT, SAMPLES, bad_traces, fitted, recipe, row, trained, wild_traces
+from tests.support.exports import LIMIT, SAMPLES, WINDOWS, bad_traces, fitted, recipe, row, trained, wild_traces
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,9 @@ def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export_torchscript(audited, tmp_path_factory.mktemp("export") / "model.ts")
 
 
-@pytest.mark.parametrize("neighbourhood", [{}, {"fraction": 0.1}, {"fraction": 0.3, "reject_fraction": 0.08}])
+@pytest.mark.parametrize(
+    "neighbourhood", [{}, {"fraction": 0.1}, {"fraction": 0.3, "reject_fraction": 0.08, "windows": WINDOWS}]
+)
 def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp_path: Path, neighbourhood) -> None:
     with trained(make_data(400, SAMPLES), audit_rate=0.3, **neighbourhood) as engine:
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
@@ -52,6 +54,8 @@ def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp
         else:
             np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
     reasons = {d.reason for d in found}
+    outside = {d.action for d in found if d.reason is Reason.OUTSIDE}
+    assert outside == ({Action.VERIFY, Action.REJECT} if "windows" in neighbourhood else set())
     assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
     assert {d.action for d in found} == set(Action)
 
@@ -79,7 +83,7 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:
-    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, fraction=0.1, label_within=2000)
+    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, fraction=0.1, label_within=2000, windows=WINDOWS)
     engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
@@ -116,7 +120,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
         assert {"ring.points", "ring.parts", "ring.repeats", "ring.total"} <= kept.keys()
         assert type(model.rule) is DecisionRule or {"evidence.told", "evidence.watch", "evidence.open"} <= kept.keys()
     assert min(happened[kind] for kind in ("verify, heard", "verify, silent", "accept, heard", "accept, silent")) > 10
-    assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.SATURATED)) > 0
+    assert min(happened[reason] for reason in (Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.OUTSIDE)) > 0
     assert len(modes) > 1 or stops == "some"
     assert saved
 

@@ -223,6 +223,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
             ("correct", {"id": "wrong-0", "success": False}),
             ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
             ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
+            ("policy", {"windows": ["0.01:0.02:-5:"]}),
             ("policy", {"shadow": True}),
         ):
             changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
@@ -230,7 +231,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
             assert changed["event"] is not None
             assert client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
         events = client.get("/events").json()["events"]
-        assert [each["kind"] for each in events] == ["shadow", "policy", "forget", "correct"]
+        assert [each["kind"] for each in events] == ["shadow", "policy", "policy", "forget", "correct"]
         assert {each["author"] for each in events} == {"Kim Lee"}
         assert (service.engine.policy.alpha, service.engine.shadow) == (0.2, True)
         assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [False, None, None]
@@ -250,6 +251,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(st
         (422, "rollback", {"version": "../1", "author": "Kim"}),
         (422, "policy", {"alpha": 7, "author": "Kim"}),
         (422, "policy", {"guarantee": "os:system", "author": "Kim"}),  # nothing is imported since a request names it
+        (422, "policy", {"windows": ["0.1:0.2:high"], "author": "Kim"}),
         (422, "export", {"author": "Kim"}),  # there is no model yet
     ],
 )

@@ -140,6 +140,10 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     length = max(1, -(-N // n))
     expected = [counted(whole[start : start + length]) for start in range(0, N, length)]
     assert store.stretches(n) == expected
+    shifts = [[each for each in whole if each.time // (10.0 * n) == k] for k in range(N)]
+    assert store.stretches(seconds=10.0 * n) == [counted(each) for each in shifts if each]
+    batches = {(each.decision.part or "")[:2]: each for each in whole}
+    assert {each.batch or "" for each in store.stretches(batch=2)} == set(batches)
 
 
 def test_an_empty_store_has_no_past() -> None:

@@ -1,13 +1,18 @@
 """The user's two numbers: a bound becomes an action."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dengine import Action, Policy
-from dengine.errors import SettingError
+from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec, Window
+from dengine.errors import ReportConflictError, SettingError
+from dengine.traces import WindowGate
+from tests.support.exports import SAMPLES, trained
 
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
 
@@ -42,8 +47,50 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"interval": "wald"}, "wilson, binomial, clopper_pearson, jeffreys"),
         ({"audit_rate": 1.1}, "audit_rate"),
         ({"audit_rate": -0.1}, "audit_rate"),
+        ({"windows": ["0.1:0.2::"]}, "one of these finite"),
+        ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
+        ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, as .*canal"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         Policy(**settings)  # type: ignore[arg-type]
+
+
+HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of their negatives
+    "0.2:0.4:2:4": 0,  # its ends and its limits are within
+    "0.2:0.4::3.9": 1,
+    "0.2:0.4:2.1::reject": 2,
+    "0.31:0.39:0:": 1,  # no sample lies there
+    "-5:-3::5:along=1": 0,
+    "-5:-3::4.9:along=1:reject": 2,
+    "-7:-6:-6.5::channel=1:along=0": 1,
+}
+
+
+@pytest.mark.parametrize(("window", "said"), HELD.items())
+def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
+    x, recipe = torch.arange(6, dtype=torch.float32), Recipe(policy=Policy(windows=(window,)))
+    assert WindowGate(recipe.policy.windows, TraceSpec(6, rate_hz=10.0, channels=2))(torch.stack([x, -x])) == said
+    assert Recipe.from_toml(recipe.to_toml()) == recipe
+    assert str(*recipe.policy.windows) == window
+
+
+def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(make_data, tmp_path: Path) -> None:
+    data = make_data(300, SAMPLES)
+    with trained(data, tmp_path / "cell.db") as engine:
+        x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT)
+        engine.set_policy(replace(engine.policy, windows=(Window(0.0, 0.1, high=float(x[:50].max()) - 0.1, reject=True),)))
+        made = engine.decide(x)
+        assert (made.action, made.predicted, made.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
+        with pytest.raises(ReportConflictError):
+            engine.report(made.id, True)
+        engine.set_shadow(True)
+        assert engine.decide(x).action is Action.VERIFY
+        with pytest.raises(SettingError, match=r"within 1 x 100 samples"):
+            engine.set_policy(Policy(windows=(Window(0.3, 0.4, 0.0),)))
+    with DataEngine.open(tmp_path / "cell.db") as engine:
+        status = engine.status()
+        assert (status.newest.outside, status.certificate.rejected.n, status.certificate.accepted.n) == (2, 0, 0)
+        assert "windows none -> 0:0.1::" in engine.store.events()[0].text
+        assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).said[0]

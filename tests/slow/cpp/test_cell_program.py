@@ -15,7 +15,7 @@ from dengine import DataEngine, Dataset, TraceSpec, export_torchscript
 from dengine.export import import_journal, make_key
 from dengine.export.cell_journal import read_journal
 from dengine.records import Action
-from tests.support.exports import SAMPLES, trained
+from tests.support.exports import SAMPLES, WINDOWS, trained
 from tests.support.programs import Program, asked, must_agree
 
 
@@ -29,7 +29,7 @@ class Learned(NamedTuple):
 
 
 POLICIES = {
-    "local": {"guarantee": "local", "stops": "some", "fraction": 0.3, "reject_fraction": 0.08},
+    "local": {"guarantee": "local", "stops": "some", "fraction": 0.3, "reject_fraction": 0.08, "windows": WINDOWS},
     "pooled": {"guarantee": "pooled", "stops": "some", "fraction": 0.1, "audit_rate": 0.6},  # its only evidence
     "all": {"guarantee": "pooled", "stops": "all", "fraction": 0.1},
 }

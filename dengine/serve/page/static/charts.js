@@ -44,7 +44,42 @@ function axis(side, given = {}) {
   return { side, stroke: ink, font: "14px system-ui, sans-serif", labelFont: "14px system-ui, sans-serif", grid, ticks: grid, ...given };
 }
 
-// Traces
+// Traces, and over them the operator's windows: the limits where they hold, in the stretch where they do
+
+function windowsOf(found, channel) {
+  const { rate_hz } = found.spec;
+  return found.windows.filter((each) => each.channel === channel).map((each) => {
+    if (each.along === null) return { ...each, from: each.start, to: each.end };
+    const there = found.trace[each.along].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
+    return { ...each, from: there[0], to: there.at(-1) };
+  }).filter((each) => each.from !== undefined);
+}
+
+function windowMarks({ ctx, bbox, valToPos }, windows) {
+  ctx.save();
+  ctx.strokeStyle = colour("ink");
+  ctx.lineWidth = 2 * devicePixelRatio;
+  ctx.beginPath();
+  for (const { from, to, low, high } of windows) {
+    const [left, right] = [from, to].map((time) => Math.min(Math.max(valToPos(time, "x", true), bbox.left), bbox.left + bbox.width));
+    for (const [limit, outwards] of [[high, -1], [low, 1]]) {
+      if (limit === null) continue;
+      const y = valToPos(limit, "y", true);
+      const tip = y + 8 * outwards * devicePixelRatio; // hatched ends point to the side that is not allowed
+      ctx.moveTo(left, tip);
+      ctx.lineTo(left, y);
+      ctx.lineTo(right, y);
+      ctx.lineTo(right, tip);
+    }
+  }
+  ctx.stroke();
+  ctx.restore();
+}
+
+function windowWords({ from, to, low, high, reject }) {
+  const limits = [low !== null && `at least ${number(low, 1)}`, high !== null && `at most ${number(high, 1)}`].filter(Boolean).join(" and ");
+  return `From ${number(from, 2)} to ${number(to, 2)} s an operator's window wants ${limits}, else ${reject ? "reject" : "verify"}. `;
+}
 
 export function traceCharts(found) {
   const widest = found.trace.map(() => 0);
@@ -57,13 +92,16 @@ function traceChart(found, channel) {
   const trace = found.trace[channel];
   const band = found.low && [found.high[channel], found.low[channel], found.median[channel]];
   const bads = found.bads.map((bad) => bad[channel]);
-  const key = [found.decision.id, channel, found.envelope?.n, bads.length].join(" ");
+  const windows = windowsOf(found, channel);
+  const limits = windows.flatMap(({ low, high }) => [low, high]).filter((limit) => limit !== null);
+  const key = [found.decision.id, channel, found.envelope?.n, bads.length, JSON.stringify(windows)].join(" ");
   const said = traceWords(found, channel);
   const line = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
   const made = () => ({
     data: [trace.map((_, i) => i / found.spec.rate_hz), ...(band ?? []), ...bads, trace],
     options: {
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...limits), Math.max(high, ...limits), 0.1, true) } },
+      hooks: { draw: [(plot) => windowMarks(plot, windows)] },
       axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: found.spec.unit, labelSize: 22, size: 56 })],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
@@ -82,7 +120,7 @@ function traceWords(found, channel) {
   const values = found.trace[channel].filter((value) => value !== null);
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
   const of = found.trace.length > 1 ? `${spec.columns[channel] ?? `Channel ${channel + 1}`}: ` : "";
-  const said = `${of}Force over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. `;
+  const said = `${of}Force over ${number(found.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${spec.unit}. ${windowsOf(found, channel).map(windowWords).join("")}`;
   if (!envelope) return `${said}No band of good parts is drawn before 20 of them are known.`;
   const outside = `${said}${percent(envelope.outside, 1)} of it lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
@@ -96,7 +134,8 @@ export function traceLegend(found) {
   return el("ul", { class: "legend" },
     swatch("line-trace", "this part"),
     envelope && [swatch("area-band", `95 % of ${number(envelope.n)} good parts`), swatch("line-median", "their median")],
-    found.bads.length > 0 && swatch("line-bad", `bad parts (${number(found.bads.length)})`));
+    found.bads.length > 0 && swatch("line-bad", `bad parts (${number(found.bads.length)})`),
+    found.windows.length > 0 && swatch("line-window", `operator's windows (${number(found.windows.length)})`));
 }
 
 // The course of decisions

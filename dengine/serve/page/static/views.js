@@ -143,7 +143,9 @@ function detail(found, level) {
   ];
 }
 
-const explanation = (get, id) => get(`explanations/${encodeURIComponent(id)}`);
+async function explanation(get, id, doing) {
+  return { ...await get(`explanations/${encodeURIComponent(id)}`), windows: doing.recipe.policy.windows };
+}
 
 // The views: each is asked with `get`, the query of the address, and the status, and gives its title and its elements
 
@@ -154,7 +156,7 @@ async function now(get, _, doing) {
       el("p", {}, "As soon as the robot sends a trace, the decision on it stands here."));
     return { title: "Now", shown: [waiting] };
   }
-  const found = await explanation(get, decisions[0].id);
+  const found = await explanation(get, decisions[0].id, doing);
   const { decision } = found;
   const name = decision.part === null ? "Part without a number" : `Part ${decision.part}`;
   const card_ = el("section", { class: `decision ${decision.action}`, id: "now-decision", "data-part": true, "aria-labelledby": "decision",
@@ -180,7 +182,25 @@ async function now(get, _, doing) {
   return { title: "Now", shown: [el("h1", { class: "visually-hidden" }, "Now"), shown] };
 }
 
-async function overview(get, _, doing) {
+const HOURS = { shift: 8, day: 24, hour: 1 };
+const SHIFT_BEGINS = 6; // o'clock
+const ROWS = 20; // of the trend
+
+async function trend(get, asked, parts) {
+  // Shift by shift, by day, by hour, or by batch: what a part's number begins with, up to its last dash, slash, dot or blank.
+  const batch = (parts.find((each) => each.part !== null)?.part.match(/^.*[-_/. ]/)?.[0] ?? "").length;
+  const by = asked in HOURS || (asked === "batch" && batch) ? asked : "shift";
+  const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
+  const { stretches } = await get(`course?${by === "batch" ? `batch=${batch}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
+  const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : moment(begun(each.last)).slice(0, 16), number(each.n),
+    percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
+  const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
+  return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
+    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"]], rows));
+}
+
+async function overview(get, query, doing) {
   const [course, { events }, { decisions }, { decisions: escaped }] = await Promise.all([
     get("course"), get("events?limit=12"), get(`decisions?limit=${PACE}`), get("decisions?action=accept&label=bad&limit=10"),
   ]);
@@ -194,7 +214,7 @@ async function overview(get, _, doing) {
     : [big("–"), small("Not watched under this policy.")];
   const tiles = [
     doing.shadow && wouldHave(doing), badAccepts(doing), verified(doing), accepted(doing), pace(decisions), saved(doing),
-    figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `Audits: ${number(newest.audits)}`)),
+    figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `Audits: ${number(newest.audits)} · Outside a window: ${number(newest.outside)}`)),
     figure("drift", "Drift, on its way to an alarm", drift),
     figure("model", "Model", big(`version ${doing.version}`), small(`${number(ever.retrains)} retrains, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
       report && el("p", {}, `newest at ${clock(report.time)}, ${number(report.report.seconds, 2)} s`),
@@ -213,12 +233,12 @@ async function overview(get, _, doing) {
     ? el("ol", { class: "story" }, events.map((each) => el("li", {}, el("time", {}, moment(each.time)), " ", el("b", {}, each.kind), each.author && ` · ${each.author}`,
       el("br"), each.text.replace(/\b([0-9a-f]{12})[0-9a-f]{28,}\b/g, "$1…"))))
     : small("Nothing beside decisions, labels and retrains."));
-  return { title: "Overview", shown: [el("h1", {}, "Overview"), escapes, el("div", { class: "tiles" }, tiles), el("div", { class: "split" }, lines, happened)] };
+  return { title: "Overview", shown: [el("h1", {}, "Overview"), escapes, el("div", { class: "tiles" }, tiles), el("div", { class: "split" }, el("div", { class: "stack" }, lines, await trend(get, query.get("by"), decisions)), happened)] };
 }
 
-async function map(get, query) {
+async function map(get, query, doing) {
   const chosen = query.get("id") ?? "";
-  const [found, part] = await Promise.all([get("embedding"), chosen ? explanation(get, chosen).catch(() => null) : null]);
+  const [found, part] = await Promise.all([get("embedding"), chosen ? explanation(get, chosen, doing).catch(() => null) : null]);
   const legend = [["good", "●", "good"], ["bad", "✕", "bad"], ["none", "■", "not known"], ["", "○", "newest parts"]].map(([kind, sign, text]) =>
     el("li", { class: kind && `label ${kind}` }, el("span", { "aria-hidden": "true" }, sign), text));
   if (found.radius !== null) legend.push(el("li", {}, el("span", { class: "swatch ring", "aria-hidden": "true" }), "ball in which labels are counted"));
@@ -234,8 +254,8 @@ async function map(get, query) {
   return { title: "Map", shown: [el("h1", {}, "Map of the parts"), el("div", { class: "split" }, picture, beside)] };
 }
 
-async function part(get, query) {
-  const found = await explanation(get, query.get("id") ?? "");
+async function part(get, query, doing) {
+  const found = await explanation(get, query.get("id") ?? "", doing);
   const name = nameOf(found.decision.part, found.decision.id);
   return { title: `Part ${name}`, shown: [el("article", { class: "card part", id: "part", "data-part": true }, el("h1", {}, `Part ${name}`), detail(found, 2))] };
 }
