@@ -271,8 +271,8 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
         with looking(browser, http_credentials={"username": "kim", "password": TOKEN}) as page:
             a_day(page, demo, part, tmp_path / "list.csv")
     with demo.store() as store:
-        told = [(event.kind, event.author) for event in store.events(3)]
-    assert told == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim")]  # nobody typed a name
+        told = [(event.kind, event.author) for event in store.events(4)]
+    assert told == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim"), ("policy", "Kim")]  # nobody typed a name
 
 
 def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
@@ -301,6 +301,13 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     opened(page, demo, "actions")
     confirmed(page, "Let the model decide again")
     expect(page.locator("#mode")).to_contain_text("Decides", timeout=PATIENT)
+    page.get_by_role("button", name="Change the policy").click()
+    page.get_by_label("Windows").fill("0.01:0.05::30:reject")
+    page.get_by_role("button", name="Do it").click()
+    opened(page, demo, "overview?by=batch")
+    expect(page.locator("#trend tbody")).to_contain_text(f"{STRANGE}-")
+    page.locator("#escapes").get_by_role("link", name=part).click()
+    expect(page.locator("#part figcaption")).to_contain_text("an operator's window wants at most 30.0, else reject")
     opened(page, demo, "history?label=bad")
     with page.expect_download() as download:
         page.get_by_role("button", name="Download these as CSV").click()

@@ -41,7 +41,8 @@ function body() {
   const said = { ...asked.body, author: at("confirm-author").value.trim() };
   for (const { name, type } of asked.fields ?? []) {
     const value = at(`confirm-${name}`).value.trim();
-    if (value !== "") said[name] = type === "number" || name === "version" ? Number(value) : value;
+    if (name === "windows") said[name] = value.split(/\s+/).filter(Boolean);
+    else if (value !== "") said[name] = type === "number" || name === "version" ? Number(value) : value;
   }
   return said;
 }
@@ -94,6 +95,11 @@ export const shadow = (on) => (on
   ? { title: "Verify everything", what: "From the next part on every part is verified. The model goes on learning.", path: "policy", body: { shadow: true } }
   : { title: "Let the model decide again", what: "From the next part on the model decides again which parts need no check.", path: "policy", body: { shadow: false } });
 
+function windowText({ start, end, low, high, channel, along, reject }) {
+  const more = [channel > 0 && `channel=${channel}`, along !== null && `along=${along}`, reject && "reject"];
+  return [start, end, low ?? "", high ?? "", ...more.filter(Boolean)].join(":");
+}
+
 export const policy = (now) => ({
   title: "Change the policy", path: "policy",
   what: "How certain the model must be, from the next part on. What was decided keeps its bounds; the guarantee counts anew.",
@@ -101,6 +107,7 @@ export const policy = (now) => ({
     { name: "alpha", label: "alpha, the error of the interval", type: "number", min: 0.0001, max: 0.9999, step: "any", value: now.alpha, required: true },
     { name: "lower_bound", label: "Lower bound that a success rate must reach", type: "number", min: 0.5001, max: 0.9999, step: "any", value: now.lower_bound, required: true },
     { name: "audit_rate", label: "Share of certain parts that are verified all the same", type: "number", min: 0, max: 1, step: "any", value: now.audit_rate, required: true },
+    { name: "windows", label: "Windows, START:END:LOW:HIGH, with a blank between; :reject rejects", value: now.windows.map(windowText).join(" ") },
   ],
 });
 

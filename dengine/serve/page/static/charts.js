@@ -57,7 +57,7 @@ function windowsOf(found, channel) {
 
 function windowMarks({ ctx, bbox, valToPos }, windows) {
   ctx.save();
-  ctx.strokeStyle = colour("ink");
+  ctx.strokeStyle = colour("link");
   ctx.lineWidth = 2 * devicePixelRatio;
   ctx.beginPath();
   for (const { from, to, low, high } of windows) {
@@ -65,7 +65,7 @@ function windowMarks({ ctx, bbox, valToPos }, windows) {
     for (const [limit, outwards] of [[high, -1], [low, 1]]) {
       if (limit === null) continue;
       const y = valToPos(limit, "y", true);
-      const tip = y + 8 * outwards * devicePixelRatio; // hatched ends point to the side that is not allowed
+      const tip = y + 8 * outwards * devicePixelRatio; // bent ends point to the side that is not allowed
       ctx.moveTo(left, tip);
       ctx.lineTo(left, y);
       ctx.lineTo(right, y);

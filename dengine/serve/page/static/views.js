@@ -193,7 +193,7 @@ async function trend(get, asked, parts) {
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
   const { stretches } = await get(`course?${by === "batch" ? `batch=${batch}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : moment(begun(each.last)).slice(0, 16), number(each.n),
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : moment(begun(each.last)).slice(5, 16), number(each.n),
     percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
