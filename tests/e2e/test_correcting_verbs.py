@@ -96,7 +96,7 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store: Path, tmp_path: P
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
     assert "alpha 0.2, lower bound 0.8" in said("status", store)
-    assert "windows none -> 0.2:0.4:-5:60:reject. Event" in said("policy", store, "--window", "0.2:0.4:-5:60:reject")
+    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in said("policy", store, "--window", "0.05:0.1:-5:60:reject")
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
     shown = said("policy", store)
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
