@@ -173,7 +173,7 @@ class Window:
             more: dict[str, Any] = {name: name == "reject" or int(value) for name, _, value in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
         except (TypeError, ValueError) as error:
-            wanted = "a window START:END:LOW:HIGH, as 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
+            wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
             raise SettingError(f"Expected {wanted}, got {shortened(text)}: {error}") from error
 
 

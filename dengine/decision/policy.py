@@ -69,8 +69,11 @@ class Policy:
         expect(self.stops in get_args(Stops), f"stops {' or '.join(get_args(Stops))}", self.stops)
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
         expect(is_whole(self.label_within, 1, 10**9), "label_within of at least one decision", self.label_within)
-        windows = tuple(Window.parse(each) if isinstance(each, str) else each for each in self.windows)
-        expect(all(isinstance(each, Window) for each in windows), "windows to be of Window", self.windows)
+        listed = self.windows if isinstance(self.windows, tuple | list) else (None,)
+        windows = tuple(Window.parse(each) if isinstance(each, str) else each for each in listed)
+        expect(
+            all(isinstance(each, Window) for each in windows), "a list of windows, each a Window, or its text", self.windows
+        )
         object.__setattr__(self, "windows", windows)
         if self.guarantee == "pooled" and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(
