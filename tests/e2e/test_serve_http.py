@@ -9,7 +9,6 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
-from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +24,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.routing import Route
 
 from dengine import DataEngine, Dataset
-from dengine.cli import main
 from dengine.errors import BusyError
 from dengine.serve.auth import Access, Token
 from dengine.serve.http import create_app
-from dengine.serve.server import serve
 from dengine.serve.service import CellService
 from tests.support.command_line import dengine
 from tests.support.serving import RECIPE, a_service, certificate, held, served, started
@@ -545,12 +542,6 @@ def refused_in_a_line(text: str, *words: object) -> None:
     done = dengine("serve", *words)
     assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
     assert text in done.output
-
-
-def test_what_the_verb_does_by_default_is_what_serving_does() -> None:
-    typed = {option.name: option.default for option in main.commands["serve"].params}
-    names = ("host", "port", "deadline", "largest", "rate", "connections", "check_seconds")
-    assert {name: typed[name] for name in names} == {name: signature(serve).parameters[name].default for name in names}
 
 
 def make_token(folder: Path, text: str = TOKEN, mode: int = 0o600) -> None:

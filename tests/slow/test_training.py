@@ -6,10 +6,8 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from dengine import load_dataset
@@ -66,38 +64,6 @@ def test_a_rival_without_a_bound_says_so_in_its_row(run: Run, tiny: Path, tmp_pa
     assert bounds["knn"] == "none: threshold swept"
     assert bounds["pca"] == "Wilson, at one look"
     assert bounds["always"].startswith("no error")
-
-
-def test_a_retrain_is_timed_until_it_is_committed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import time
-
-    from dengine import Recipe, SqlStore, load_dataset
-
-    put_version = SqlStore.put_version
-
-    def slow(*words: Any) -> Any:
-        time.sleep(0.4)
-        return put_version(*words)
-
-    monkeypatch.setattr(SqlStore, "put_version", slow)
-    row = load("benchmark_scale").measure_store(load_dataset(tiny), Recipe.load("pca"), 60, 2, tmp_path)
-    assert row["retrain_p50_s"] >= 0.4
-
-
-def test_a_stream_that_is_there_is_compared_under_drift_without_a_simulator(run, make_data, tmp_path, monkeypatch) -> None:
-    data = make_data(240, noise=0.2)
-    data.X[120:] += np.float32(30.0)  # the sensor's offset jumps half way
-    (tmp_path / "streams").mkdir()
-    np.savez(tmp_path / "streams" / "bias_jump_240_7.npz", X=data.X, y=data.y)
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    words = ["--cycles", 240, "--scenarios", "bias_jump", "--seed", 7, "--n-jobs", 1, "--out", tmp_path]
-    assert "bias_jump" in run("compare_drift", *words, "--methods", "dengine,paper-conv")
-    table = pd.read_csv(tmp_path / "drift.csv").set_index("method")
-    novel = {name: int(said.split(" / ")[1]) for name, said in table["novel"].items()}
-    assert novel["dengine"] > 0 == novel["paper-conv"]
-    assert 1 <= int(table.loc["dengine", "alarm"]) < 40
-    assert table.loc["paper-conv", "alarm"] == "-"
-    assert (tmp_path / "drift.png").is_file()
 
 
 def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run: Run, tmp_path: Path) -> None:
