@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -90,17 +90,18 @@ def change(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     return True
 
 
-def tell_all(model: EngineModel, known: Evidence, evidence: EvidenceWindow) -> None:
+def tell_all(model: EngineModel, known: Callable[[], Evidence], evidence: EvidenceWindow) -> None:
     """Reset a model's rule and replay its evidence."""
     model.forget()
     model.begin_safely_in(evidence.began_in)
     tell(model, known)
 
 
-def tell(model: EngineModel, known: Evidence) -> None:
-    """Tell a model's rule what became of parts, in the order of their labels."""
+def tell(model: EngineModel, asked: Callable[[], Evidence]) -> None:
+    """Tell a model's rule what became of parts, in the order of their labels; one that learns nothing asks for nothing."""
     if not model.remembers:
         return
+    known = asked()
     columns = (known.lower, known.upper, known.success, known.novel, known.silent, known.predicted, known.looked)
     for row in zip(*(column.tolist() for column in columns), strict=True):
         model.tell_safely(*row)

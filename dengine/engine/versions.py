@@ -138,7 +138,7 @@ class ModelVersions:
             if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
                 self._look_ahead(template, labelled)
             template.begin_safely_in(self.evidence.began_in)
-            tell(template, store.evidence_since(0, since))
+            tell(template, lambda: store.evidence_since(0, since))
             self.new_labels = len(labelled.seq)
             self.corrected_to = max((each.number for each in store.corrections()), default=0)
         else:
@@ -149,9 +149,9 @@ class ModelVersions:
             told_to = int(version.state.get("told_to", version.last_seq))  # 0: a peer's, who knows nothing of this cell
             anew = not told_to or not version.state.keys().isdisjoint(("untold", "owed")) or version.version < since
             if anew or self.corrected_to > corrected_at(version):
-                tell_all(model, store.evidence_since(0, since), self.evidence)
+                tell_all(model, lambda: store.evidence_since(0, since), self.evidence)
             else:
-                tell(model, store.evidence_since(told_to, since))
+                tell(model, lambda: store.evidence_since(told_to, since))
             self.new_labels = int((labelled.seq > trained_on.counts_from).sum())
             self._trained_on = trained_on
         if self.fleet is not None:
@@ -213,7 +213,7 @@ class ModelVersions:
     def tell_anew(self) -> None:
         """Tell the rule everything again: what it was told was not what happened. StoreError where the store is away."""
         known = self.outbox.ask(lambda: self.store.evidence_since(0, self.evidence.since))
-        tell_all(self.newest, known, self.evidence)
+        tell_all(self.newest, lambda: known, self.evidence)
         for made in list(self.overdue.values()):
             self.owe(made)
 
