@@ -59,7 +59,7 @@ def join_since(model: EngineModel, store: SqlStore, version: ModelVersion, windo
     since = store.labelled(window.capacity, first=known_to(version) + 1, last=window.newest_seq, corrected_to=as_of)
     corrections = deque(store.corrections(corrected_to))
     newest = corrections[-1].number if corrections else corrected_to
-    added = store.past_labels(version.last_seq, points=True)
+    added = store.past_labels(version.last_seq)
     points = {each.seq: each.point for each in added if each.model_version == version.version}
     for seq, trace, label, hash_ in zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True):
         while corrections and corrections[0].newest_seq < seq:

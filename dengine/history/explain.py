@@ -67,7 +67,7 @@ def as_it_stood(store: SqlStore, version: int, recipe: Recipe, then: StoredDecis
     reports = ((each.report, each.last_seq) for each in store.versions(own=True))
     retrains = [last_seq for report, last_seq in reports if report.accepted and report.version > version]
     upto = min([*retrains[:1], stored.last_seq + STRIDE])
-    later = store.past_labels(stored.last_seq, upto, points=True)
+    later = store.past_labels(stored.last_seq, upto)
     if then is not None:
         later = [label for label in later if _known_at(label, then, recipe.policy.stops == "all")]
     before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)

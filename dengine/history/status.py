@@ -178,12 +178,12 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     outcomes = every.outcomes
     return Status(
         cell=store.cell_id,
-        product=counts.get("product"),
+        product=store.product,
         settings=settings,
         recipe=recipe,
         trace=trace_in(settings),
         model=settings.get("model"),
-        version=counts["last_version"] or 0,
+        version=next((each.version for each in reversed(store.retrains()) if each.accepted), 0),
         shadow=policy.shadow,
         safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
         safe_mode_time=None if mode is None else mode.time,

@@ -6,7 +6,6 @@ A deleted file, a fork, and a row that the database refuses are each met here.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import logging
 import os
 import sqlite3
@@ -21,21 +20,9 @@ import sqlalchemy as sa
 from ..errors import DengineError, StoreError, shortened
 from .journal import Record, forked, owned_by, owner
 from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
-from .queries import Scope, held_query, join_product
-from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, pack, to_row
-from .schema import (
-    CORRECTION,
-    DECISION,
-    EVENT,
-    LABEL,
-    LEDGER,
-    TRACE,
-    check_schema,
-    chunks,
-    decision_row,
-    prepare_tables,
-    trace_row,
-)
+from .queries import WITH_LABELS, WITH_TRACES, Scope, counted, join_product
+from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, chunks, decision_row, to_row, trace_row
+from .schema import CELL, CORRECTION, DECISION, EVENT, LABEL, LEDGER, TRACE, check_schema, hold, prepare_tables
 
 log = logging.getLogger("dengine")
 T = TypeVar("T")
@@ -70,13 +57,10 @@ def make_engine(url: str | None) -> sa.Engine:
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=PATIENCE)
         return _sqlite(sa.create_engine(parsed, connect_args={"timeout": BUSY}))
-    except (sa.exc.ArgumentError, ImportError) as error:
+    except (sa.exc.ArgumentError, ImportError, ValueError) as error:
+        if isinstance(error, ValueError) and "@" in url:  # what it quotes, and takes for a port, may be half of a password
+            raise _unusable(url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F") from None
         raise _unusable(url, f"{error}") from error
-    except ValueError as error:
-        if "@" not in url:
-            raise _unusable(url, f"{error}") from error
-        # What it quotes, and takes for a port, may be half of a password.
-        raise _unusable(url, "it cannot be read; write @, : and / in a password as %40, %3A and %2F") from None
 
 
 def _sqlite(engine: sa.Engine) -> sa.Engine:
@@ -159,6 +143,15 @@ def reading(url: str) -> Iterator[sa.Connection]:
         engine.dispose()
 
 
+def integrity(connection: sa.Connection, table: str = "") -> list[str]:
+    """What SQLite finds wrong in its file, or in one table and its indexes; nothing where all is well."""
+    try:
+        lines = connection.execute(sa.text(f"PRAGMA integrity_check({table})" if table else "PRAGMA integrity_check"))
+        return [str(line) for line in lines.scalars() if line != "ok"]
+    except sa.exc.DatabaseError as error:
+        return [str(error.orig)]
+
+
 class Database:
     """An open database, prepared for a cell; one thread writes at a time.
 
@@ -185,16 +178,12 @@ class Database:
         self.on_entry: Callable[[], object] = lambda: None
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
-        self.name = self._engine.url.render_as_string(hide_password=True)
+        self.url = self._engine.url  # its password included
+        self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
         file = Path(str(self.url.database)) if self.url.get_backend_name() == "sqlite" else None
         self._file = file if file is not None and file.is_file() else None  # None: an URI of SQLite's own, or a server
         self._opened = None if self._file is None else self._file.stat()
-
-    @property
-    def url(self) -> sa.URL:
-        """Of the database, its password included."""
-        return self._engine.url
 
     def _open(self, product: str | None) -> Scope:
         try:
@@ -211,27 +200,29 @@ class Database:
             raise
 
     @contextmanager
-    def transaction(self, write: bool) -> Iterator[sa.Connection]:
-        """Begin a transaction that is committed at its end, or rolled back by an error."""
+    def reading(self) -> Iterator[sa.Connection]:
+        """Begin a transaction that reads."""
         self.check_open()
-        if not write:
-            self._before_use()
-        engine = self._writer if write else self._engine
-        with _told("write to" if write else "read", self.name), engine.connect() as plain:
-            entry = LedgerEntry(self.scope, self._clock, self._key) if write else None
-            connection = plain.execution_options(dengine_write=write, dengine_entry=entry)
+        self._before_use()
+        with _told("read", self.name), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sa.Connection]:
+        """Begin a transaction that holds the cell, is chained and committed at its end, or rolled back by an error."""
+        with _told("write to", self.name), self._writer.connect() as connection:
+            connection.execution_options(dengine_write=True)
             with connection.begin():
-                if write:
-                    self._check_file()
-                yield connection
-                if entry is not None:
-                    entry.append(connection)  # chains what the transaction added
-                if write and not getattr(self._asked, "wanted", lambda: True)():
+                self._check_file()
+                hold(connection, CELL, self.cell_id)
+                entry = LedgerEntry(connection, self.cell_id, self._key)
+                yield connection.execution_options(dengine_entry=entry)
+                newest = entry.append(self._clock)
+                if not getattr(self._asked, "wanted", lambda: True)():
                     raise StoreError(f"Could not write to {self.name} in time, and was given up; nothing was written.")
-            if write:
-                self._check_file()  # nobody is told that a file holds what went into another one
-            if entry is not None and entry.written is not None:
-                self.newest = entry.written
+            self._check_file()  # nobody is told that a file holds what went into another one
+            if newest is not None:
+                self.newest = newest
                 self.on_entry()
 
     def _check_file(self) -> None:
@@ -261,7 +252,7 @@ class Database:
 
         window : so many of the newest labels are read.  since : those after that number alone; None: the window.
         """
-        with self.transaction(write=False) as connection:
+        with self.reading() as connection:
             first = self.scope.first_label(connection, window) if since is None else since + 1
             for cell in self.scope.cells(connection):
                 if said := doubt_of(connection, cell, self._key, first):
@@ -272,26 +263,24 @@ class Database:
         """What SQLite finds wrong in a table that is read, or in its indexes, in words; "" where nothing is."""
         for name in READ if self._file is not None else ():
             try:
-                with self.transaction(write=False) as connection:
-                    said = connection.execute(sa.text(f"PRAGMA integrity_check({name})")).scalar()
+                with self.reading() as connection:
+                    if said := integrity(connection, name):
+                        return f"of the table {name} SQLite says: {said[0]}"
             except StoreError as error:
                 return f"{error}"
-            if said != "ok":
-                return f"of the table {name} SQLite says: {said}"
         return ""
 
     def lease(self) -> None:
         """Write from now on through one connection that holds the cell; StoreError where another engine has it."""
         said = PATIENCE | {"application_name": f"dengine {owner()}"[:63]}  # so that others are told who it is
-        writer = sa.create_engine(self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=said)
-        chain_writes(writer)
-        sa.event.listen(writer, "connect", self._take_lease)
-        self._writer = writer
+        self._writer = sa.create_engine(self.url, pool_pre_ping=True, pool_size=1, max_overflow=0, connect_args=said)
+        chain_writes(self._writer)
+        sa.event.listen(self._writer, "connect", self._take_lease)
         try:
             self.write(lambda connection: None)
         except StoreError:
+            self._writer.dispose()
             self._writer = self._engine
-            writer.dispose()
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
@@ -323,7 +312,7 @@ class Database:
             self._before_use()  # not while others are kept from writing
         with self._writing:
             try:
-                with self.transaction(write=True) as connection:
+                with self._transaction() as connection:
                     return work(connection)
             finally:
                 if self._closed:  # meanwhile: `close` did not wait
@@ -331,19 +320,15 @@ class Database:
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
         """Return the rows of a query."""
-        with self.transaction(write=False) as connection:
+        with self.reading() as connection:
             return connection.execute(query).all()
 
     def close(self, waiting: bool = True) -> None:
         """Disconnect; waiting : for a write that is under way."""
-        if self._closed:
-            return
         self._closed = True
         if self._writing.acquire(blocking=waiting):
-            try:
-                self._disconnect()
-            finally:
-                self._writing.release()
+            self._disconnect()
+            self._writing.release()
 
     def _disconnect(self) -> None:
         self._writer.dispose()
@@ -351,27 +336,29 @@ class Database:
 
     # What goes in
 
+    def insert(self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]) -> range:
+        """Add the cell's rows, numbered in this column of their table; returns the numbers."""
+        if not rows:
+            return range(0)
+        first = self.scope.next_number(connection, column)
+        named = [{**row, "cell_id": self.cell_id, column.name: i} for i, row in enumerate(rows, first)]
+        connection.execute(sa.insert(column.table), named)
+        return range(first, first + len(rows))
+
+    def correct(self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Add corrections."""
+        newest = self.scope.next_number(connection, LABEL.c.seq) - 1
+        self.insert(connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows])
+
     def held(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """What is stored of decisions and their labels, by id, once the cell is locked."""
-        self.scope.lock_cell(connection)
-        return {row.id: row for part in chunks(ids) for row in connection.execute(held_query(self.cell_id, part))}
+        """What is stored of decisions, as labels repeat it, and of the labels that they have, by id."""
+        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, counted().label("counted"))
+        query = sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(WITH_LABELS)
+        return self._by_id(connection, query, ids)
 
-    def insert(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> None:
-        """Add decisions and their traces."""
-        number = itertools.count(self.scope.next_number(connection, DECISION.c.number) if decisions else 1)
-        for part in chunks(decisions):
-            rows = [decision_row(self.cell_id, item) | {"number": next(number)} for item in part]
-            connection.execute(sa.insert(DECISION), rows)
-            connection.execute(sa.insert(TRACE), [trace_row(self.cell_id, item) for item in part])
-
-    def insert_labels(self, connection: sa.Connection, labels: Sequence[NewLabel], held: Mapping[str, Any]) -> list[int]:
-        """Add labels of held decisions; returns their numbers."""
-        first = self.scope.next_number(connection, LABEL.c.seq)
-        for part in chunks(range(len(labels))):
-            rows: list[dict[str, Any]] = [{"cell_id": self.cell_id, "seq": first + i} | to_row(labels[i]) for i in part]
-            rows = [row | {"quarantined": held[row["decision_id"]].quarantined} for row in rows]
-            connection.execute(sa.insert(LABEL), rows)
-        return list(range(first, first + len(labels)))
+    def _by_id(self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]) -> dict[str, Any]:
+        query = query.where(DECISION.c.cell_id == self.cell_id)
+        return {row.id: row for part in chunks(ids) for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
 
     def take(self, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Commit what a journal held, as `SqlStore.take`."""
@@ -384,91 +371,68 @@ class Database:
                 half = len(records) // 2
                 return self.take(records[:half]) + self.take(records[half:])
             text = f"{_named(records[0])}, which the database refused: {error.__cause__}"
-        self.write(lambda connection: self._insert_events(connection, [self._set_aside(text)]))
+        self.write(lambda connection: self.insert(connection, EVENT.c.number, [to_row(self._set_aside(text))]))
         return []
 
     def _take(self, connection: sa.Connection, records: Sequence[Record]) -> list[tuple[str, int]]:
         """Insert what is not there yet; what is there must be the same, or it becomes a dead letter."""
-        events = [each for each in records if isinstance(each, Event)]
-        if events:
-            events = self._new_events(connection, events)
+        events = self._new_events(connection, [each for each in records if isinstance(each, Event)])
         events += self._take_decisions(connection, [each for each in records if isinstance(each, StoredDecision)])
         labels = [each for each in records if isinstance(each, NewLabel)]
         held = self.held(connection, [each.decision_id for each in labels])
-        numbers = {name: row.seq for name, row in held.items() if row.seq is not None}
-        said = {name: (held[name].success, held[name].source) for name in numbers}
-        fresh: dict[str, NewLabel] = {}
-        well: list[str] = []
-        late: list[str] = []
+        fresh, well, late = dict[str, NewLabel](), list[str](), list[str]()
         for each in labels:
-            name, now = each.decision_id, (each.success, each.source.value)
-            if name not in held:
-                events.append(self._set_aside(f"{_named(each)}, which the store does not hold"))
-            elif (held[name].content_hash, held[name].time) != (each.content_hash, each.decided):
-                events.append(self._set_aside(f"{_named(each)}, of which the store holds another decision"))
-            elif said.setdefault(name, now) == now:
+            name, row = each.decision_id, held.get(each.decision_id)
+            if row is None or (row.content_hash, row.time) != (each.content_hash, each.decided):
+                lacks = "which the store does not hold" if row is None else "of which the store holds another decision"
+                events.append(self._set_aside(f"{_named(each)}, {lacks}"))
+                continue
+            first = fresh.setdefault(name, each) if row.seq is None else row
+            said, now = (first.success, first.source), (each.success, each.source)
+            stopped = (said, now) == LATE_STOP and row.counted != FORGOTTEN
+            if said == now or stopped:
                 well.append(name)
-                if name not in numbers:
-                    fresh.setdefault(name, each)
-            elif (said[name], now) == LATE_STOP and held[name].counted != FORGOTTEN:
-                well.append(name)
-                late += [name] * (held[name].counted != 0)  # else the store has it
+                late += [name] * (stopped and row.counted != 0)  # else the store has it
             else:
                 events.append(self._set_aside(f"a second label: {_named(each)}, which has one"))
-        if fresh:
-            numbers |= zip(fresh, self.insert_labels(connection, list(fresh.values()), held), strict=True)
-        self._insert_events(connection, events)
+        rows = [to_row(each) | {"quarantined": held[each.decision_id].quarantined} for each in fresh.values()]
+        numbers = {name: row.seq for name, row in held.items()}
+        numbers |= zip(fresh, self.insert(connection, LABEL.c.seq, rows), strict=True)
+        self.insert(connection, EVENT.c.number, [to_row(each) for each in events])
         if late:
             self._take_back(connection, list(dict.fromkeys(late)))
         return [(name, numbers[name]) for name in dict.fromkeys(well)]
 
     def _take_back(self, connection: sa.Connection, names: Sequence[str]) -> None:
         """Parts that were confirmed stopped the system: their labels are corrected, with an event each."""
-        first, now = self.scope.next_number(connection, EVENT.c.number), self._clock()
-        text = "counts as a failure, was a success: its stop came after its confirmation"
-        self._insert_events(connection, [Event(0, now, "late stop", f"decision {as_text(name)} {text}") for name in names])
-        for event, name in enumerate(names, first):
-            said = {"author": "", "event": event, "time": now, "success": False}
-            self.insert_corrections(connection, said, {name: True})
-
-    def insert_corrections(
-        self, connection: sa.Connection, said: Mapping[str, Any], was: Mapping[str, bool | None]
-    ) -> None:
-        """Add corrections of the labels of these decisions, which counted as `was`; said : what the rows have in common."""
-        first = self.scope.next_number(connection, CORRECTION.c.number)
-        newest = self.scope.next_number(connection, LABEL.c.seq) - 1
-        row = {**said, "cell_id": self.cell_id, "newest_seq": newest}
-        rows = [row | {"number": i, "decision_id": name, "was": was[name]} for i, name in enumerate(was, first)]
-        for part in chunks(rows):
-            connection.execute(sa.insert(CORRECTION), part)
+        now, text = float(self._clock()), "counts as a failure, was a success: its stop came after its confirmation"
+        events = [to_row(Event(0, now, "late stop", f"decision {as_text(name)} {text}")) for name in names]
+        numbers = self.insert(connection, EVENT.c.number, events)
+        said = {"author": "", "time": now, "success": False, "was": True}
+        self.correct(connection, [said | {"event": i, "decision_id": name} for i, name in zip(numbers, names, strict=True)])
 
     def _take_decisions(self, connection: sa.Connection, decisions: Sequence[StoredDecision]) -> list[Event]:
         """Insert the new ones; returns what is to be said of those whose id has another decision."""
-        same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
-        query = sa.select(*DECISION.c, TRACE.c.data).select_from(DECISION.outerjoin(TRACE, same))
-        query = query.where(DECISION.c.cell_id == self.cell_id)
-        stored: dict[str, Any] = {}
-        for part in chunks([each.decision.id for each in decisions]):
-            stored |= {row.id: row._mapping for row in connection.execute(query.where(DECISION.c.id.in_(part)))}
-        self.insert(connection, [each for each in decisions if each.decision.id not in stored])
+        query = sa.select(*DECISION.c, *TRACE.c["decision_id", "channels", "samples", "data"]).select_from(WITH_TRACES)
+        stored = self._by_id(connection, query, [each.decision.id for each in decisions])
+        new = [each for each in decisions if each.decision.id not in stored]
+        self.insert(connection, DECISION.c.number, [decision_row(each) for each in new])
+        if new:
+            connection.execute(sa.insert(TRACE), [{"cell_id": self.cell_id} | trace_row(each) for each in new])
         events = []
         for each in decisions:
             if (row := stored.get(each.decision.id)) is not None:
-                given = decision_row(self.cell_id, each) | {"data": pack(each.trace)}
-                if other := ", ".join(name for name, value in given.items() if row[name] != value):
+                given = decision_row(each) | trace_row(each)
+                if other := ", ".join(name for name, value in given.items() if row._mapping[name] != value):
                     events.append(self._set_aside(f"{_named(each)}, of which the store holds another: {other} differ"))
         return events
 
     def _new_events(self, connection: sa.Connection, events: Sequence[Event]) -> list[Event]:
+        if not events:
+            return []
         query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text).where(EVENT.c.cell_id == self.cell_id)
         stored = {tuple(row) for row in connection.execute(query.where(EVENT.c.time.in_([each.time for each in events])))}
         return [each for each in events if (each.time, each.kind, each.text) not in stored]
-
-    def _insert_events(self, connection: sa.Connection, events: Sequence[Event]) -> None:
-        if events:
-            first = self.scope.next_number(connection, EVENT.c.number)
-            rows = [to_row(each) | {"cell_id": self.cell_id, "number": i} for i, each in enumerate(events, first)]
-            connection.execute(sa.insert(EVENT), rows)
 
     def _set_aside(self, text: str) -> Event:
         log.error("dead letter: %s", text)

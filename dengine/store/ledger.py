@@ -30,7 +30,6 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..files import read_key
-from .queries import Scope
 from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
 
 KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
@@ -143,80 +142,51 @@ def _loaded(held: str) -> dict[str, str]:
     return {}
 
 
-DOUBLES = {
-    name: tuple(column.name for column in table.c if isinstance(column.type, sa.Double)) for name, table in CHAINED.items()
-}
-Row = Mapping[str, Any]
-
-
 class LedgerEntry:
-    """The entry that a transaction under way will end with; nothing is asked or written where it adds no row.
+    """The entry that a transaction under way will end with. The cell is locked: two processes may write to it.
 
-    scope : whose ledger.  clock : the time in seconds that the entry is stamped with.  key : of a keyed ledger.
-    written : its number and digest, in hexadecimal, once it is; None before, and where there is none.
+    key : of a keyed ledger.  settings : whether they change.
     """
 
-    def __init__(self, scope: Scope, clock: Callable[[], float], key: bytes = b"") -> None:
-        self._scope, self.cell_id, self._key = scope, scope.cell_id, key
-        self.written: tuple[int, str] | None = None
-        self._clock = clock
-        self._number = 0  # 0: not begun
-        self._previous = START
+    def __init__(self, connection: sa.Connection, cell_id: str, key: bytes = b"") -> None:
+        self._connection, self._cell_id, self._key = connection, cell_id, key
+        last = newest_entry(connection, cell_id)
+        self._number: int = 1 if last is None else last.number + 1
+        self._previous: bytes = START if last is None else last.digest
+        self._held = {} if last is None else _loaded(last.held)
         self._sums: dict[str, list[bytes]] = {}
-        self._settings = False
-        self._held: dict[str, str] = {}
+        self.settings = False
 
-    def take(self, connection: sa.Connection, table: str, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    def take(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return rows on their way into a table with the number of the entry, and each with its sum."""
-        self._begin(connection)
-        taken = [self._summed(table, row) for row in rows]
+        taken = [{**row, "entry": self._number} for row in rows]
+        for row in taken:
+            row["sum"] = row_sum(table, row)
         self._sums.setdefault(table, []).extend(row["sum"] for row in taken)
         return taken
 
-    def _summed(self, table: str, row: Row) -> dict[str, Any]:
-        full = {**row, "entry": self._number}
-        for name in DOUBLES[table]:  # an integer comes back as a float
-            if name in full and type(full[name]) is not float:
-                full[name] = None if full[name] is None else float(full[name])
-        if "state" in row:
-            full["state_sum"] = state_sum(row["state"])
-        return full | {"sum": row_sum(table, full)}
+    def append(self, clock: Callable[[], float]) -> tuple[int, str] | None:
+        """Write the entry, as the last of the transaction; its number and digest, None where there is nothing to chain.
 
-    def take_settings(self, connection: sa.Connection) -> None:
-        """Note that the settings change."""
-        self._begin(connection)
-        self._settings = True
-
-    def _begin(self, connection: sa.Connection) -> None:
-        """Lock the cell, before the newest entry is read: two processes may write to it."""
-        if self._number:
-            return
-        self._scope.lock_cell(connection)
-        last = newest_entry(connection, self.cell_id)
-        if last is None:
-            self._number = 1
-        else:
-            self._number, self._previous, self._held = last.number + 1, last.digest, _loaded(last.held)
-
-    def append(self, connection: sa.Connection) -> None:
-        """Write the entry, as the last of the transaction, where there is one."""
-        if not self._number:
-            return
-        settings = held_settings(connection, self.cell_id) if self._settings else None
+        clock : the time in seconds that it is stamped with.
+        """
+        if not (self._sums or self.settings):
+            return None
+        settings = held_settings(self._connection, self._cell_id) if self.settings else None
         held = {name: _onward(self._held.get(name, ""), self._sums[name]) for name in IN_FORCE if name in self._sums}
         held |= {} if settings is None else {SETTING.name: _of_settings(settings)}
         head = {
-            "cell_id": self.cell_id,
+            "cell_id": self._cell_id,
             "number": self._number,
-            "time": float(self._clock()),
+            "time": float(clock()),
             "added": json.dumps({table: len(sums) for table, sums in sorted(self._sums.items())}),
             "rows": rows_digest(self._sums),
             "held": json.dumps(self._held | held, sort_keys=True),
             "settings": None if settings is None else json.dumps(settings, sort_keys=True),
         }
         digest = entry_digest(self._previous, head, self._key)
-        connection.execute(sa.insert(LEDGER), head | {"digest": digest})
-        self.written = self._number, digest.hex()
+        self._connection.execute(sa.insert(LEDGER), head | {"digest": digest})
+        return self._number, digest.hex()
 
 
 def held_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
@@ -231,9 +201,10 @@ def settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     newest = sa.select(LEDGER.c.settings).where(LEDGER.c.cell_id == cell_id, LEDGER.c.settings.is_not(None))
     with suppress(ValueError, TypeError):  # the entry itself was changed: of that the chain tells
         chained = dict(json.loads(connection.execute(newest.order_by(LEDGER.c.number.desc()).limit(1)).scalar() or "{}"))
-    other = [key for key in sorted(held.keys() | chained.keys(), key=str) if held.get(key) != chained.get(key)]
     return {
-        key: "is not chained" if key not in chained else "is missing" if key not in held else "was changed" for key in other
+        key: "is not chained" if key not in chained else "is missing" if key not in held else "was changed"
+        for key in sorted(held.keys() | chained.keys(), key=str)
+        if held.get(key) != chained.get(key)
     }
 
 
@@ -290,20 +261,15 @@ def chain_writes(engine: sa.Engine) -> None:
     sa.event.listen(engine, "before_execute", _meet, retval=True)
 
 
-Met = tuple[Any, Sequence[Row], Row]
-
-
-def _meet(connection: sa.Connection, statement: Any, many: Sequence[Row], one: Row, options: Mapping[str, Any]) -> Met:
+def _meet(connection: sa.Connection, statement: Any, many: Any, one: Any, options: Any) -> tuple[Any, Any, Any]:
     """See what is about to be executed: rows for a chained table are taken into the entry of the transaction."""
-    entry = connection.get_execution_options().get("dengine_entry")
+    entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):
         return statement, many, one
     table = statement.table.name if isinstance(statement.table, sa.Table) else ""
-    if table == SETTING.name:
-        entry.take_settings(connection)
+    entry.settings |= table == SETTING.name
     if table not in CHAINED or not isinstance(statement, sa.Insert):
         return statement, many, one
     if not (many or one):
         raise StoreError(f"Expected the rows of {table} beside the statement, got none; execute(insert(table), rows).")
-    taken = entry.take(connection, table, many or [one])
-    return (statement, taken, {}) if many else (statement, (), taken[0])
+    return statement, entry.take(table, many or [one]), {}

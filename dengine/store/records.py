@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import UnionType
 from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
@@ -16,15 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
-from ..errors import ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
+from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
+from ..files import read_archive
 from ..records import Decision, RetrainReport, Source
 
 SAFE_MODE_BEGAN, SAFE_MODE_ENDED = "safe mode", "safe mode ended"  # kinds of events
 T = TypeVar("T")
-STATUS_EVENTS = 5  # newest ones that a status shows
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)  # what stands, and what comes: silence was no success after all
 FORGOTTEN = 2  # beside 0 and 1: a label that takes no part any more
+CHUNK = 500  # rows sent or fetched at a time
 KEEP = 5  # newest versions that keep their states
 # Beginnings of names in a version's state: what its maker's parts taught its rule.
 RULE = ("rule.", "untold", "told_to", "owed")
@@ -65,16 +68,12 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
-    if data is None:
-        return None
     try:
-        text = json.dumps(dict(data), allow_nan=False)
+        return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
     except (TypeError, ValueError) as error:
         raise StoreError(
             f"Expected an event's data as JSON has it, got {data!r}: {error}; give numbers and text."
         ) from error
-    plain: dict[str, Any] = json.loads(as_text(text))
-    return plain
 
 
 def as_text(text: str) -> str:
@@ -84,12 +83,10 @@ def as_text(text: str) -> str:
 
 def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
     """Copy a version's arrays; an accepted version needs them, and none may hold Python objects (a pickle)."""
-    if state is None:
-        if report.accepted:
-            raise StoreError(f"Expected the arrays of accepted version {report.version}, got None; pass its state.")
-        return None
-    copies = {name: np.array(values) for name, values in state.items()}
-    for name, values in copies.items():
+    if state is None and report.accepted:
+        raise StoreError(f"Expected the arrays of accepted version {report.version}, got None; pass its state.")
+    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
+    for name, values in (copies or {}).items():
         if values.dtype.hasobject:
             raise StoreError(f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers or strings.")
     return copies
@@ -195,14 +192,6 @@ class Evidence:
     silent: NDArray[np.int64]
     predicted: NDArray[np.int64]
     looked: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, rows: Iterable[tuple[Any, ...]]) -> Evidence:
-        """Stack rows of (seq, lower, upper, success, novel, silent, predicted, looked)."""
-        columns = zip(*rows, strict=True)
-        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64, np.int64, np.float64)
-        arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
-        return cls(*arrays)
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,7 +329,8 @@ def _written(value: Any, kind: type) -> Any:
         return None
     if issubclass(kind, StrEnum):
         return kind(value).value
-    writers: dict[type, Callable[[Any], Any]] = {tuple: _as_json, dict: _as_json, np.ndarray: pack}
+    as_json = partial(json.dumps, default=float)
+    writers: dict[type, Callable[[Any], Any]] = {tuple: as_json, dict: as_json, np.ndarray: pack}
     return writers.get(kind, kind)(value)
 
 
@@ -353,8 +343,22 @@ def _read(value: Any, kind: type) -> Any:
     return readers.get(kind, kind)(value)
 
 
-def _as_json(value: Any) -> str:
-    return json.dumps(value, default=float)
+def decision_row(item: StoredDecision) -> dict[str, Any]:
+    """The row of the table `decision`."""
+    return to_row(item.decision) | to_row(item, *OF_DECISION)
+
+
+def trace_row(item: StoredDecision) -> dict[str, Any]:
+    """The row of the table `trace`."""
+    channels, samples = item.trace.shape
+    return {"decision_id": item.decision.id, "channels": channels, "samples": samples, "data": pack(item.trace)}
+
+
+def read_decision(row: Any) -> StoredDecision:
+    """A row of `decision`, joined with its label where it has one, and with its trace where it is wanted."""
+    held = row._mapping
+    trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in held else NO_TRACE
+    return from_row(StoredDecision, held, decision=from_row(Decision, held), trace=trace)
 
 
 def pack(values: NDArray[np.float32]) -> bytes:
@@ -367,9 +371,27 @@ def unpack(blob: bytes) -> NDArray[np.float32]:
     return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 
-def as_label(counted: int | None) -> bool | None:
-    """Return a label as it counts; None where there is none, or where it is forgotten."""
-    return None if counted in (None, FORGOTTEN) else bool(counted)
+def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
+    """The rows in parts of at most CHUNK."""
+    return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
+
+
+def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
+    """Arrays as an npz file; written member by member, since `np.savez` reserves the name `file`."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, values in state.items():
+            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.save(member, values, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
+    """What `to_npz` wrote; a pickle in it is refused."""
+    try:
+        return read_archive(blob, name=f"a version in {name}")[0]
+    except DataError as error:
+        raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error
 
 
 class VersionError(StoreError):
@@ -407,11 +429,3 @@ def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     while age >= 10 * step:
         step *= 10
     return version % step == 0
-
-
-def not_kept(version: int, kept: Collection[int]) -> VersionError:
-    """Return the error for a version that cannot be loaded; it names those that can."""
-    others = ", ".join(str(each) for each in sorted(set(kept) - {version})) or "none"
-    return VersionError(
-        f"Expected a version whose state is held, got {version}, which is not kept; load one of these: {others}."
-    )

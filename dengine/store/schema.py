@@ -2,42 +2,24 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
-from ..errors import DataError, StoreError
-from ..files import read_archive
+from ..errors import StoreError
 from ..records import Decision, RetrainReport
-from .records import (
-    NO_TRACE,
-    OF_DECISION,
-    Correction,
-    Event,
-    NewLabel,
-    StoredDecision,
-    columns,
-    from_row,
-    pack,
-    to_row,
-    unpack,
-)
+from .records import OF_DECISION, Correction, Event, NewLabel, StoredDecision, columns
 
 SCHEMA = "1"
-SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell, which also serves as the cell's lock
+SCHEMA_KEY = "schema_version"  # a row of `setting` for every cell
 PRODUCT_KEY = "product"  # a row of `setting` for every cell that shares what it learns
 LEDGER_KEY = "ledger_key"  # a row of `setting` for every cell whose ledger is keyed: what tells its key from others
+TABLES, PRODUCT, CELL = range(7236482514, 7236482517)  # what is held; the numbers are nobody else's
 RESERVED = (SCHEMA_KEY, PRODUCT_KEY, LEDGER_KEY)  # rows of `setting` that are the store's own
-CHUNK = 500  # rows sent or fetched at a time
 
 METADATA = sa.MetaData()
-T = TypeVar("T")
 KINDS: dict[type, Any] = {
     str: sa.String,
     int: sa.BigInteger,
@@ -131,13 +113,19 @@ LEDGER = sa.Table(  # an entry for every transaction that added rows or changed 
 )
 
 
+def hold(connection: sa.Connection, kind: int, name: str = "") -> None:
+    """Hold the tables, then a cell, then a product until the transaction ends, so that numbers are committed in order."""
+    if connection.dialect.name == "postgresql":  # SQLite's BEGIN IMMEDIATE did it already
+        lock = sa.text("SELECT pg_advisory_xact_lock(hashtextextended(:name, :kind))")
+        connection.execute(lock, {"name": name, "kind": kind})
+
+
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     """Create the tables in an empty database, or check that they are ours; enter the cell.
 
     name : of the database, for the error.
     """
-    if connection.dialect.name == "postgresql":  # two cells may create the tables at the same moment
-        connection.execute(sa.text("SELECT pg_advisory_xact_lock(7236482514)"))
+    hold(connection, TABLES)  # two cells may create them at the same moment
     found = set(sa.inspect(connection).get_table_names())
     # A file belongs to one program; a PostgreSQL database may hold other tables beside ours.
     if found & set(METADATA.tables) or (found and connection.dialect.name == "sqlite"):
@@ -169,45 +157,3 @@ def check_schema(connection: sa.Connection, name: str) -> None:
     for table in METADATA.tables.values():
         if missing := set(table.c.keys()) - found.get(table.name, set()):
             raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")
-
-
-def decision_row(cell_id: str, item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `decision`."""
-    return {"cell_id": cell_id, **to_row(item.decision), **to_row(item, *OF_DECISION)}
-
-
-def trace_row(cell_id: str, item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `trace`."""
-    channels, samples = item.trace.shape
-    row = {"cell_id": cell_id, "decision_id": item.decision.id, "channels": channels, "samples": samples}
-    return row | {"data": pack(item.trace)}
-
-
-def read_decision(row: Any) -> StoredDecision:
-    """A row of `decision`, joined with its label where it has one, and with its trace where it is wanted."""
-    held = row._mapping
-    trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in held else NO_TRACE
-    return from_row(StoredDecision, held, decision=from_row(Decision, held), trace=trace)
-
-
-def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
-    """The rows in parts of at most CHUNK."""
-    return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
-
-
-def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Arrays as an npz file; written member by member, since `np.savez` reserves the name `file`."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, values in state.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
-                np.save(member, values, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
-    """What `to_npz` wrote; a pickle in it is refused."""
-    try:
-        return read_archive(blob, name=f"a version in {name}")[0]
-    except DataError as error:
-        raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error

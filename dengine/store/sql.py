@@ -9,7 +9,6 @@ what it decides: that goes into a journal first, and from there, by `take`, into
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import time
@@ -29,25 +28,22 @@ from .ledger import held_settings, is_sound, state_sum
 from .peers import must_agree
 from .queries import (
     LABEL_OF_DECISION,
+    SAID,
+    TRACE_OF_DECISION,
     WITH_LABELS,
     Scope,
-    cells_of,
     counted,
-    decisions_query,
     how_looked,
-    lock_product,
     n_decisions,
-    newest_of,
     past_query,
-    remembered,
     since,
     stretches_query,
-    tally_query,
     training_query,
 )
 from .records import (
+    CHUNK,
+    FORGOTTEN,
     KEEP,
-    STATUS_EVENTS,
     Change,
     Correction,
     Event,
@@ -61,33 +57,22 @@ from .records import (
     StoredVersion,
     VersionError,
     as_data,
-    as_label,
     as_text,
     check_state,
+    chunks,
+    from_npz,
     from_row,
     keeps_state,
-    not_kept,
     nothing_to_correct,
+    read_decision,
+    to_npz,
     to_row,
     unknown_decision,
     unpack,
     without_rule,
 )
-from .schema import (
-    CHUNK,
-    CORRECTION,
-    DECISION,
-    EVENT,
-    LABEL,
-    RESERVED,
-    SETTING,
-    TRACE,
-    VERSION,
-    from_npz,
-    read_decision,
-    to_npz,
-)
-from .views import HistoryFilter, Kind, PastLabel, Stretch, Tally
+from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, RESERVED, SETTING, TRACE, VERSION, hold
+from .views import LABELS, HistoryFilter, Kind, PastLabel, Stretch, Tally
 
 if TYPE_CHECKING:
     from .verification import HistoryReport
@@ -96,7 +81,6 @@ WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
 NAMED = 20  # decisions that an event names
-REPORT = ("version", "seconds", "n_traces", "n_steps", "accepted", "reason")  # the fields of a `RetrainReport`
 
 
 class SqlStore:
@@ -148,14 +132,13 @@ class SqlStore:
         self.database = Database(url if url is None else str(url), cell_id, clock, product, lambda: self.before_use())
         self._read, self._scope = self.database.read, self.database.scope
         self.product = self._scope.product
-        self._remote = self.database.url.get_backend_name() != "sqlite"
         self._journal: Journal | None = None
 
     # Settings
 
     def settings(self) -> dict[str, str]:
         """What `save_settings` was given; {} for a new store."""
-        with self.database.transaction(write=False) as connection:
+        with self.database.reading() as connection:
             return held_settings(connection, self.cell_id)
 
     def save_settings(self, settings: Mapping[str, str]) -> None:
@@ -167,9 +150,8 @@ class SqlStore:
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(f"Expected settings of the engine, got {key!r}, which is the store's; rename it.")
         if self.product is not None:
-            self._scope.lock_cell(connection)
-            lock_product(connection, self.product)
-            for name, theirs in self._peers_of(connection, self.product).items():
+            hold(connection, PRODUCT, self.product)
+            for name, theirs in self._peers_of(connection).items():
                 must_agree(settings, theirs, name, self.product)
         mine = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
         connection.execute(sa.delete(SETTING).where(mine))
@@ -179,15 +161,12 @@ class SqlStore:
 
     def peers_settings(self) -> dict[str, dict[str, str]]:
         """Return the settings of the product's other cells, by cell."""
-        if self.product is None:
-            return {}
-        with self.database.transaction(write=False) as connection:
-            return self._peers_of(connection, self.product)
+        with self.database.reading() as connection:
+            return self._peers_of(connection)
 
-    def _peers_of(self, connection: sa.Connection, product: str) -> dict[str, dict[str, str]]:
-        query = cells_of(product).where(SETTING.c.cell_id != self.cell_id).order_by(SETTING.c.cell_id)
-        names = connection.execute(query).scalars().all()
-        return {name: held for name in names if (held := held_settings(connection, name))}
+    def _peers_of(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
+        peers = self._scope.cells(connection)[1:]
+        return {name: held for name in peers if (held := held_settings(connection, name))}
 
     # Decisions
 
@@ -201,28 +180,21 @@ class SqlStore:
 
         trace : with it; StoreError where it is not as it was stored.
         """
-        if not trace:
-            rows = self._read(past_query(self.cell_id).where(DECISION.c.id == decision_id))
-            return read_decision(rows[0]) if rows else None
-        same = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
-        stored = (TRACE.c.entry.label("trace_entry"), TRACE.c.sum.label("trace_sum"))
-        query = past_query(self.cell_id).add_columns(*TRACE.c["channels", "samples", "data"], *stored)
-        rows = self._read(query.outerjoin(TRACE, same).where(DECISION.c.id == decision_id))
+        query = past_query(self.cell_id).where(DECISION.c.id == decision_id)
+        rows = self._read(query.add_columns(*TRACE.c).outerjoin(TRACE, TRACE_OF_DECISION) if trace else query)
         if not rows:
             return None
-        row = rows[0]
-        values = {"cell_id": row.cell_id, "decision_id": row.id, "channels": row.channels, "samples": row.samples}
-        if not is_sound(TRACE.name, values | {"data": row.data, "entry": row.trace_entry, "sum": row.trace_sum}):
+        if trace and not is_sound(TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))):
             raise StoreError(
-                f"Expected the trace of decision {row.id!r} as it was stored in {self.database.name}, its bytes have "
-                "changed; see `dengine verify`, and restore the store from a copy."
+                f"Expected the trace of decision {decision_id!r} as it was stored in {self.database.name}, its bytes "
+                "have changed; see `dengine verify`, and restore the store from a copy."
             )
-        return read_decision(row)
+        return read_decision(rows[0])
 
     def decision_ids(self) -> Iterator[Sequence[str]]:
         """Yield the ids of every decision, in any order and in pieces, so that others have their turns."""
         query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
-        with self.database.transaction(write=False) as connection:
+        with self.database.reading() as connection:
             yield from connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
 
     # Training
@@ -247,7 +219,7 @@ class SqlStore:
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
         query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
         query = query if last is None else query.where(LABEL.c.seq <= last)
-        with self.database.transaction(write=False) as connection:
+        with self.database.reading() as connection:
             rows = self._newest(connection, query, limit, last)[::-1]
             found, damaged = self._with_traces(connection, rows, scope)
         return self._told_of(damaged, found)
@@ -257,7 +229,7 @@ class SqlStore:
     ) -> Sequence[Any]:
         """The newest labels, newest first. Of a product: by their numbers, or all would be read to be sorted."""
         if self.product is not None and limit is not None:
-            newest = connection.execute(newest_of(self.product, LABEL.c.seq)).scalar() or 0
+            newest = self._scope.newest(connection, LABEL.c.seq)
             newest = newest if last is None else min(newest, last)
             rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
             if len(rows) == limit or newest <= 2 * limit:
@@ -267,13 +239,10 @@ class SqlStore:
     def news_since(self, seq: int, limit: int) -> News:
         """Return the labels after `seq`, at most `limit`, and the numbers of the newest version and correction."""
         query = training_query(self._scope).where(LABEL.c.seq > int(seq)).order_by(LABEL.c.seq).limit(limit)
-        with self.database.transaction(write=False) as connection:
+        with self.database.reading() as connection:
             found, damaged = self._with_traces(connection, connection.execute(query).all(), self._scope)
-            version = correction = 0
-            if self.product is not None:
-                accepted = newest_of(self.product, VERSION.c.version, VERSION.c.accepted == sa.true())
-                version = connection.execute(accepted).scalar() or 0
-                correction = connection.execute(newest_of(self.product, CORRECTION.c.number)).scalar() or 0
+            version = self._scope.newest_version(connection)
+            correction = self._scope.newest(connection, CORRECTION.c.number)
         return News(self._told_of(damaged, found), version, correction)
 
     def _with_traces(self, connection: sa.Connection, rows: Sequence[Any], scope: Scope) -> tuple[Labelled, list[str]]:
@@ -325,27 +294,30 @@ class SqlStore:
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], counted(), DECISION.c.reason, LABEL.c.silent, *how_looked())
+        label = counted()
+        novel = DECISION.c.reason == Reason.NOVEL.value
+        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label, novel, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
-        query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, remembered())
-        rows = self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq))
-        return Evidence.of((*row[:4], row.reason == Reason.NOVEL, *row[5:]) for row in rows)
+        query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
+        columns = zip(*self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq)), strict=True)
+        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64, np.int64, np.float64)
+        arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
+        return Evidence(*arrays)
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
-        mine = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.quarantined == sa.false()) & LABEL.c.seq.is_(None)
-        query = sa.select(DECISION.c.id).select_from(WITH_LABELS).where(mine, DECISION.c.action == Action.ACCEPT.value)
-        return [row.id for row in self._read(query.where(since(DECISION, since_version)).order_by(DECISION.c.number))]
-
-    def _owed(self) -> sa.ColumnElement[bool]:
-        """Whether a decision asked for a check of which nothing was reported."""
-        return (DECISION.c.action == Action.VERIFY.value) & LABEL.c.seq.is_(None) & (DECISION.c.quarantined == sa.false())
+        return [row.id for row in self._read(self._unheard_of(Action.ACCEPT, since_version, DECISION.c.id))]
 
     def owed(self, since_version: int = 0) -> list[tuple[StoredDecision, int]]:
         """Return the decisions whose checks were not reported, oldest first, and how many came since each."""
         newer = (n_decisions(self.cell_id) - DECISION.c.number).label("newer")
-        query = past_query(self.cell_id).add_columns(newer).where(self._owed(), since(DECISION, since_version))
-        return [(read_decision(row), int(row.newer)) for row in self._read(query.order_by(DECISION.c.number))]
+        rows = self._read(self._unheard_of(Action.VERIFY, since_version, *DECISION.c, newer))
+        return [(read_decision(row), row.newer) for row in rows]
+
+    def _unheard_of(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
+        query = sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
+        query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false())
+        return query.where(since(DECISION, since_version)).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
@@ -361,34 +333,24 @@ class SqlStore:
         return self.tally(since_version=since_version, within=within).outcomes
 
     def status(self) -> dict[str, Any]:
-        """Count decisions, labels and versions; show the newest events."""
-        every, retrains = self.tally(), self.retrains()
+        """Count decisions and labels, by what they are. Of retrains tells `versions`, of events `events`."""
+        every = self.tally()
         actions, reasons = every.by("action"), every.by("reason")
         sources: Counter[Any] = Counter()
         for kind in every.kinds:
             sources[kind.source] += kind.n if kind.success is not None else 0
-        versions, forgotten = [report.version for report in retrains if report.accepted], every.by("label")["forgotten"]
-        corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct())).where(
-            CORRECTION.c.cell_id == self.cell_id
-        )
+        forgotten = every.by("label")["forgotten"]
+        corrected = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
         return {
-            "cell_id": self.cell_id,
             "decisions": every.count(),
             "actions": {action.value: actions[action] for action in Action},
             "reasons": {reason.value: reasons[reason] for reason in Reason},
             "quarantined": every.by("quarantined")[True],
             "labels": sources.total(),
             "sources": {source.value: sources[source] for source in Source},
-            "corrected": self._read(corrected)[0][0] - forgotten,
+            "corrected": self._read(corrected.where(CORRECTION.c.cell_id == self.cell_id))[0][0] - forgotten,
             "forgotten": forgotten,
-            "retrains": len(retrains),
-            "versions": len(versions),
-            "last_version": versions[-1] if versions else None,
-            "first_time": every.first,
-            "last_time": every.last,
-            "last_label_time": every.last_label,
-            "events": [{"kind": each.kind, "text": each.text, "time": each.time} for each in self.events(STATUS_EVENTS)],
-        } | ({} if self.product is None else {"product": self.product})
+        }
 
     # Model versions
 
@@ -397,7 +359,7 @@ class SqlStore:
 
         That is the report's, but where cells share versions and a peer's was stored meanwhile: then the next.
         """
-        given = report, last_seq, check_state(report, state), self.clock()
+        given = report, last_seq, check_state(report, state), float(self.clock())
         if self.wait is None and self.product is None:
             self._trained.append(given)
             if len(self._trained) == MOST_TRAINED:
@@ -418,14 +380,16 @@ class SqlStore:
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None, now: float
     ) -> dict[str, Any]:
         arrays = check_state(report, state)
-        held = {"cell_id": self.cell_id, "time": now, "last_seq": int(last_seq)}
-        return held | {"state": None if arrays is None else to_npz(arrays)} | to_row(report)
+        blob = None if arrays is None else to_npz(arrays)
+        return {"time": now, "last_seq": int(last_seq), "state": blob, "state_sum": state_sum(blob)} | to_row(report)
 
     def _add_version(self, connection: sa.Connection, row: dict[str, Any]) -> int:
         """Insert a version, and let go of states that `keeps_state` does not keep; returns its number."""
-        retrain = self._scope.next_number(connection, VERSION.c.retrain)
-        number = self._scope.next_version(connection, row["version"], row["accepted"])
-        connection.execute(sa.insert(VERSION), row | {"retrain": retrain, "version": number})
+        number: int = row["version"]
+        if self.product is not None and row["accepted"]:  # a peer's may have come before
+            hold(connection, PRODUCT, self.product)
+            number = max(number, self._scope.newest_version(connection) + 1)
+        self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         if row["accepted"]:
             held = connection.execute(self._accepted().where(VERSION.c.state.is_not(None))).all()
             gone = [each.retrain for each in held if not keeps_state(each.version, number, self.keep_versions)]
@@ -455,7 +419,10 @@ class SqlStore:
         """Return an accepted version by its number. VersionError, naming those that can be loaded, where it cannot."""
         held = {row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept}
         if version not in held:
-            raise not_kept(version, held)
+            others = ", ".join(map(str, held)) or "none"
+            raise VersionError(
+                f"Expected a version whose state is held, got {version}, which is not kept; load one of these: {others}."
+            )
         return self._loaded(held[version])
 
     def _loaded(self, retrain: int) -> ModelVersion:
@@ -480,14 +447,12 @@ class SqlStore:
 
         own : this cell's alone.
         """
-        size = sa.func.length(VERSION.c.state).label("size")
-        columns = (*VERSION.c["retrain", "time", "last_seq"], size, *VERSION.c[REPORT])
-        mine = VERSION.c.cell_id == self.cell_id if own else self._scope.shared(VERSION.c.cell_id)
-        rows = self._read(sa.select(*columns).where(mine).order_by(VERSION.c.retrain))
-        return [
-            StoredVersion(row.retrain, row.time, row.last_seq, RetrainReport(*row[4:]), row.size or 0, row.size is not None)
-            for row in rows
-        ]
+        kept = VERSION.c.state.is_not(None).label("kept")
+        n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
+        query = sa.select(*(c for c in VERSION.c if c.name != "state"), VERSION.c.retrain.label("number"), n_bytes, kept)
+        scope = Scope(self.cell_id) if own else self._scope
+        rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
+        return [from_row(StoredVersion, row._mapping, report=from_row(RetrainReport, row._mapping)) for row in rows]
 
     def retrains(self) -> list[RetrainReport]:
         """Return every retrain, oldest first."""
@@ -518,13 +483,12 @@ class SqlStore:
 
         Raises ReportError for a decision that is unknown or has no label.
         """
-        now, author = self.clock(), as_text(change.author)
+        now, author = float(self.clock()), as_text(change.author)
         said = Event(0, now, as_text(change.kind), as_text(change.text), as_data(change.data), author)
         version = None if change.version is None else self._version_row(*change.version, now)
 
         def add(connection: sa.Connection) -> int:
-            number = self._scope.next_number(connection, EVENT.c.number)
-            connection.execute(sa.insert(EVENT), {"cell_id": self.cell_id} | to_row(said) | {"number": number})
+            (number,) = self.database.insert(connection, EVENT.c.number, [to_row(said)])
             if change.decisions:
                 self._correct(connection, change, {"author": author, "event": number, "time": now})
             if version is not None and (stored := self._add_version(connection, version)) != version["version"]:
@@ -545,16 +509,17 @@ class SqlStore:
                 raise unknown_decision(name)
             if held[name].counted is None:
                 raise nothing_to_correct(name)
-        was = {name: as_label(held[name].counted) for name in change.decisions}
-        self.database.insert_corrections(connection, {**event, "success": change.success}, was)
+        counts = {0: False, 1: True, FORGOTTEN: None}
+        was = {name: counts[held[name].counted] for name in change.decisions}
+        said = {**event, "success": change.success}
+        self.database.correct(connection, [said | {"decision_id": name, "was": label} for name, label in was.items()])
 
     def corrections(self, after: int = 0) -> list[Correction]:
         """Return the corrections after number `after`, oldest first."""
-        own = ("number", "time", "decision_id", "success", "was", "author", "event", "newest_seq")
         same = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (LABEL.c.decision_id == CORRECTION.c.decision_id)
-        query = sa.select(*CORRECTION.c[own], LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
+        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(CORRECTION.join(LABEL, same))
         query = query.where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
-        return [Correction(*row) for row in self._read(query.order_by(CORRECTION.c.number))]
+        return [from_row(Correction, row._mapping) for row in self._read(query.order_by(CORRECTION.c.number))]
 
     # Looking back
 
@@ -566,14 +531,28 @@ class SqlStore:
         beyond : only those before (or after) the one of this id: the next page. Their order is that of the decisions,
         whatever the clock said.
         """
-        rows = self._read(decisions_query(self.cell_id, where, beyond, newest).limit(limit))
+        asked = ((column, getattr(where, column.name)) for column in DECISION.c["action", "predicted", "reason", "part"])
+        meant = [column == str(wanted) for column, wanted in asked if wanted is not None]
+        if where.label is not None:
+            label = LABELS[where.label]
+            meant.append(SAID.is_(None) if label is None else SAID.in_([int(label)]))
+        if where.since is not None:
+            meant.append(DECISION.c.time >= where.since)
+        if where.until is not None:
+            meant.append(DECISION.c.time < where.until)
+        number = DECISION.c.number
+        if beyond is not None:
+            one = DECISION.alias("beyond")
+            there = sa.select(one.c.number).where(one.c.cell_id == self.cell_id, one.c.id == beyond).scalar_subquery()
+            meant.append(number < there if newest else number > there)
+        query = past_query(self.cell_id).where(*meant).order_by(number.desc() if newest else number)
+        rows = self._read(query.limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
-    def past_labels(self, after: int, upto: int | None = None, points: bool = False) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, oldest first; points : with them."""
-        columns: list[Any] = [column for column in LABEL.c if points or column.name != "point"]
-        columns += [*DECISION.c["lower", "upper", "reason"], *how_looked(), *([] if points else [sa.null().label("point")])]
-        query = sa.select(*columns).select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+    def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
+        """Return the labels after number `after`, up to `upto`, oldest first."""
+        query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *how_looked())
+        query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
@@ -583,10 +562,17 @@ class SqlStore:
 
         within : decisions after which one that asked for a check, and got none, is overdue; None: none is.
         """
-        rows = self._read(tally_query(self.cell_id, last, since_version, within))
-        first, newest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
+        newest = n_decisions(self.cell_id)
+        aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label("aged")
+        columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
+        kind = (*columns, aged, SAID.label("success"), LABEL.c.source, sa.func.count().label("n"))
+        times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
+        query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, LABEL.c.source)
+        query = query.where(DECISION.c.cell_id == self.cell_id, since(DECISION, since_version))
+        rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
+        first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
-        return Tally(kinds, min(first, default=None), max(newest, default=None), max(label, default=None))
+        return Tally(kinds, min(first, default=None), max(latest, default=None), max(label, default=None))
 
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
         """Cut all decisions into `n` stretches of one length at most, oldest first; the newest may be shorter.
@@ -611,7 +597,7 @@ class SqlStore:
             return None
         journal = Journal(journal_path(self.database.url, self.cell_id))
         try:
-            if self._remote:
+            if self.database.url.get_backend_name() != "sqlite":
                 self.database.lease()
         except StoreError:
             journal.close()
@@ -627,31 +613,29 @@ class SqlStore:
         """
         if self.wait is not None:
             return self.database.take(records)
-        if len(records) == 1 and isinstance(one := records[0], StoredDecision) and one.decision.id not in self._held:
-            self._held[one.decision.id] = False  # as at each decision
-            self._waiting.append(one)
-            return []
-        made = dict.fromkeys((each.decision.id for each in records if isinstance(each, StoredDecision)), False)
-        labelled = dict.fromkeys((each.decision_id for each in records if isinstance(each, NewLabel)), True)
-        once = len(made) + len(labelled) == sum(not isinstance(each, Event) for each in records)
-        known = [name for name in labelled if made.get(name, self._held.get(name, True))]  # or of no decision
-        if once and not known and self._held.keys().isdisjoint(made):
-            numbers = list(zip(labelled, itertools.count(self._labels + 1)))  # nobody else gives any
-            self._waiting += records
+        numbers: list[tuple[str, int]] = []
+        for each in records:
+            if isinstance(each, StoredDecision) and each.decision.id not in self._held:
+                self._held[each.decision.id] = False
+            elif isinstance(each, NewLabel) and self._held.get(each.decision_id) is False:
+                numbers.append((each.decision_id, self._labels + len(numbers) + 1))  # nobody else gives any
+                self._held[each.decision_id] = True
+            elif not isinstance(each, Event):  # what is there already, or contradicts it
+                numbers = self.database.take(records)
+                self._held |= dict.fromkeys((name for name, _ in numbers), True)
+                break
         else:
-            numbers = self.database.take(records)
-        for name in made:
-            self._held.setdefault(name, False)
-        for name, number in numbers:
-            self._held[name], self._labels = True, max(self._labels, number)
+            self._waiting += records
+        for _, number in numbers:
+            self._labels = max(self._labels, number)
         return numbers
 
     def _write_waiting(self) -> None:
         """Write what was taken in memory: a replay, which reads nothing, never does."""
         self._write_trained()
-        if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            self.database.take(waiting)
+        waiting, self._waiting = self._waiting, []
+        for part in chunks(waiting):
+            self.database.take(part)
 
     def let_go(self) -> None:
         """Disconnect without waiting: the journal holds what is missing."""

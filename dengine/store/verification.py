@@ -22,10 +22,11 @@ import numpy as np
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .connections import reading
+from .connections import integrity, reading
 from .journal import journal_path, newest_known
 from .ledger import START, entry_digest, ledger_key, must_have_key, row_sum, rows_digest, settings_faults, state_sum
-from .schema import CHAINED, CHUNK, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
+from .records import CHUNK
+from .schema import CHAINED, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
 
 KEY = {name: next(c.name for c in table.primary_key if c.name != "cell_id") for name, table in CHAINED.items()}
 KEPT = struct.Struct("<q32s32s")  # of a row in memory: its entry, and its sum as it stands there and as it comes out now
@@ -81,39 +82,23 @@ def verify_history(
     if expect is not None and (not 8 <= len(wanted) <= 64 or set(wanted) - set("0123456789abcdef")):
         raise StoreError(f"Expected a digest of 64 hexadecimal digits, or its first 8 or more, got {expect!r}.")
     with reading(str(url)) as connection:
-        faults = list(_pages(connection))
-        checks = [CellCheck(connection, cell, on_rows) for cell in _chosen_cells(connection, cell_id)]
+        names = _chosen_cells(connection, cell_id)
+        known = {name: newest_known(journal_path(connection.engine.url, name)) for name in names}
+    with reading(str(url)) as connection:  # anew: what the journals knew is in the store as it is now
+        pages = integrity(connection) if connection.dialect.name == "sqlite" else []
+        faults = [HistoryFault("", "file", "", said) for said in pages]
+        checks = [CellCheck(connection, name, on_rows) for name in names]
         for check in checks:
             must_have_key(connection, check.cell_id, check.key)
             faults += check.run()
-            known = newest_known(journal_path(connection.engine.url, check.cell_id))
-            for number, digest in known:
-                if digest in check.digests or _holds(str(url), check.cell_id, digest):
-                    continue
-                what = "is not there, though the cell's journal knows it: the history was cut off, or put back from a copy"
-                faults.append(HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", what))
+            lacking = [number for number, digest in known[check.cell_id] if digest not in check.digests]
+            what = "is not there, though the cell's journal knows it: the history was cut off, or put back from a copy"
+            faults += [HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", what) for number in lacking]
     if wanted and not any(digest.startswith(wanted) for check in checks for digest in check.digests):
         what = "is in no entry: the history was cut off before it, or made anew"
         faults.append(HistoryFault(cell_id or "", LEDGER.name, f"digest {wanted}", what))
-    return HistoryReport(tuple(check.history() for check in checks), tuple(faults))
-
-
-def _holds(url: str, cell_id: str, digest: str) -> bool:
-    """Whether the ledger has that entry by now, one that an engine added meanwhile."""
-    with reading(url) as connection:
-        mine = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.digest == bytes.fromhex(digest))
-        return connection.execute(sa.select(LEDGER.c.number).where(mine)).first() is not None
-
-
-def _pages(connection: sa.Connection) -> Iterator[HistoryFault]:
-    """What SQLite itself finds wrong in its file."""
-    if connection.dialect.name != "sqlite":
-        return
-    try:
-        said = [str(line) for line in connection.execute(sa.text("PRAGMA integrity_check")).scalars()]
-    except sa.exc.DatabaseError as error:
-        said = [str(error.orig)]
-    yield from (HistoryFault("", "file", "", line) for line in said if line != "ok")
+    cells = (CellHistory(each.cell_id, len(each.digests), each.rows, "".join(each.digests[-1:])) for each in checks)
+    return HistoryReport(tuple(cells), tuple(faults))
 
 
 def _chosen_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -131,18 +116,14 @@ def _chosen_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
 class CellCheck:
     """The check of one cell.
 
-    digests : of its entries, oldest first, in hexadecimal, once it ran.
+    digests : of its entries, oldest first, in hexadecimal, once it ran.  rows : that were read.
     """
 
     def __init__(self, connection: sa.Connection, cell_id: str, on_rows: Callable[[int], None] | None) -> None:
         self.connection, self.cell_id, self.on_rows, self.key = connection, cell_id, on_rows, ledger_key()
         self.digests: list[str] = []
         self._sums = {table: bytearray() for table in CHAINED}
-        self._rows, self._unread = 0, False
-
-    def history(self) -> CellHistory:
-        """What there is."""
-        return CellHistory(self.cell_id, len(self.digests), self._rows, self.digests[-1] if self.digests else "")
+        self.rows, self._unread = 0, False
 
     def run(self) -> list[HistoryFault]:
         """Read everything, and say what is wrong."""
@@ -171,8 +152,8 @@ class CellCheck:
 
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
         for row in self._raw(table):
-            self._rows += 1
-            if self.on_rows is not None and self._rows % CHUNK == 0:
+            self.rows += 1
+            if self.on_rows is not None and self.rows % CHUNK == 0:
                 self.on_rows(CHUNK)
             key, entry, stored = row[KEY[table]], row["entry"], row["sum"]
             if entry is None and stored is None:

@@ -50,11 +50,7 @@ class HistoryFilter:
 
 @dataclass(frozen=True, slots=True)
 class PastLabel:
-    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `Evidence`.
-
-    seq, time : its number, and when it came.  decided : when its decision was made.
-    point : (d,), None where there is none or none was asked for.
-    """
+    """A label as it was recorded, and of its decision what a rule was told; fields as in `NewLabel` and `Evidence`."""
 
     seq: int
     time: float
