@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, shortened
-from .journal import Record, forked, owned_by, owner
+from .journal import Record, forked, owned_by, owner, sqlite_file
 from .ledger import LedgerEntry, chain_writes, doubt_of, ledger_key, must_have_key, newest_entry
 from .queries import WITH_LABELS, WITH_TRACES, Scope, counted, join_product
 from .records import FORGOTTEN, LATE_STOP, Event, NewLabel, StoredDecision, as_text, chunks, decision_row, to_row, trace_row
@@ -181,8 +181,8 @@ class Database:
         self.url = self._engine.url  # its password included
         self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
-        file = Path(str(self.url.database)) if self.url.get_backend_name() == "sqlite" else None
-        self._file = file if file is not None and file.is_file() else None  # None: an URI of SQLite's own, or a server
+        file = sqlite_file(self.url) if self.url.get_backend_name() == "sqlite" else None
+        self._file = file if file is not None and file.is_file() else None  # None: in memory, or a server
         self._opened = None if self._file is None else self._file.stat()
 
     def _open(self, product: str | None) -> Scope:

@@ -115,8 +115,7 @@ class Journal:
             digest = _digest(digest, record)
             framed += FRAME.pack(MARK, len(record), zlib.crc32(record), digest) + record
         with _using(self.path):
-            if (written := os.pwrite(self._fd, framed, self.end)) < len(framed):
-                raise OSError(f"only {written} of {len(framed)} bytes were written")
+            self._put(framed, self.end)
             SYNC(self._fd)
         if not self._in_place():
             raise LostJournalError(
@@ -124,6 +123,10 @@ class Journal:
             )
         self.end, self._digest = self.end + len(framed), digest
         return offsets
+
+    def _put(self, content: bytes | bytearray, offset: int) -> None:
+        if (written := os.pwrite(self._fd, content, offset)) < len(content):  # a disk that is full takes a part
+            raise OSError(f"only {written} of {len(content)} bytes were written")
 
     def read(self, offset: int) -> bytes:
         """Return the record at an offset that `append` gave."""
@@ -172,7 +175,7 @@ class Journal:
         lost, self._fd = self._fd, _locked(self.path)
         try:
             with _using(self.path):
-                os.pwrite(self._fd, os.pread(lost, self.end - self.drained, self.drained), self.drained)
+                self._put(os.pread(lost, self.end - self.drained, self.drained), self.drained)
                 self._begin()
         except StoreError:
             lost, self._fd = self._fd, lost
@@ -302,10 +305,16 @@ def journal_path(url: Any, cell_id: str) -> Path:
     """Where a cell's journal lies: beside an SQLite file, else in the user's folder of state, `XDG_STATE_HOME`."""
     name = urllib.parse.quote(cell_id, safe="")
     if url.get_backend_name() == "sqlite":
-        return Path(f"{Path(str(url.database)).absolute()}.{name}.journal")
+        return Path(f"{sqlite_file(url)}.{name}.journal")
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "dengine"
     where = hashlib.sha256(f"{url.host}:{url.port}/{url.database}/{cell_id}".encode()).hexdigest()[:12]
     return state / f"{name[:60]}.{where}.journal"
+
+
+def sqlite_file(url: Any) -> Path:
+    """The file of an SQLite database, by whatever link or URI of SQLite's own it is named: one file has one owner."""
+    named = str(url.database)
+    return Path(urllib.parse.unquote(urllib.parse.urlsplit(named).path) if named.startswith("file:") else named).resolve()
 
 
 def head_path(journal: Path) -> Path:
