@@ -127,6 +127,8 @@ def _read_store(path: Path, name: str, asked: Asked) -> Dataset:
     from ..store.opening import opening
 
     with opening(path, must_exist=True) as store:
+        if said := store.database.doubt(0, since=0):
+            raise DataError(f"Expected {path} as its ledger has it, {said}; see `dengine verify`, and restore a copy.")
         held, spec = store.labelled(), trace_in(store.settings())
     store.close()
     if spec is None or not len(held.labels):

@@ -15,21 +15,23 @@ from .settings import EvidenceWindow
 from .trainer import TrainedOn, Window
 
 if TYPE_CHECKING:
+    from ..store.outbox import Outbox
     from ..store.sql import SqlStore
 
 
-def restored(store: SqlStore, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
+def restored(outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]) -> EngineModel | None:
     """The model of a version; None where it is refitted, and a trace that it was fitted on is damaged."""
     model = template.successor()
     # On the very traces that it was fitted on, with the labels that these had.
-    if model.needs_refit(state) and not refit(model, store, TrainedOn.from_state(state)):
+    if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
         return None
     return model.set_state(state)
 
 
-def refit(model: EngineModel, store: SqlStore, trained_on: TrainedOn) -> bool:
+def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on what another was trained on, with the labels of then; False where a trace of these is damaged."""
-    first, last = int(trained_on.seq[0]), int(trained_on.seq[-1])
+    store, first, last = outbox.store, int(trained_on.seq[0]), int(trained_on.seq[-1])
+    outbox.hold_to_ledger(first - 1)  # older than what is read of the newest
     data = store.labelled(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
     said = {each.seq: each.success for each in store.corrections() if each.number <= trained_on.corrected_to}

@@ -30,7 +30,7 @@ from ..recipe import Recipe
 from ..records import ACTIONS, Action, Decision, Reason, RetrainReport
 from ..reducers.base import State
 from ..store.outbox import Outbox
-from ..store.records import Change, Labelled, ModelVersion, StoredDecision, without_rule
+from ..store.records import Change, Evidence, Labelled, ModelVersion, StoredDecision, without_rule
 from .resume import change, corrected_at, join_since, known_to, refit, restored, tell, tell_all
 from .settings import EvidenceWindow
 from .trainer import HUNG, Retrainer, Trained, TrainedOn, Window
@@ -133,12 +133,12 @@ class ModelVersions:
         self._newest = max((report.version for report in store.retrains()), default=0)
         # The later versions may be damaged: what an earlier one's rule learned under an earlier policy is left out.
         state = {} if version is None else version.state if version.version >= since else without_rule(version.state)
-        model = None if version is None else restored(store, template, state)
+        model = None if version is None else restored(self.outbox, template, state)
         if version is None or model is None:
             if len(labelled.seq) >= 500:  # and no retrain yet: they were imported
                 self._look_ahead(template, labelled)
             template.begin_safely_in(self.evidence.began_in)
-            tell(template, lambda: store.evidence_since(0, since))
+            tell(template, self._evidence)
             self.new_labels = len(labelled.seq)
             self.corrected_to = max((each.number for each in store.corrections()), default=0)
         else:
@@ -149,13 +149,18 @@ class ModelVersions:
             told_to = int(version.state.get("told_to", version.last_seq))  # 0: a peer's, who knows nothing of this cell
             anew = not told_to or not version.state.keys().isdisjoint(("untold", "owed")) or version.version < since
             if anew or self.corrected_to > corrected_at(version):
-                tell_all(model, lambda: store.evidence_since(0, since), self.evidence)
+                tell_all(model, self._evidence, self.evidence)
             else:
-                tell(model, lambda: store.evidence_since(told_to, since))
+                tell(model, lambda: self._evidence(told_to))
             self.new_labels = int((labelled.seq > trained_on.counts_from).sum())
             self._trained_on = trained_on
         if self.fleet is not None:
             self.fleet.resume()
+
+    def _evidence(self, after: int = 0) -> Evidence:
+        """What the rule is told of labels after that number, which are held to the ledger."""
+        self.outbox.hold_to_ledger(after)
+        return self.store.evidence_since(after, self.evidence.since)
 
     def _look_ahead(self, model: EngineModel, labelled: Labelled) -> None:
         """Compute beside the cell what a retrain on these begins with: an opening need not wait for it."""
@@ -219,7 +224,7 @@ class ModelVersions:
 
     def correct(self, own: bool = True) -> None:
         """Learn the store's newest corrections; a rival is trained anew, by the cell that corrected."""
-        self.outbox.hold_to_ledger()
+        self.outbox.hold_to_ledger(0)  # the rule is told all of it
         window = self.retrainer.window
         last = None if self.fleet is None else window.newest_seq  # what peers stored since comes as their news
         window.refill(self.store.labelled(window.capacity, last=last))
@@ -250,7 +255,7 @@ class ModelVersions:
         if not model.keeps_references:
             # A rival cannot take a label back: it learns from the same traces as they are labelled now.
             trained_on = replace(trained_on, corrected_to=self.corrected_to)
-        if model.needs_refit(state) and not refit(model, self.store, trained_on):
+        if model.needs_refit(state) and not refit(model, self.outbox, trained_on):
             raise StoreError(
                 f"Expected the traces that version {number} was fitted on as they were stored, some have changed; "
                 "see `dengine verify`, and restore the store from a copy."
@@ -535,7 +540,7 @@ class Fleet:
         versions = self.versions
         trained_on = TrainedOn.from_state(version.state)
         try:
-            model = restored(self.store, versions.template, without_rule(version.state))
+            model = restored(versions.outbox, versions.template, without_rule(version.state))
             if model is None:
                 raise StoreError("a trace that it was fitted on has changed; see `dengine verify`.")
             join_since(model, self.store, version, self._window)

@@ -222,7 +222,8 @@ class SqlStore:
         with self.database.reading() as connection:
             rows = self._newest(connection, query, limit, last)[::-1]
             found, damaged = self._with_traces(connection, rows, scope)
-        return self._told_of(damaged, found)
+        self._tell_of(damaged, "trace")
+        return found
 
     def _newest(
         self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
@@ -243,7 +244,8 @@ class SqlStore:
             found, damaged = self._with_traces(connection, connection.execute(query).all(), self._scope)
             version = self._scope.newest_version(connection)
             correction = self._scope.newest(connection, CORRECTION.c.number)
-        return News(self._told_of(damaged, found), version, correction)
+        self._tell_of(damaged, "trace")
+        return News(found, version, correction)
 
     def _with_traces(self, connection: sa.Connection, rows: Sequence[Any], scope: Scope) -> tuple[Labelled, list[str]]:
         """Labels, oldest first, with their traces, read one by one; and the decisions whose traces have changed."""
@@ -278,13 +280,12 @@ class SqlStore:
         )
         return found, [rows[i].decision_id for i in np.flatnonzero(~kept)]
 
-    def _told_of(self, damaged: Sequence[str], found: Labelled) -> Labelled:
-        """What was read, once its transaction is over: damage is an event."""
+    def _tell_of(self, damaged: Sequence[str], what: str) -> None:
+        """Damage that was read is an event, once that transaction is over."""
         if damaged:
             more = f" and {len(damaged) - NAMED} more" if len(damaged) > NAMED else ""
-            what = f"decision {', '.join(damaged[:NAMED])}{more}; see dengine verify"
-            self._note("damaged", f"left out of training, since the trace is not as it was stored: {what}")
-        return found
+            named = f"decision {', '.join(damaged[:NAMED])}{more}; see dengine verify"
+            self._note("damaged", f"left out, since the {what} is not as it was stored: {named}")
 
     # What became of decisions
 
@@ -550,11 +551,18 @@ class SqlStore:
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def past_labels(self, after: int, upto: int | None = None) -> list[PastLabel]:
-        """Return the labels after number `after`, up to `upto`, oldest first."""
+        """Return the labels after number `after`, up to `upto`, oldest first.
+
+        One that is not as it was stored is left out; an event names its decision.
+        """
         query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *how_looked())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
+        names = LABEL.c.keys()
+        damaged = {row.decision_id for row in rows if not is_sound(LABEL.name, dict(zip(names, row, strict=False)))}
+        self._tell_of(sorted(damaged), "label")
+        rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
 
     def tally(self, last: int | None = None, since_version: int = 0, within: int | None = None) -> Tally:
