@@ -230,13 +230,13 @@ class EndAskedError(Exception):
 
 @contextmanager
 def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar whose next step ends the work with EndAskedError where Ctrl-C asked for that; a second Ctrl-C ends at once."""
-    asked, done, before = False, 0, signal.getsignal(signal.SIGINT)
+    """A bar whose next step ends the work with EndAskedError where Ctrl-C or SIGTERM asked for that; a second at once."""
+    asked, done, before = False, 0, {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before[number])
 
     with progress(label, total) as advance:
 
@@ -247,11 +247,13 @@ def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
             if asked:
                 raise EndAskedError(done)
 
-        signal.signal(signal.SIGINT, ask)
+        for number in before:
+            signal.signal(number, ask)
         try:
             yield count
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, handler in before.items():
+                signal.signal(number, handler)
 
 
 def end_interrupted(*lines: str) -> NoReturn:

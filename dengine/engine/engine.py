@@ -104,6 +104,13 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
+def _close(outbox: Outbox) -> None:
+    try:
+        outbox.close()
+    except StoreError as error:  # nobody is there any more to be told by an exception
+        log.error("%s", error)
+
+
 class Alone:
     """Refuses other threads, and holds SIGINT back until the block ends: a label is stored and counted, or neither."""
 
@@ -186,12 +193,12 @@ class DataEngine:
         settings = EngineSettings(chosen_recipe(reducer, recipe, beside), seed, trace=trace)
         settings, template = settings.with_template(model)  # before a store is made: a wrong setting leaves none behind
         with opening(store) as opened:
-            if opened.settings():
-                raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name a new one.")
             if settings.trace is None:
                 settings = replace(settings, trace=peers_trace(opened))
             self._start(settings, template, opened, executor, replaying, clock, on_safe_mode)
             with self._closed_on_failure():
+                if opened.settings():  # now that the cell is owned: nobody begins it meanwhile
+                    raise StoreError("The store is not empty; use DataEngine.open(url) to go on with it, or name another.")
                 self.store.save_settings(self._settings.now.to_store())
                 if opened.product is not None:
                     self._versions.resume()  # on what the others of its product learned
@@ -211,7 +218,7 @@ class DataEngine:
         limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
         retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._outbox = Outbox(store, settings.recipe.window, not reading, replaying)
-        weakref.finalize(self, self._outbox.close)  # of a program that forgot to
+        weakref.finalize(self, _close, self._outbox)  # of a program that forgot to
         self._alone = Alone()
         self.seed, self.store, self.clock, self.resumed, self._unseen = settings.seed, store, clock, False, True
         self._settings = SettingsInForce(settings, self._outbox)

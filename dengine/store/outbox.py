@@ -443,7 +443,7 @@ class Outbox:
             self.store.close()
         elif self._journal is not None:
             log.warning("the store was left, its journal %s holds what it lacks: %s", self._journal.path, self.fault)
-            self.store.let_go()  # else its lease on the cell would outlive the engine
+            self.store.database.close(waiting=False)  # else its lease on the cell would outlive the engine
             self._journal.close()
 
     # The thread that writes the journal

@@ -645,10 +645,6 @@ class SqlStore:
         for part in chunks(waiting):
             self.database.take(part)
 
-    def let_go(self) -> None:
-        """Disconnect without waiting: the journal holds what is missing."""
-        self.database.close(waiting=False)
-
     def close(self) -> None:
         """Disconnect."""
         if self.wait is not None:  # what is in memory lives as long as its store
