@@ -236,7 +236,7 @@ def steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
     def ask(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
-        signal.signal(number, before[number])
+        signal.signal(number, before[signal.Signals(number)])
 
     with progress(label, total) as advance:
 

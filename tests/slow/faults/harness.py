@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -75,9 +75,9 @@ class Place:
 class Cell:
     """An engine that is driven by hand, so that what it raises and how long it takes is seen."""
 
-    def __init__(self, place: Place, outcome: Outcome, **options: Any) -> None:
-        self.place, self.outcome, self.options = place, outcome, options
-        self.engine = DataEngine(recipe=RECIPE, store=place.store(), **options)
+    def __init__(self, place: Place, outcome: Outcome, window: int = RECIPE.window, **options: Any) -> None:
+        self.place, self.outcome = place, outcome
+        self.engine = DataEngine(recipe=replace(RECIPE, window=window), store=place.store(), **options)
         self.acknowledged: dict[str, bool] = {}
         self.next = 0
 

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from dengine import Action, DataEngine, Decision, Reason, ReplayCell
+from dengine import Action, DataEngine, Decision, Reason, ReplayCell, load_dataset
 from dengine.engine import trainer
-from dengine.errors import ReportError, StoreError, TraceError
+from dengine.errors import DataError, ReportError, StoreError, TraceError
 from dengine.store import StoredDecision, verify_history
 from dengine.store.journal import journal_path
 from dengine.store.ledger import row_sum
@@ -383,22 +383,47 @@ def clock_set_back(outcome: Outcome, place: Place) -> None:
         cell.finish()
 
 
-def full_tmpfs(outcome: Outcome, place: Place) -> None:
-    """A tmpfs that is full while the journal is drained."""
+@contextlib.contextmanager
+def _on_tmpfs(outcome: Outcome, place: Place) -> Iterator[Cell]:
     folder = Path(f"{place.url}.tmpfs")
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", folder], check=True)
     try:
-        during(Cell(replace(place, url=str(folder / "engine.db")), outcome), _filled(folder / "filler"), away=True)
+        yield Cell(replace(place, url=str(folder / "engine.db")), outcome)
     finally:
         subprocess.run(["umount", folder], check=True)
 
 
+def full_tmpfs(outcome: Outcome, place: Place) -> None:
+    """A tmpfs that is full while the journal is drained."""
+    with _on_tmpfs(outcome, place) as cell:
+        during(cell, _filled(Path(cell.place.url).with_name("filler")), away=True)
+
+
+def remade_on_a_full_disk(outcome: Outcome, place: Place) -> None:
+    """The journal deleted while the store is away, on a tmpfs with room for a part of it."""
+    with _on_tmpfs(outcome, place) as cell:
+        journal = journal_path(cell.engine.store.database.url, cell.place.cell)
+        with lock(cell.place):
+            cell.play(BEFORE)
+            cell.engine.flush()
+            journal.unlink()
+            outcome.injected += 1
+            with _filled(journal.with_name("filler"), room=1 << 16):
+                decision = cell.timed(lambda: cell.engine.decide(stream().X[0]))
+                with contextlib.suppress(StoreError):
+                    cell.timed(lambda: cell.engine.report(decision.id, True))
+                    outcome.must(False, "a label was acknowledged that had no room")
+        cell.until_back()
+        cell.finish()
+
+
 @contextlib.contextmanager
-def _filled(filler: Path) -> Iterator[None]:
+def _filled(filler: Path, room: int = 0) -> Iterator[None]:
     with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
         while file.write(bytes(4096)) == 4096:
             pass
+    os.truncate(filler, filler.stat().st_size - room)
     yield
     filler.unlink()
 
@@ -427,6 +452,23 @@ def changed(outcome: Outcome, place: Place) -> None:
             outcome.must("see `dengine verify`" in again.store_fault, f"nobody was told of: {sql}")
             outcome.lost += missing(again.store, {said[0].id: True})
         outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
+        with contextlib.suppress(DataError):
+            load_dataset(other.url)
+            outcome.must(False, f"a data set was made of it: {sql}")
+
+
+def changed_long_ago(outcome: Outcome, place: Place) -> None:
+    """A label older than those that are read at opening changed by SQL, and one corrected."""
+    cell = Cell(place, outcome, window=20)
+    cell.play(BEFORE)
+    cell.finish()
+    with contextlib.closing(sqlite3.connect(place.url)) as connection:
+        connection.executescript(CHANGES[1])
+        outcome.injected += 1
+    with DataEngine.open(place.store()) as again:
+        name, good = cell.acknowledged.popitem()
+        again.correct(name, not good)
+        outcome.must("see `dengine verify`" in again.store_fault, "the rule was told what was changed")
 
 
 def flipped(file: Path, rng: np.random.Generator, size: int | None = None) -> None:
@@ -485,9 +527,12 @@ def second(outcome: Outcome, place: Place) -> None:
         looking.decide(stream().X[0])
         outcome.must(False, "an engine that was opened for reading decides")
     code = "import sys; from dengine import DataEngine; from dengine.store import SqlStore; "
-    command = [sys.executable, "-c", f"{code}DataEngine.open(SqlStore(*sys.argv[1:]))", place.url, place.cell]
+    command = [sys.executable, "-c", f"{code}DataEngine.open(SqlStore(*sys.argv[1:]))"]
     elsewhere = os.environ | {"XDG_STATE_HOME": f"{SYNC}-elsewhere"}  # as on another machine
-    done = subprocess.run(command, capture_output=True, text=True, env=elsewhere, timeout=120, check=False)
+    url = place.url
+    if "://" not in url:
+        Path(url := f"{url}.link").symlink_to(place.url)  # by another name, too
+    done = subprocess.run([*command, url, place.cell], capture_output=True, text=True, env=elsewhere, check=False)
     outcome.injected += 1
     outcome.must(f"process {os.getpid()} on" in done.stderr and " owns " in done.stderr, "a second engine was let in")
     cell.play(DURING)
@@ -615,8 +660,8 @@ def forked(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-ON_SQLITE = (locked, moved, replaced, deleted, put_back, changed, flipped_store, unstorable)
+ON_SQLITE = (locked, moved, replaced, deleted, put_back, changed, changed_long_ago, flipped_store, unstorable)
 ON_SQLITE += (lost_journal, second, unclosed, closed_while_away, killed_executor, hung_executor, interrupted, forked)
 ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk, served_over_a_hung_disk)
-ON_DISKS += (full_tmpfs, clock_set_back)
+ON_DISKS += (full_tmpfs, remade_on_a_full_disk, clock_set_back)
 ON_POSTGRES = (frozen, closed_while_away, killed_server, cut_off, lost_journal, second, asked_again)
