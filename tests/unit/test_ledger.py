@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset
 from dengine.errors import StoreError
 from dengine.export import make_key
 from dengine.records import Action, Decision, Reason, Source
@@ -23,7 +22,6 @@ from dengine.store import Change, NewLabel, SqlStore, StoredDecision, verify_his
 from dengine.store.ledger import KEY_VARIABLE, START, entry_digest, row_sum, rows_digest
 from dengine.store.schema import CHAINED
 from tests.support.command_line import dengine
-from tests.support.exports import trained
 from tests.support.stores import decision, execute, labelled, put_decision, put_label, put_labels, report
 
 TABLES = ("decision", "trace", "label", "model_version", "event", "correction", "ledger", "setting")
@@ -251,22 +249,6 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
     assert (fault.table, "cut off" in fault.what) == ("ledger", True)
     with pytest.raises(StoreError, match="64 hexadecimal digits"):
         verify_history(str(file), expect="newest")
-
-
-def test_a_log_of_sqlite_that_was_cut_off_is_noticed_by_verify_and_at_opening(data: Dataset, tmp_path: Path) -> None:
-    with trained(data, tmp_path / "engine.db") as engine:
-        execute(tmp_path / "engine.db", "PRAGMA wal_checkpoint(TRUNCATE)")
-        engine.store.put_event("note", "the newest entry, of which nothing went through the journal")
-        for name in ("whole", "cut"):
-            (tmp_path / name).mkdir()
-            for part in tmp_path.glob("engine.db*"):
-                shutil.copy(part, tmp_path / name)
-    (tmp_path / "cut" / "engine.db-wal").unlink()
-    for name, missing in (("whole", 0), ("cut", 1)):
-        file = tmp_path / name / "engine.db"
-        assert [table for table, _ in faults(file)] == ["ledger"] * missing
-        with DataEngine.open(file) as engine:
-            assert [event.kind for event in engine.store.events()].count("lost") == missing
 
 
 def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -138,35 +138,23 @@ def unstorable(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-def replaced(outcome: Outcome, place: Place) -> None:
-    """The store's file replaced by a copy of itself while it is open."""
-
-    def replace(file: Path) -> None:
-        shutil.copy(file, f"{file}.new")
-        Path(f"{file}.new").replace(file)
-
-    _lost_file(Cell(place, outcome), replace)
-
-
-def deleted(outcome: Outcome, place: Place) -> None:
-    """The store's file deleted while it is open."""
-    _lost_file(Cell(place, outcome), Path.unlink)
-
-
-def _lost_file(cell: Cell, lose: Callable[[Path], object]) -> None:
-    """What was acknowledged before went with the file; what is acknowledged after must be in the journal."""
-    cell.play(BEFORE)
-    file, copy = Path(cell.place.url), Path(cell.place.url + ".copy")
-    shutil.copy(file, copy)
-    lose(file)
-    cell.outcome.injected += 1
-    cell.acknowledged.clear()
-    cell.play(DURING)
-    cell.outcome.must("deleted, moved or replaced" in cell.engine.store_fault, "a lost file was not noticed")
-    cell.engine.close()
-    copy.replace(file)
-    cell.engine = type(cell.engine).open(cell.place.store())
-    cell.finish()
+def lost_file(outcome: Outcome, place: Place) -> None:
+    """The store's file deleted, or replaced by a copy of itself, while it is open."""
+    ways = (Path.unlink, lambda file: Path(shutil.copy(file, f"{file}.new")).replace(file))
+    for i, lose in enumerate(ways):
+        cell = Cell(replace(place, url=f"{place.url}.{i}"), outcome)
+        cell.play(BEFORE)
+        file, copy = Path(cell.place.url), Path(cell.place.url + ".copy")
+        shutil.copy(file, copy)
+        lose(file)
+        outcome.injected += 1
+        cell.acknowledged.clear()  # they went with the file; what is acknowledged after must be in the journal
+        cell.play(DURING)
+        outcome.must("deleted, moved or replaced" in cell.engine.store_fault, "a lost file was not noticed")
+        cell.engine.close()
+        copy.replace(file)
+        cell.engine = DataEngine.open(cell.place.store())
+        cell.finish()
 
 
 def _backends(url: str, work: Callable[[sa.Connection, int], object]) -> None:
@@ -660,7 +648,7 @@ def forked(outcome: Outcome, place: Place) -> None:
     cell.finish()
 
 
-ON_SQLITE = (locked, moved, replaced, deleted, put_back, changed, changed_long_ago, flipped_store, unstorable)
+ON_SQLITE = (locked, moved, lost_file, put_back, changed, changed_long_ago, flipped_store, unstorable)
 ON_SQLITE += (lost_journal, second, unclosed, closed_while_away, killed_executor, hung_executor, interrupted, forked)
 ON_DISKS = (hung_disk, failing_disk, closed_while_hung, run_over_a_hung_disk, served_over_a_hung_disk)
 ON_DISKS += (full_tmpfs, remade_on_a_full_disk, clock_set_back)
