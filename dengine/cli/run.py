@@ -61,7 +61,7 @@ def run(
     on after its last part that was labelled or accepted: no part is learned from twice. A robot runs
     training/ur_cell.script, or a program of the same handshake; --trigger and --samples say what is recorded of it.
     Where too much goes wrong, or looks like nothing known, everything is verified until fresh evidence says otherwise: the
-    safe mode. Ctrl-C ends the run after the cycle that is under way and shows what was done; pressed twice, at once.
+    safe mode. Ctrl-C or SIGTERM ends the run after the cycle that is under way and shows what was done; twice, at once.
     """
     if kind == "simulated":
         options.must_have("the simulated cell", "sim", "mujoco")
