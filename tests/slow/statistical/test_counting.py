@@ -20,7 +20,6 @@ from dengine.folds import content_fold
 from dengine.model import neighbours as prediction
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
-from dengine.records import Reason
 from dengine.reducers import features
 from dengine.reducers.features import FeatureReducer
 from tests.slow.proof.counts import count_noise, mean_square, moved, places, relabelled, weak_signal, white_noise
@@ -124,14 +123,15 @@ def features_screened_by_labels(patch: pytest.MonkeyPatch) -> None:
 
 
 def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
-    def learn(self: Any, known: Any, success: bool, point: Any, silent: int) -> None:
-        lower, upper = known.decision.lower, known.decision.upper
-        self.newest.add_safely(point, int(success), known.content_hash, 0)
-        if self.answering is not None:
-            now = self.answering.predict_one(known.trace)
-            lower, upper = now.lower, now.upper
-        self.newest.tell_safely(lower, upper, success, known.decision.reason is Reason.NOVEL, silent)
-        self.new_labels += 1
+    whole = ModelVersions.learn
+
+    def learn(self: Any, known: Any, success: bool, silent: int) -> Any:
+        if (model := self.answering) is not None:
+            point = model.place_safely(known.trace, known.content_hash, None)
+            model.add_safely(point, int(success), known.content_hash, 0)
+            now = model.predict_one(known.trace)
+            known = replace(known, decision=replace(known.decision, lower=now.lower, upper=now.upper))
+        return whole(self, known, success, silent)
 
     patch.setattr(ModelVersions, "learn", learn)
 
