@@ -261,7 +261,7 @@ def of_retrains(retrains: Iterable[RetrainReport | None]) -> Arrays:
 
 
 def machine() -> dict[str, str]:
-    """What may change the last digit of a float: compared before decisions are. Libraries choose their code by the model."""
+    """What may change the last digit of a float: libraries choose their code by the model."""
     about = Path("/proc/cpuinfo")
     known = dict(re.findall(r"^(.+?)\s*: (.*)$", about.read_text(encoding="utf-8"), re.M)) if about.exists() else {}
     return {
