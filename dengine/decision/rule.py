@@ -162,10 +162,10 @@ class Evidence(nn.Module):
 
     def action(self, lower: float, upper: float) -> int:
         """What a bound allows at this moment; a part that could as well be accepted as rejected is verified."""
-        accept_at, reject_at = float(self.open[0].item()), 1.0 - float(self.open[1].item())
-        if lower >= accept_at and upper <= reject_at:
+        at: list[float] = self.open.tolist()
+        if lower >= at[0] and upper <= 1.0 - at[1]:
             return 0
-        return action_of(lower, upper, accept_at, reject_at)
+        return action_of(lower, upper, at[0], 1.0 - at[1])
 
     def observe(self, silent: int, novel: bool) -> None:
         """Update the detectors: parts of unknown outcome did not fail as far as is known; they and this may be novel."""

@@ -9,6 +9,7 @@ as unobserved, which is no success.
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -41,11 +42,11 @@ class Feedback:
     ) -> None:
         self.outbox, self.versions, self.settings = outbox, versions, settings
         self.on_safe_mode = on_safe_mode
-        self._went_on: dict[str, StoredDecision] = {}  # accepted, nothing heard of them yet
+        self._went_on: OrderedDict[str, StoredDecision] = OrderedDict()  # accepted, nothing heard of them yet
         self._waiting: dict[str, tuple[StoredDecision, NewLabel]] = {}  # confirmed, not on their way into the store
         self._unsynced: dict[str, bool] = {}  # learned, and not known to be on the disk
         # Decisions that asked for a check of which nothing was reported, each behind its number.
-        self._owed: dict[str, tuple[int, Decision]] = {}
+        self._owed: OrderedDict[str, tuple[int, Decision]] = OrderedDict()
         self._decisions = 0
         self._unobserved = 0
         self._mode = ""
@@ -82,7 +83,7 @@ class Feedback:
         if not self._went_on:
             return
         while self._went_on:
-            known = self._went_on.pop(next(iter(self._went_on)))
+            _, known = self._went_on.popitem(last=False)
             if self._stops_all:
                 self._waiting[known.decision.id] = known, self._learn(known, True, Source.CONFIRMED)
             else:
@@ -95,7 +96,7 @@ class Feedback:
         """A check that was not reported in time counts as a wrong decision."""
         latest = self._decisions - self.settings.now.recipe.policy.label_within
         while self._owed and next(iter(self._owed.values()))[0] <= latest:
-            self.versions.owe(self._owed.pop(next(iter(self._owed)))[1])
+            self.versions.owe(self._owed.popitem(last=False)[1][1])
 
     def decided(self, known: StoredDecision) -> None:
         """A part was decided on."""

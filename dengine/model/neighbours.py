@@ -99,8 +99,11 @@ class Predictor(nn.Module):
         part : the hash of its part, which has no vote on itself; 0 for an unknown one.
         """
         z = self.embed(x)
-        if self.novelty(x):
-            return 0, self.novel, 0.0, 1.0, 0, 0, z
+        return (0, self.novel, 0.0, 1.0, 0, 0, z) if self.novelty(x) else self.at(z, part)
+
+    @torch.jit.export
+    def at(self, z: Tensor, part: int) -> Predicted:
+        """What `forward` says of a trace that is not novel, by its scaled embedding (K, d)."""
         action, lower, upper, n_success, n_failure = self.neighbours(z, part)
         return action, self.neighbours.reason(action), lower, upper, n_success, n_failure, z
 
@@ -144,7 +147,8 @@ def mould_of(eager: Predictor, trace_shape: tuple[int, ...]) -> Any:
         mould = script(eager)
         with torch.inference_mode():
             for _ in range(3):  # TorchScript's first calls compile; a cell should not wait for that
-                mould.look(torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf)
+                said = mould.look(torch.linspace(0.0, 1.0, math.prod(trace_shape)).view(trace_shape), 0, math.inf)[2]
+                mould.at(said[-1], 1)
         while len(_COMPILED) >= KINDS:
             _COMPILED.pop(next(iter(_COMPILED)), None)
         _COMPILED[structure] = mould
@@ -360,10 +364,10 @@ class ModelPrediction(EngineModel):
         predictor, known = self.predictor, self.index.known
         with torch._C._InferenceMode(True):  # as `torch.inference_mode`, whose entering costs 3 % of a decision
             fault, content, said = predictor.look(torch.from_numpy(x), part if part in known else 0, limit)
+            if part is None and content in known and not fault and said[1] != NOVEL:  # the same trace is a reference
+                said = predictor.at(said[-1], content)
         if fault:
             return fault, content, None
-        if part is None and content in known:  # the same trace is a reference
-            return fault, content, self.predict_one(x, content)
         return fault, content, self._prediction(said)
 
     def _prediction(self, said: Predicted) -> Prediction:
