@@ -32,7 +32,8 @@ class Case:
 
     share : of the repeats that are asked for.  rate : of the labels where the truth has one rate.
     order : "drawn", "best first", "worst first".  missing : share of the checks of bad parts that are never reported.
-    late : decisions by which a stop comes late, at most.  mirrored : successes for failures, so rejects are looked at.
+    late : decisions by which a stop comes late, at most.  confirms : of what was accepted, whether under stops="some" the
+    good parts are told of, and not the bad ones.  mirrored : successes for failures, so rejects are looked at.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Case:
     order: str = "drawn"
     missing: float = 0.0
     late: int = 0
+    confirms: bool = False
     mirrored: bool = False
     cycles: int = 1503
 
@@ -123,7 +125,7 @@ def judge(seed: int, case: Case) -> Row:
                 stops.append((i + 1 + int(rng.integers(case.late)), decision))
             elif checked and not good and rng.random() < case.missing:
                 owed.append((i + 1 + case.label_within, p))
-            elif checked or (accepted and (case.stops == "all" or not good)):
+            elif checked or (accepted and (case.stops == "all" or good == case.confirms)):
                 engine.report(decision.id, good)
             members.add(p, _members(engine, side) > before)
     means = {"members": members, "passed": passed}

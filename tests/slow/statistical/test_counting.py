@@ -1,7 +1,7 @@
-"""Honest counting, and six ways to cheat: each one is seen by the very check that the honest engine passes beside it.
+"""Honest counting, and nine ways to cheat: each one is seen by the very check that the honest engine passes beside it.
 
 The count-only statistic sees labels that are counted where they were learned; the blindness check, what is chosen by them,
-however little it is worth; the guarantee's replay, evidence that was taken after its label.
+however little it is worth; the guarantee's replay, evidence that was taken after its label or came unasked.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from dengine import load_dataset
+from dengine import Decision, load_dataset
 from dengine.engine.versions import ModelVersions
 from dengine.folds import content_fold
 from dengine.model import neighbours as prediction
@@ -28,6 +28,7 @@ from tests.slow.proof.replays import Case, broken, judge
 HONEST = (0.8, 1.3)  # mean z^2; heads trained on all folds: 3 to 4.4
 SEEDS = 16
 JUST_BEYOND = Case("just beyond", "just beyond", reducer="pca", alpha=0.2, lower_bound=0.8, cycles=500)
+WORSENS = replace(JUST_BEYOND, truth="jumping", cycles=1000)
 
 
 def z2(reducer: str = "conv", seeds: int = SEEDS) -> float:
@@ -39,9 +40,9 @@ def peeks(*strengths: float, folds: tuple[int, ...] = (3,)) -> float:
     return max(moved(RECIPES["conv"], weak_signal(200, s, seed=1), fold, seed=0) for s in strengths for fold in folds)
 
 
-def worse_than_allowed(replays: int) -> float:
-    """Share of replays in which accepted parts were worse than the tolerance, where every part is."""
-    return broken([judge(seed, JUST_BEYOND) for seed in range(replays)], "passed, end", 0.2) / replays
+def worse_than_allowed(replays: int, case: Case = JUST_BEYOND) -> float:
+    """Share of replays in which accepted parts were worse than the tolerance, as where every part is."""
+    return broken([judge(seed, case) for seed in range(replays)], "passed, end", 0.2) / replays
 
 
 @pytest.mark.parametrize(("reducer", "seeds"), [("conv", SEEDS), ("pca", 2 * SEEDS)])  # the plane of pca has fewer balls
@@ -136,6 +137,26 @@ def evidence_after_its_label(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(ModelVersions, "learn", learn)
 
 
+def asked_for_whatever_came(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Decision, "looked", 1.0)
+
+
+def missing_checks_forgiven(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(ModelVersions, "owe", lambda self, made: None)
+
+
+def confirmed_for_ever(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(ModelVersions, "take_back", lambda self: None)
+    patch.setattr(ModelVersions, "tell_anew", lambda self: None)
+
+
+SAID: list[tuple[Mutation, Case]] = [
+    (asked_for_whatever_came, replace(WORSENS, stops="some", audit_rate=0.3, confirms=True)),
+    (missing_checks_forgiven, replace(WORSENS, truth="edge", missing=0.9, label_within=20)),
+    (confirmed_for_ever, replace(WORSENS, late=5)),
+]
+
+
 @contextmanager
 def mutated(mutation: Mutation) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
@@ -160,3 +181,10 @@ def test_whatever_a_label_chose_in_its_own_space_is_caught(mutation: Mutation) -
 def test_evidence_that_is_taken_after_its_label_is_caught() -> None:
     with mutated(evidence_after_its_label):
         assert worse_than_allowed(3) > 0.5
+
+
+@pytest.mark.parametrize(("mutation", "case"), SAID)
+def test_outcomes_that_came_unasked_or_never_or_were_taken_back_are_no_evidence(mutation: Mutation, case: Case) -> None:
+    assert worse_than_allowed(3, case) <= 0.34
+    with mutated(mutation):
+        assert worse_than_allowed(3, case) == 1.0
