@@ -10,6 +10,7 @@ coin behind it.
 import copy
 import math
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache, reduce
 from typing import Any, Self
@@ -264,12 +265,16 @@ class ModelPrediction(EngineModel):
 
     def look_ahead(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
-        blank = self.spaces.look_ahead(X, numbers)
-        if blank is not None and self.rule.scriptable and "index" not in vars(self):
-            gate = NoveltyGate(*X.shape[1:])
-            gate.asleep = not self.novelty
-            around = self.classifier.around(RadiusIndex(blank.dim, self.classifier.capacity), self.rule, self.spaces.scores)
-            mould_of(Predictor(trace_gate(X.shape[1:]), blank, torch.ones(self.n_spaces), gate, around).eval(), X.shape[1:])
+        blank = self.spaces.blank(X)
+        with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
+            ahead = pool.submit(self.spaces.look_ahead, X, numbers)
+            if blank is not None and self.rule.scriptable and "index" not in vars(self):
+                shape, own = X.shape[1:], self.classifier
+                gate = NoveltyGate(*shape)
+                gate.asleep = not self.novelty
+                around = own.around(RadiusIndex(blank.dim, own.capacity), self.rule, self.spaces.scores)
+                mould_of(Predictor(trace_gate(shape), blank, torch.ones(self.n_spaces), gate, around).eval(), shape)
+            ahead.result()
 
     def prepare(self, previous: EngineModel) -> None:
         """Take over the rule of an earlier model, and be compiled."""

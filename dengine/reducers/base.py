@@ -110,11 +110,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         self.fit(X, y if self.uses_labels else None)
         return self.embed_own(X, folds)
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> Any:
-        """Do now what `train` on X (n, C, T) with labels of these numbers would begin with, as far as no label is read.
+    def blank(self, X: Floats) -> Any:
+        """A module as `module` will give after `train` on X (n, C, T), its dimension `dim`; None: that is not known."""
 
-        Returns a module as `module` will give, with its dimension, `dim`; None where that is not known.
-        """
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Do now what `train` on X (n, C, T) with labels of these numbers would begin with, as far as no label is read."""
 
     def embed(self, X: Floats) -> Floats:
         """(n, C, T) -> (n, K, d) float32, every trace in every space."""

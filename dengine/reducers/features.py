@@ -22,6 +22,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
+from ..decision.rule import script
 from ..errors import SettingError, expect
 from ..folds import content_fold
 from ..records import is_whole
@@ -36,7 +37,8 @@ GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown s
 VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
 LEARNED = 256  # traces that channels' scales are read from: more tell no more
 MOST = 10**9  # of a parameter that is a whole number
-MANY = 100  # chunks of traces, for which a second core is worth taking
+MANY = 3200  # traces, for which a second core is worth taking
+PIECE = 512  # of them at once
 CHUNK = 32  # traces embedded at a time: what they need stays in the cache, and is not asked of the kernel anew
 SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small against a radius of 0.05
 
@@ -93,6 +95,19 @@ class Features(nn.Module):
         floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
         self.gain.copy_(1.0 / (deviation + floor))
         self.offset.copy_(-mean / (deviation + floor))
+
+
+class InChunks(nn.Module):
+    """The raw features of many traces: compiled it holds up no Python, while an engine opens or compiles beside it."""
+
+    def __init__(self, features: Features) -> None:
+        super().__init__()
+        self.features = features
+
+    def forward(self, x: Tensor, out: Tensor) -> None:
+        """(n, C, T) -> out (n, P), n whole chunks."""
+        for i in range(0, x.size(0), 32):  # CHUNK
+            out[i : i + 32] = self.features.raw(x[i : i + 32])
 
 
 def rocket_kernels() -> Tensor:
@@ -265,14 +280,15 @@ class FeatureReducer(Reducer):
             places = in_chunks(lambda some: self.net_.places(self.net_.features.clipped(some)), raw, 16 * CHUNK)
             return own_places(places.numpy(), folds)
 
-    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> FeatureEmbedding:
-        """Compute the features of traces that a store brings: in the first retrain it would take too long."""
-        enough = len(X) >= MIN_TRACES
-        new: Self = self if enough or "net_" in vars(self) else clone(self)
-        traces = new._begun(X)
-        if enough:
-            self.raw_features(traces, numbers)
+    def blank(self, X: Floats) -> FeatureEmbedding:
+        new: Self = self if len(X) >= MIN_TRACES or "net_" in vars(self) else clone(self)
+        new._begun(X)
         return new.net_
+
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
+        """Compute the features of traces that a store brings: in the first retrain it would take too long."""
+        if len(X) >= MIN_TRACES:
+            self.raw_features(self._begun(X), numbers)
 
     def _begun(self, X: Floats) -> Floats:
         """The traces, checked, once there are features for them: the first ones that come set these."""
@@ -356,7 +372,9 @@ class FeatureReducer(Reducer):
                 return self._computed(traces)
             at = np.searchsorted(self._numbers, numbers)
             new = np.append(self._numbers, -1)[at] != numbers
-            if new.any():
+            if new.all():
+                at, self._raw = np.arange(len(at)), self._computed(traces)
+            elif new.any():
                 at[new] = len(self._raw) + np.arange(new.sum())
                 self._raw = torch.cat([self._raw, self._computed(traces[new])])
             joined = len(at) > 0 and (np.diff(at) == 1).all()  # as long as nothing is forgotten: then none is moved
@@ -365,15 +383,21 @@ class FeatureReducer(Reducer):
 
     def _computed(self, traces: Floats) -> Tensor:
         """(n, C, T) -> (n, P), the same to the bit whatever is beside a trace: each chunk is full, or filled up."""
-        whole = len(traces) // CHUNK * CHUNK
-        rest = np.zeros((CHUNK, *traces.shape[1:]), dtype=np.float32)
-        rest[: len(traces) - whole] = traces[whole:]
-        x = [torch.from_numpy(traces[i : i + CHUNK]) for i in range(0, whole, CHUNK)] + [torch.from_numpy(rest)]
-        raw = self.net_.features.raw
-        if len(x) < MANY:
-            return torch.cat([raw(each) for each in x])[: len(traces)]
-        with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:  # of a store that is opened
-            return torch.cat(list(pool.map(raw, x)))[: len(traces)]
+        features, x, n = self.net_.features, torch.from_numpy(traces), len(traces)
+        whole, out = n // CHUNK * CHUNK, torch.empty(n, len(features.gain))
+        rest = torch.zeros(CHUNK, *x.shape[1:])
+        rest[: n - whole] = x[whole:]
+        out[whole:] = features.raw(rest)[: n - whole]
+        if n < MANY:
+            InChunks(features)(x[:whole], out[:whole])
+            return out
+        many = script(InChunks(features))  # of a store that is opened
+        for _ in range(2):  # TorchScript's first calls compile
+            many(x[:CHUNK], out[:CHUNK])
+        with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:
+            pieces = [slice(i, min(i + PIECE, whole)) for i in range(0, whole, PIECE)]
+            list(pool.map(lambda piece: many(x[piece], out[piece]), pieces))
+        return out
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """A training changes the module in place; all else it binds anew, so that may be shared."""

@@ -15,7 +15,7 @@ from dengine.errors import SettingError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
-from dengine.reducers.features import FIRST_STEPS, fit_heads
+from dengine.reducers.features import FIRST_STEPS, MANY, fit_heads
 from dengine.reducers.rocket import RocketFeatures
 
 STEPS = StopRule(max_steps=20)
@@ -220,6 +220,11 @@ def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkey
         found.append(sum(computed))
         computed.clear()
     assert found == [64, 32, 0, 32]  # whole chunks
+
+
+def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
+    X, features = traces(MANY + 50)[0], ConvReducer(folds=2).fit(*traces(100)).raw_features
+    assert torch.equal(features(X), torch.cat([features(X[i : i + 7]) for i in range(0, len(X), 7)]))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
