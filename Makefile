@@ -76,7 +76,7 @@ docs: $(VENV)/.dev
 	$(VENV)/bin/python -m mkdocs build --strict
 
 proof: $(VENV)/.dev
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof --out $(OUT)/proof --docs docs --repeats $(REPEATS) --jobs 2
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof --out $(OUT)/proof --docs docs/explanation --repeats $(REPEATS) --jobs 2
 
 # pip-audit may skip every package and still end well, so what it audited is counted. It gets names and plain versions: one
 # that is installed in editable form, or a build like 2.9.0+cpu, is not on PyPI, and --strict fails at what is not there.
