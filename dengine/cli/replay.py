@@ -19,7 +19,7 @@ from click.core import ParameterSource
 from ..errors import percent
 from . import options
 from .options import ALPHA, COUNT, LOWER_BOUND, OWN, RULE, DataChoice, Known, Listed, RecipeChoice, short_name, verb
-from .output import Out, end_interrupted, explain_option, explained, heading, progress, tell, written
+from .output import Out, end_interrupted, explain_option, explained, progress, tell, written
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -207,8 +207,9 @@ def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoic
     for name, some in by_name.items():
         retrains = [each for one in some for each in one.retrains]
         lines.append(f"{name}: {tables.retrain_line(retrains)}")
-    took = ", ".join(f"{heading(name)} {written(name, value)}" for name, value in finished.costs.items())
-    lines += [*found, f"{len(replays)} replay{'' if len(replays) == 1 else 's'}: {took}."]
+    took, core, kept = (written(name, value) for name, value in finished.costs.items())
+    again = f"; {kept} of them were kept from before" if finished.costs["found"] else ""
+    lines += [*found, f"{len(replays)} replay{'' if len(replays) == 1 else 's'} in {took}, {core} of one core{again}."]
     tell(record, *lines, out=out, made=lambda: dict(_made(frame, replays, title)))
     if finished.interrupted:
         end_interrupted(f"{finished.interrupted}; the table shows those.")

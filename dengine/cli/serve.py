@@ -27,6 +27,7 @@ DEMO = "Play the bundled recordings as a robot would; forgotten at the end, or i
 NAMED = "A name by which the server is called, beside its own."
 WAITS = "Seconds that a decision may wait in line; then it is verify, and recorded so."
 RATE = "Requests a second of one client; 0: any."
+TOKENS = "A file, its owner's alone: a line each, TOKEN, or TOKEN viewer|operator NAME; every request has to say one."
 
 
 @click.command(epilog=options.ends_in("dengine serve --store cell.db --port 8000"))
@@ -35,7 +36,7 @@ RATE = "Requests a second of one client; 0: any."
 @click.option("--speed", type=SPEED, default=1.0, show_default=True, help="Parts a second of --demo.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Where to listen; any but this machine wants a token.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8000, show_default=True, help="0: any that is free.")
-@click.option("--token-file", type=FILE, help="A file, its owner's alone, with the token that every request has to say.")
+@click.option("--token-file", type=FILE, help=TOKENS)
 @click.option("--cert", type=FILE, help="For TLS: the certificate, with its chain, in PEM.")
 @click.option("--key", type=FILE, help="Its key, in PEM, without a password.")
 @click.option("--allow-host", "allow_hosts", multiple=True, metavar="NAME", help=NAMED)

@@ -14,9 +14,10 @@ from .options import verb
 from .output import certificate_record, facts, heading, listed, rows_of, tell, when, written
 
 if TYPE_CHECKING:
-    from ..history.status import Judged, Status
+    from ..history.status import Judged, Span, Status
 
 WORDS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
+TITLES = {"stops": "accepted, and bad"}
 APART = ("newest", "ever", "recipe", "trace", "certificate", "retrains", "events", "settings", "last")
 ELSEWHERE = ("retraining", "store_lag")  # of an engine that runs
 LAST = "The newest so many decisions, looked at apart."
@@ -54,8 +55,8 @@ def status(store: str, last: int) -> None:
 def _tables(store: str, found: Status) -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
-    names = [each.name for each in fields(found.ever)]
-    spans = [[heading(name), *(_of_span(name, getattr(span, name)) for span in both)] for name in names]
+    names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
+    spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
     now = [("look at", found.alarm)] if found.alarm else []
     now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
@@ -69,15 +70,18 @@ def _tables(store: str, found: Status) -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
-def _of_span(name: str, value: Any) -> str:
+def _of_span(name: str, span: Span) -> str:
+    value = getattr(span, name)
     if name in ("first", "last"):
         return when(value)
-    return _held(value) if hasattr(value, "verdict") else written(name, value)
+    return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
 
 
-def _held(said: Judged) -> str:
-    """An interval of the share of wrong ones, held against what is tolerated."""
-    if not said.known:
-        return "none is known"
+def _held(said: Judged, stops: int) -> str:
+    """An interval of the share of wrong ones, held against what is tolerated; first the stops that no share tells."""
+    first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.by != "every outcome" else ""
+    if not said.known and said.verdict == "open":
+        return first + ("else unknown" if stops else "none is known")
     between = f"{100 * said.lower:.1f} to {percent(said.upper)}"
-    return f"{said.wrong:,} of {said.known:,} by {said.by}: {between}, {WORDS[said.verdict]} {percent(said.tolerance, 'g')}"
+    by = f"{said.wrong:,} of {said.known:,} by {said.by}: " if said.known else ""
+    return f"{first}{by}{between}, {WORDS[said.verdict]} {percent(said.tolerance, 'g')}"

@@ -175,10 +175,11 @@ class Certificate:
 
     def _sentence(self, bounded: Bounded, which: str, verb: str, wrong: str, unknown: str) -> str:
         parts = f"{bounded.n:,} part{'s' if bounded.n != 1 else ''}"
+        but = " beyond the known stops" if verb == "accept" else ""
         if bounded.n == 0:
             return f"Nothing can be said yet: no part was one {which}."
         if bounded.propensity == 0.0:
-            return f"Of {parts} {which} nothing can be said, for {unknown}."
+            return f"Of {parts} {which} nothing can be said{but}, for {unknown}."
         if bounded.propensity < 1.0:
             which = f"that the model would {verb}, of which {bounded.n_looked_at:,} were audited"
         if bounded.shadowed:

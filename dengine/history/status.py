@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
@@ -238,19 +238,29 @@ def _judged(
 ) -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper, tolerance = 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound
-    verdict = "kept" if upper <= tolerance else "broken" if lower > tolerance else "open"
-    return Judged(known if n is None else n, known, wrong, by if known else "", lower, upper, tolerance, verdict)
+    by = by if known else ""
+    return Judged(known if n is None else n, known, wrong, by, lower, upper, tolerance, _verdict(lower, upper, tolerance))
+
+
+def _verdict(lower: float, upper: float, tolerance: float) -> str:
+    return "kept" if upper <= tolerance else "broken" if lower > tolerance else "open"
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
     """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
 
     Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
+    What stopped the system is known all the same: the interval goes no lower, and is kept to by no more, than it allows.
     """
     n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
         return _judged(heard, outcomes.stops, policy, policy.alpha, n, "every outcome")
-    return _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
+    said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
+    # What nobody looked at may have been good, but what stopped the system was bad: audits promise no less than is known.
+    quiet = outcomes.accepted - outcomes.stops
+    lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.stops, policy.alpha)[1])
+    upper = max(said.upper, outcomes.stops / max(1, outcomes.accepted))
+    return replace(said, lower=lower, upper=upper, verdict=_verdict(lower, upper, said.tolerance))
 
 
 def watch(store: SqlStore, recipe: Recipe) -> Watch | None:

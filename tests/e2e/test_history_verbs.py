@@ -131,6 +131,17 @@ def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reas
     assert (ever["dropped"], ever["unlabelled"]) == ({dropped.reason: 2}, 1)
 
 
+def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known(stream: Dataset, tmp_path: Path) -> None:
+    with DataEngine(recipe=RECIPE, store=(store := tmp_path / "engine.db")) as engine:
+        cycles = drive(engine, stream, 0, 300)
+        accepted = next(each for each in reversed(cycles) if each.decision.action is Action.ACCEPT and each.success is None)
+        engine.report(accepted.decision.id, False)
+    ever, words = document("status", store)["ever"], " ".join(succeed("status", store).split())
+    assert words.split("│")[1].strip() == "accepted, and bad"
+    assert ever["stops"] == 1
+    assert "1 stop; else unknown" in words
+
+
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     some, every = Policy(alpha=0.1, lower_bound=0.9), Policy(alpha=0.1, lower_bound=0.9, stops="all")
     silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
@@ -141,6 +152,8 @@ def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
     assert (bad_accepts(audited, some).by, bad_accepts(audited, some).known) == ("audits", 40)
     assert bad_accepts(audited, some).verdict == "kept"
+    assert bad_accepts(Outcomes(50, 6, 0, 40, 0, 0, 0, 0), some).verdict == "open"  # as many as 6 of 50 are known to be bad
+    assert bad_accepts(Outcomes(50, 20, 0, 40, 0, 0, 0, 0), some).verdict == "broken"
     assert bad_accepts(Outcomes(50, 30, 20, 0, 0, 0, 0, 0), every).verdict == "broken"
     assert bad_accepts(Outcomes(10, 1, 9, 0, 0, 0, 0, 0), every).verdict == "open"
     assert bad_accepts(Outcomes(*[0] * 8), every).upper == 1.0

@@ -290,6 +290,7 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     expect(page.locator("#said")).to_have_text("It is recorded: bad.", timeout=PATIENT)
     opened(page, demo, "overview")
     expect(page.locator("#saved")).to_contain_text("system stops, not taken off: 1")
+    expect(page.locator("#bad p").first).to_have_text("1 known bad")
     page.locator("#escapes").get_by_role("link", name=part).click()
     expect(page.locator("h1")).to_have_text(f"Part {part}")
     expect(page.locator("#part .why")).to_contain_text("The part turned out bad (stop)")

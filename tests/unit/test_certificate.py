@@ -53,7 +53,7 @@ def test_what_is_known_one_way_and_the_other_spends_alpha_once() -> None:
 
 
 def test_where_nothing_can_be_said_the_sentence_says_what_to_set() -> None:
-    silent = "went on without a check nothing can be said, for silence is no success: set audit_rate, or stops='all' where"
+    silent = "a check nothing can be said beyond the known stops, for silence is no success: set audit_rate, or stops='all'"
     assert silent in certificate("some", accepted=1203).sentence
     assert certificate("all", rejected=7).sentence_on_rejects.endswith("nobody looks at what is rejected: set audit_rate.")
     assert certificate("all").sentence.startswith("Nothing can be said yet")

@@ -125,7 +125,8 @@ function traceWords(found, channel) {
   const outside = `${said}${percent(envelope.outside, 1)} of it lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
   if (!most) return outside;
-  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} between ${number(most.from_s, 2)} s and ${number(most.to_s, 2)} s.`;
+  const [from, to] = [number(most.from_s, 2), number(most.to_s, 2)];
+  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} ${from === to ? "at" : `between ${from} s and`} ${to} s.`;
 }
 
 export function traceLegend(found) {

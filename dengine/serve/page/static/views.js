@@ -17,8 +17,8 @@ const VERDICT = { kept: "Tolerance kept", open: "Not decided yet", broken: "Tole
 const MODES = { decides: "Decides", learns: "Learning", shadow: "Verifying all", safe: "Safe mode" };
 const BY = {
   "every outcome": (bad) => `Every outcome is known: ${number(bad.wrong)} of ${number(bad.known)} were bad.`,
-  audits: (bad, stops) => `By audits alone: ${number(bad.wrong)} of ${number(bad.known)} were bad; system stops, not among these: ${number(stops)}.`,
-  "": (bad, stops) => `Only the ${number(stops)} system stops are known so far; audits would bound it.`,
+  audits: (bad) => `By audits, ${number(bad.wrong)} of ${number(bad.known)} bad, and by the known system stops.`,
+  "": (bad, stops) => `${stops ? "Only the system stops are known" : "Nothing is known"} so far; audits would bound it.`,
 };
 
 export function modeOf(doing) {
@@ -67,10 +67,12 @@ function pace(recent) {
 
 const verdict = (judged, text) => el("p", { class: `big verdict ${judged.verdict}` }, icon(judged.verdict), text);
 
+const knownBad = ({ stops }) => stops > 0 && el("p", { class: "verdict broken" }, icon("bad"), el("b", {}, `${number(stops)} known bad`));
+
 function badAccepts(doing) {
   const bad = doing.ever.bad_accepts;
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
-    verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
+    knownBad(doing.ever), verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
     el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
     small(BY[bad.by](bad, doing.ever.stops)));
 }
@@ -172,7 +174,7 @@ async function now(get, _, doing) {
   const bad = doing.ever.bad_accepts;
   const figures = [
     verified(doing), accepted(doing),
-    figure("bad", "Bad accepted parts", verdict(bad, `${percent(bad.lower, 1)} – ${percent(bad.upper, 1)}`), small(`${VERDICT[bad.verdict]} (${percent(bad.tolerance)})`)),
+    figure("bad", "Bad accepted parts", knownBad(doing.ever), verdict(bad, `${percent(bad.lower, 1)} – ${percent(bad.upper, 1)}`), small(`${VERDICT[bad.verdict]} (${percent(bad.tolerance)})`)),
     pace(decisions), saved(doing),
   ];
   const shown = el("div", { class: "now" }, card_,
@@ -193,11 +195,11 @@ async function trend(get, asked, parts) {
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
   const { stretches } = await get(`course?${by === "batch" ? `batch=${batch}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : moment(begun(each.last)).slice(5, 16), number(each.n),
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
     percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
-    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"]], rows));
+    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"]], rows));
 }
 
 async function overview(get, query, doing) {
@@ -207,7 +209,8 @@ async function overview(get, query, doing) {
   const { newest, ever } = doing;
   const report = ever.retrains > 0 && course.retrains.filter((each) => each.report.accepted).at(-1);
   const escapes = escaped.length > 0 && card("escapes", `Accepted, and bad: ${number(ever.stops)}`,
-    el("ul", { class: "chips" }, escaped.map((each) => el("li", {}, el("a", { href: partAddress(each.id) }, nameOf(each.part, each.id)), ` ${moment(each.time)}`))));
+    el("ul", { class: "chips" }, escaped.map((each) => el("li", {}, el("a", { href: partAddress(each.id) }, nameOf(each.part, each.id)), ` ${moment(each.time)}`)),
+      ever.stops > escaped.length && el("li", {}, el("a", { href: "history?action=accept&label=bad" }, "All of them"))));
   const drift = doing.watch
     ? [["accepts", "bad among the accepted"], ["rejects", "good among the rejected"], ["novelty", "novel parts"]].map(([name, title]) => el("p", { class: "watched" },
       el("label", { for: `watch-${name}` }, title), el("meter", { id: `watch-${name}`, min: 0, max: 1, high: 0.5, value: Math.min(1, doing.watch[name]) }), percent(doing.watch[name])))
