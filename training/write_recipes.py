@@ -1,7 +1,4 @@
-"""Write models/recipes/NAME.toml from the defaults in the code; a test keeps the two equal.
-
-python training/write_recipes.py
-"""
+"""`python training/write_recipes.py` writes models/recipes/NAME.toml from the code's defaults; a test keeps them equal."""
 
 from pathlib import Path
 
