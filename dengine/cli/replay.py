@@ -207,7 +207,7 @@ def _replay(who: Sequence[Contender], grid: Mapping[str, Any], source: DataChoic
     for name, some in by_name.items():
         retrains = [each for one in some for each in one.retrains]
         lines.append(f"{name}: {tables.retrain_line(retrains)}")
-    took, core, kept = (written(name, value) for name, value in finished.costs.items())
+    took, core, kept = (written(name, finished.costs[name]) for name in ("seconds", "core_seconds", "found"))
     again = f"; {kept} of them were kept from before" if finished.costs["found"] else ""
     lines += [*found, f"{len(replays)} replay{'' if len(replays) == 1 else 's'} in {took}, {core} of one core{again}."]
     tell(record, *lines, out=out, made=lambda: dict(_made(frame, replays, title)))

@@ -250,13 +250,12 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
     """How many of the parts that the model let pass were bad: by every outcome where all are known, else by audits.
 
     Under `stops="all"` a part whose silence is not over is left out. Audits speak for all: their coin knows no outcome.
-    What stopped the system is known all the same: the interval goes no lower, and is kept to by no more, than it allows.
+    Stops are known beside them: the lower end is at least that of the stops if all others were good, the upper their share.
     """
     n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
         return _judged(heard, outcomes.stops, policy, policy.alpha, n, "every outcome")
     said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
-    # What nobody looked at may have been good, but what stopped the system was bad: audits promise no less than is known.
     quiet = outcomes.accepted - outcomes.stops
     lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.stops, policy.alpha)[1])
     upper = max(said.upper, outcomes.stops / max(1, outcomes.accepted))

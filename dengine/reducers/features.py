@@ -102,12 +102,12 @@ class InChunks(nn.Module):
 
     def __init__(self, features: Features) -> None:
         super().__init__()
-        self.features = features
+        self.features, self.chunk = features, CHUNK  # a scripted method reads no global
 
     def forward(self, x: Tensor, out: Tensor) -> None:
         """(n, C, T) -> out (n, P), n whole chunks."""
-        for i in range(0, x.size(0), 32):  # CHUNK
-            out[i : i + 32] = self.features.raw(x[i : i + 32])
+        for i in range(0, x.size(0), self.chunk):
+            out[i : i + self.chunk] = self.features.raw(x[i : i + self.chunk])
 
 
 def rocket_kernels() -> Tensor:
