@@ -23,12 +23,9 @@ REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
 QUICK = {"README.md", "docs/tutorials/first_part.md", "docs/howto/own_reducer.md", "docs/howto/labels.md"}
 
-ONE_REPLAY = "--seeds 100:101 --cycles 60 --policies 0.2:0.8 --n-jobs 1"
-SMALL = "--data small.npz --samples 100"
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
     "dengine replay --data screw_driving.npz": "--cycles 60",
-    "dengine compare --data screw_driving.npz": "--repeats 1 --cycles 60 --n-jobs 1",
     "dengine compare --data insertion": "--repeats 1 --cycles 80 --n-jobs 1",
     "dengine compare --data insertion --reducers conv --paper": "--cycles 50",
     "dengine compare --reducers pca,my_reducers:PeakReducer": "--cycles 80",
@@ -41,16 +38,12 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data numbered.npz": "--cycles 80",
     "dengine train --data insertion": "--data small.npz --retrains 1",
     "dengine train --data recordings": "--retrains 1",
-    "python training/compare_reducers.py report --data insertion": f"{ONE_REPLAY} --reducers conv,pca,knn",
-    "python training/compare_reducers.py report --data screw_driving.npz": f"{ONE_REPLAY} --reducers conv,pca",
     "python training/benchmark_cycle.py": "--data screw_driving.npz --samples 100 --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data screw_driving.npz --samples 100 --sizes 80 --repeats 1",
     "python -m tests.slow.proof --only null": "--repeats 2",
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --cycles 0 --samples 100",
     "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100",
-    "python training/compare_ablations.py": f"{SMALL} --only length --seeds 100:101 --cycles 60 --n-jobs 1",
-    "python training/compare_drift.py": "--cycles 40 --scenarios bias_jump --methods dengine,paper-conv --n-jobs 1",
     "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
     "cmake --build build/cpp": "--parallel 2",
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20",
