@@ -103,7 +103,8 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     offset, gain = _standardising(features)
     standard = torch.addcmul(offset, features, gain).float()
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
-    standard, same = standard[sound], same[sound][:, sound]
+    if not sound.all():
+        standard, same = standard[sound], same[sound][:, sound]
     texture = torch.arange(3 * gate.quiet.size(1)).ge(2 * gate.quiet.size(1)).repeat(channels)  # (P,)
     for i, group in enumerate((~texture, texture)):
         points = standard[:, group]
@@ -122,8 +123,8 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
 def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:
     """(n, P) float64 -> offset, gain, (P,) each."""
     # A glitch among the references must not be the measure of the others: the outermost of each feature are drawn in.
-    ordered = features.t().contiguous().sort(1).values  # (P, n)
-    few = 1 + len(features) // TAIL_TRACES
+    few, n = 1 + len(features) // TAIL_TRACES, len(features)
+    ordered = torch.from_numpy(np.partition(features.numpy().T, (few, n - 1 - few), 1))  # (P, n)
     inner = torch.minimum(torch.maximum(features, ordered[:, few]), ordered[:, -1 - few])
     mean, deviation = inner.mean(0), inner.std(0, unbiased=False)
     # What never moved is far away once it does, but not by the rounding of its own size.
@@ -133,8 +134,11 @@ def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:
 
 def _same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> tuple[Tensor, int]:
     """(n, n) bool, which traces (n, C, T) are one trace or of one part, themselves too; and how many are different."""
-    found: dict[bytes, int] = {}
-    trace = np.array([found.setdefault(x.tobytes(), len(found)) for x in traces])
+    for some in (traces[..., ::16], traces):  # a few samples tell most apart
+        found: dict[bytes, int] = {}
+        trace = np.array([found.setdefault(x.tobytes(), len(found)) for x in some])
+        if len(found) == len(traces):
+            break
     own = trace if parts is None else parts
     same = (trace[:, None] == trace) | (own[:, None] == own)
     return torch.from_numpy(same), int((~np.tril(same, -1).any(1)).sum())
@@ -153,8 +157,8 @@ def _limits(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)
     squared.masked_fill_(same, float("inf"))
     nearest = squared.amin(1)
-    nine = float(torch.quantile(nearest, 0.9))
-    usual = max(1e-3, min(float(torch.quantile(nearest, QUANTILE)), 6.0 * nine))
+    nine, most = torch.quantile(nearest, torch.tensor([0.9, QUANTILE])).tolist()
+    usual = max(1e-3, min(most, 6.0 * nine))
     reach = torch.full_like(nearest, usual)
     strange = nearest > max(1e-3, min(usual, 3.0 * nine))
     if LIKE < int(strange.sum()) < len(points):
