@@ -35,7 +35,7 @@ endef
 export LOCKED
 REPEATS ?= 200
 
-.PHONY: setup demo test test-merge test-all lint docs proof audit dist clean
+.PHONY: setup demo test test-merge test-all lint docs proof evidence audit dist clean
 
 setup: $(VENV)/.dev
 
@@ -77,6 +77,10 @@ docs: $(VENV)/.dev
 
 proof: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof --out $(OUT)/proof --docs docs/explanation --repeats $(REPEATS) --jobs 2
+
+# Hours: it says how many before it begins, and goes on where it was killed. SCREW names the screw-driving set, an .npz file.
+evidence: $(VENV)/.dev
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence.py $(if $(SCREW),--screw $(SCREW))
 
 # pip-audit may skip every package and still end well, so what it audited is counted. It gets names and plain versions: one
 # that is installed in editable form, or a build like 2.9.0+cpu, is not on PyPI, and --strict fails at what is not there.

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from dengine import load_dataset
@@ -35,6 +36,29 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 def load(name: str) -> ModuleType:
     return importlib.import_module(name)
+
+
+def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_path: Path) -> None:
+    words = ["--seeds", "0:3", "--only", "conv,knn", "--sets", "opposite,screw driving", "--cycles", 150, "--n-jobs", 1]
+    first, second = (run("evidence", *words, "--out", tmp_path, "--keep", tmp_path / "kept") for _ in range(2))
+    assert "Without screw driving" in first
+    assert "\n12 replays are left" in first
+    assert "\n0 replays are left" in second
+    rows, told = (pd.read_csv(tmp_path / "evidence" / f"{name}.csv") for name in ("replays", "differences"))
+    certain = rows[rows["alpha"] == 0.1].pivot_table("certain", "seed", "recipe")
+    more = told.query("alpha == 0.1 and recipe == 'knn'").iloc[0]
+    assert more["certain_more"] == pytest.approx((certain["knn"] - certain["conv"]).mean(), abs=1e-3)
+    assert more["certain_low"] < more["certain_more"] < more["certain_high"]
+    assert "| opposite | " in (tmp_path / "explanation" / "evidence.md").read_text(encoding="utf-8")
+
+
+def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition() -> None:
+    evidence = load("evidence")
+    known = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
+    old = pd.DataFrame([known | {"recipe": who, "seed": seed, "commit": "a"} for who in ("pca", "conv") for seed in (1, 2)])
+    new = pd.DataFrame([known | {"recipe": "conv", "seed": 2, "commit": "b"}])
+    found = evidence.merged(old, new)[["recipe", "seed", "commit"]]
+    assert found.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
 
 
 def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run: Run, tmp_path: Path) -> None:
