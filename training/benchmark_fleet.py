@@ -150,33 +150,23 @@ def work(plan: Plan, data: Dataset, cell: int) -> Worked:
     return about | {"sent": sent, "seconds": seconds, "others": others, "marks": marks}
 
 
-def server(url: str) -> tuple[Path, list[int]]:
-    """A PostgreSQL server's folder, and its processes, the first one first."""
+def break_server(url: str, seconds: float) -> None:
+    """Freeze a PostgreSQL server for a while, go on, then kill it and start it anew."""
     engine = sa.create_engine(url)
     with engine.connect() as connection:
         folder = Path(connection.execute(sa.text("SHOW data_directory")).scalar_one())
     engine.dispose()
-    first = int((folder / "postmaster.pid").read_text().split()[0])
-    children = Path(f"/proc/{first}/task/{first}/children").read_text().split()
-    return folder, [first, *map(int, children)]
-
-
-def break_server(url: str, seconds: float) -> None:
-    """Freeze a PostgreSQL server for a while, go on, then kill it and start it anew."""
-    time.sleep(seconds / 4)
-    pids = server(url)[1]
-    for number in (signal.SIGSTOP, signal.SIGCONT):
-        print(f"{number.name} to the {len(pids)} processes of the server", flush=True)
-        for pid in pids:
-            os.kill(pid, number)
-        time.sleep(FROZEN if number == signal.SIGSTOP else seconds / 4 - FROZEN)
-    folder, pids = server(url)
-    command = shlex.split((folder / "postmaster.opts").read_text())
-    print(f"SIGKILL to the {len(pids)} processes of the server", flush=True)
-    for pid in pids:
-        os.kill(pid, signal.SIGKILL)
+    pid = folder / "postmaster.pid"
+    first, command = pid.read_text().split()[0], shlex.split((folder / "postmaster.opts").read_text())
+    steps = ((seconds / 4, signal.SIGSTOP), (FROZEN, signal.SIGCONT), (seconds / 4 - FROZEN, signal.SIGKILL))
+    for pause, number in steps:
+        time.sleep(pause)
+        processes = [first, *Path(f"/proc/{first}/task/{first}/children").read_text().split()]
+        print(f"{number.name} to the {len(processes)} processes of the server", flush=True)
+        for process in processes:
+            os.kill(int(process), number)
     time.sleep(DOWN)
-    (folder / "postmaster.pid").unlink(missing_ok=True)
+    pid.unlink(missing_ok=True)
     owner = ["runuser", "-u", folder.owner(), "--"] if os.getuid() != folder.stat().st_uid else []
     subprocess.Popen([*owner, *command], cwd=folder.parent, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     print("started again", flush=True)
