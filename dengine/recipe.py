@@ -234,7 +234,7 @@ def _value(value: Any) -> str:
 
 
 RECIPES: dict[str, Recipe] = {
-    "conv": Recipe("conv", radius=0.05),  # radius of a probability: the encoder's own unit
+    "conv": Recipe("conv", radius=0.07),  # radius of a probability: the encoder's own unit
     "umap": Recipe("umap"),
     "pca": Recipe("pca", radius=0.2),
     "rocket": Recipe("rocket", radius=0.05),

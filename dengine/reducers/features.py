@@ -1,18 +1,19 @@
 """Features of traces, which read no label, and cross-fitted logistic heads over them: what conv and rocket share.
 
-    x (B, C, T) -> features of a kind, standardised and clipped                                     (B, P)
-                -> W principal components: no label is read, so one set serves every fold           (B, W)
-                -> head k, a logistic regression on the labels outside fold k                       (B, K, d)
+    x (B, C, T) -> features of a kind, standardised and clipped, in one tower or several            (B, P)
+                -> W principal components of each: no label is read, so one set serves every fold   (B, W)
+                -> head k of each, a logistic regression on the labels outside fold k               (B, K)
+                -> their logits in the shares that say best what each left out                      (B, K, d)
 
-In what answers the last two are one matrix. A retrain computes the features of new traces alone, finds the components anew
-where the traces have grown by half, and fits the heads from where they were.
+In what answers the last three are one matrix. A retrain computes the features of new traces alone, finds the components
+anew where the traces have grown by half, and fits the heads from where they were.
 """
 
 import copy
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from itertools import combinations
-from typing import Any, Self
+from itertools import combinations, pairwise
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ MIN_TRACES = 20  # that an engine's first model is trained on
 FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, they would hold all parts for alike
 TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
 GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
-VARIANCE = 150.0  # of the components together: what the ridge of a head is weighed against
+SHARES = 11  # of the first tower in the logit, from 0 to 1
 LEARNED = 256  # traces that channels' scales are read from: more tell no more
 MOST = 10**9  # of a parameter that is a whole number
 MANY = 3200  # traces, for which a second core is worth taking
@@ -44,15 +45,20 @@ SECOND_AXIS = 0.04  # range of the second coordinate: seen in a picture, small a
 
 
 class Features(nn.Module):
-    """(B, C, T) raw traces -> (B, P) features, centred, scaled and clipped; a kind gives `raw` and `learn_filters`."""
+    """(B, C, T) raw traces -> (B, P) features, centred, scaled and clipped; a kind gives `raw` and `learn_filters`.
+
+    widths : features of each tower, P together.
+    """
 
     shift: Tensor
     scale: Tensor
     offset: Tensor
     gain: Tensor
 
-    def __init__(self, channels: int, samples: int, n_features: int) -> None:
+    def __init__(self, channels: int, samples: int, *widths: int) -> None:
         super().__init__()
+        n_features, ends = sum(widths), np.cumsum([0, *widths]).tolist()
+        self.towers = [slice(*each) for each in pairwise(ends)]
         if samples < 2:
             raise SettingError(f"Expected at least 2 samples, got {samples} (n_features = {channels * samples}).")
         # A channel becomes scale * x + shift, a feature gain * f + offset: one pass each.
@@ -92,6 +98,8 @@ class Features(nn.Module):
     def standardise(self, raw: Tensor) -> None:
         """Set mean and deviation of the features from raw ones (n, P)."""
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
+        for tower in self.towers[1:]:  # of shares what moves more tells more
+            deviation[tower] = deviation[tower].square().mean().sqrt()
         floor = 1e-3 * deviation.median() + 1e-12  # a feature that never moved must not explode when it does
         self.gain.copy_(1.0 / (deviation + floor))
         self.offset.copy_(-mean / (deviation + floor))
@@ -160,7 +168,7 @@ def fit_heads(
     its bias last.  Each minimises its log loss + l2/2 |w|^2: convex, so it ends at one place wherever it starts. A head
     that says held-out labels worse than their base rate does says the base rate: its own gate, for a common one would let
     fold k's labels choose head k.  At most `max_iter` steps, the first `least` however late.
-    Returns w, each head's leave-one-out log loss (K,), the heads that say the base rate, and the steps taken.
+    Returns w, the logit of each row by each head without it (K, n), the heads that say the base rate, and the steps taken.
     """
     small = torch.cat([g, torch.ones(len(g), 1)], 1)
     g, y, mask = small.double(), y.double(), outside.double()
@@ -202,26 +210,56 @@ def fit_heads(
         done |= (size * (size / last).clamp(max=1.0) < 2e-4) & (fresh | ~rises)  # about what the next step would be
         # A step with a former factor costs a tenth: a new one where that serves no more.
         stale, last = ~done & (rises | (size > (last / 4.0).clamp(max=0.3))), size
-    loss, base, rate = left_out_losses(small, y, mask, w @ g.T, torch.stack(factors))
-    worse = loss > base
+    left_out = leave_one_out(small, y, w @ g.T, torch.stack(factors))
+    rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
+    worse = masked_loss(left_out, y, mask) > masked_loss(rate, y, mask)
     w = torch.where(worse[:, None], 0.0, w)  # anew: who has the former heads keeps them
-    w[worse, -1] = torch.logit(rate[worse])
-    return w, loss, worse.nonzero().flatten().tolist(), step
+    w[worse, -1] = rate[worse, 0]
+    return w, torch.where(worse[:, None], rate, left_out), worse.nonzero().flatten().tolist(), step
 
 
-def left_out_losses(x: Tensor, y: Tensor, mask: Tensor, s: Tensor, factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of each head its leave-one-out log loss, that of the base rate, and that rate, (K,) each.
+def leave_one_out(x: Tensor, y: Tensor, s: Tensor, factors: Tensor) -> Tensor:
+    """(K, n) logits of every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
 
-    x (n, W+1), y (n,), mask (K, n) of the rows that count.  s (K, n) scores.  factors (K, W+1, W+1) of the Hessians.
-    Every row by the head without it, to first order: Rad and Maleki (2020), JRSS B 82(4).
+    x (n, W+1), y (n,).  s (K, n) logits by the heads.  factors (K, W+1, W+1) of the Hessians.
     """
     p = torch.sigmoid(s)
     lever = torch.stack([((x @ each) * x).sum(1) for each in torch.cholesky_inverse(factors).float()])
-    left_out = s + lever * (p - y) / (1.0 - lever * p * (1.0 - p)).clamp(min=0.05)
-    n = mask.sum(1)
-    rate = (mask @ y) / n
-    losses = (mask * (F.softplus(left_out) - y * left_out)).sum(1) / n
-    return losses, F.binary_cross_entropy(rate, rate, reduction="none"), rate
+    return s + lever * (p - y) / (1.0 - lever * p * (1.0 - p)).clamp(min=0.05)
+
+
+def masked_loss(s: Tensor, y: Tensor, mask: Tensor) -> Tensor:
+    """(..., K, n) logits -> (..., K) mean log losses of labels (n,) on the rows that count, mask (K, n)."""
+    return (mask * (F.softplus(s) - y * s)).sum(-1) / mask.sum(1)
+
+
+class Tower(NamedTuple):
+    """Principal components of some of the features, and the heads on them."""
+
+    axes: Tensor  # (P of the tower, W), scaled so that all traces together have the tower's variance
+    centre: Tensor  # (W,) what is added
+    w: Tensor  # (K, W+1) float64, each head's bias last
+
+    @classmethod
+    def over(cls, f: Tensor, width: int, variance: float, weights: Tensor, scores: Tensor) -> Self:
+        """Of standardised features (n, P), with heads near `weights` (P, K) on them, whose mean is `scores` (K,)."""
+        centred = f - f.mean(0)
+        # In float32, in half the time: components are told from noise to 1e-6.
+        sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
+        sizes, axes = (each[..., -width:].flip(-1) for each in (sizes.clamp(min=0.0), axes))
+        axes = axes * (sizes > 1e-6 * sizes[0])
+        size = (variance / sizes.sum().clamp(min=1e-9)).sqrt()
+        w = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double()
+        return cls(axes * size, -(f.mean(0) @ axes) * size, w)
+
+    def components(self, f: Tensor) -> Tensor:
+        """(n, P) -> (n, W)."""
+        return torch.addmm(self.centre, f, self.axes)
+
+    def heads(self) -> tuple[Tensor, Tensor]:
+        """Weights (P, K) and biases (K,) on the features."""
+        w, bias = self.w[:, :-1], self.w[:, -1]
+        return (self.axes.double() @ w.T).float(), (bias + w @ self.centre.double()).float()
 
 
 class FeatureReducer(Reducer):
@@ -234,8 +272,9 @@ class FeatureReducer(Reducer):
 
     uses_labels = True
     scores = True
-    own_unit = True  # a radius of 0.05 is five in a hundred, never rescaled
+    own_unit = True  # a radius of 0.07 is seven in a hundred, never rescaled
     width = 128  # W
+    variances: tuple[float, ...] = (150.0,)  # of each tower's components together: what a head's ridge is weighed against
     sizes: tuple[str, ...] = ()  # parameters of a kind that are whole numbers
     n_components: int
     folds: int
@@ -243,7 +282,7 @@ class FeatureReducer(Reducer):
     max_iter: int
     random_state: Any
     net_: FeatureEmbedding
-    w_: Tensor
+    towers_: list[Tower]
 
     @property
     def n_spaces(self) -> int:
@@ -306,6 +345,7 @@ class FeatureReducer(Reducer):
         features = self.make_features(channels, samples)
         self.net_ = FeatureEmbedding(features, self.folds, self.n_components).eval()
         self.n_fits_ = self.n_seen_ = 0
+        self.towers_ = []
         self._numbers = np.zeros(0, dtype=np.int64)  # of the labels that were seen last
         self._raw = torch.empty(0, len(features.gain))
 
@@ -327,15 +367,32 @@ class FeatureReducer(Reducer):
             for k, some in enumerate(outside):
                 if (classes := len(np.unique(labels[rows][some]))) < 2:
                     raise one_class_outside(k, int(some.sum()), classes)
-            g, y = torch.addmm(self.centre_, self.net_.features.clipped(raw), self.axes_), torch.from_numpy(labels[rows])
-            fitted = fit_heads(g, y, torch.from_numpy(outside), self.w_, self.l2, self.max_iter, stop, least)
-            self.w_, losses, unsure, self.n_iter_ = fitted
-            first = slice(None, None, self.n_components)
-            self.net_.weight[:, first] = (self.axes_.double() @ self.w_[:, :-1].T).float()
-            self.net_.bias[first] = (self.w_[:, -1] + self.w_[:, :-1] @ self.centre_.double()).float()
+            f, y, rows_of = self.net_.features.clipped(raw), torch.from_numpy(labels[rows]), torch.from_numpy(outside)
+            towers, said = [], []
+            for tower, columns in zip(self.towers_, self.net_.features.towers, strict=True):
+                g = tower.components(f[:, columns])
+                w, *rest = fit_heads(g, y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
+                towers.append(tower._replace(w=w))
+                said.append(rest)
+            left_out, unsure, steps = zip(*said, strict=True)
+            # Leave-one-out logits of rows outside fold k alone weigh the towers of head k.
+            shares = torch.linspace(0.0, 1.0, SHARES if len(towers) > 1 else 1, dtype=torch.float64)[:, None, None]
+            mixed = shares * left_out[0] + (1.0 - shares) * left_out[-1]
+            losses, best = masked_loss(mixed, y, rows_of.double()).min(0)
+            self._answer_by(towers, shares[best, 0, 0].float())
+        self.towers_, self.n_iter_ = towers, max(steps)
         self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
-        heads = ", ".join(map(str, unsure))
-        self.note_ = f"head {heads} says the base rate: it would have done worse" if unsure else ""
+        heads = ", ".join(map(str, sorted(set.intersection(*map(set, unsure)))))
+        self.note_ = f"head {heads} says the base rate: it would have done worse" if heads else ""
+
+    def _answer_by(self, towers: list[Tower], share: Tensor) -> None:
+        """Put the towers' heads into what answers; share (K,) of the first one, and the last has the rest."""
+        net, first = self.net_, slice(None, None, self.n_components)
+        net.bias[first] = 0.0
+        for tower, columns, own in zip(towers, net.features.towers, (share, 1.0 - share)[-len(towers) :], strict=True):
+            weight, bias = tower.heads()
+            net.weight[columns, first] = own * weight
+            net.bias[first] += own * bias
 
     def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
         """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
@@ -345,25 +402,22 @@ class FeatureReducer(Reducer):
         """Find the principal components of raw features (n, P), and what the heads, if any, come to on these."""
         net, self.n_seen_ = self.net_, len(raw)
         some = raw[:: 1 + (len(raw) - 1) // 1000]
-        weights, biases = net.weight[:, :: self.n_components], net.bias[:: self.n_components]  # of every head
-        scores = torch.addmm(biases, net.features.clipped(some), weights).mean(0)
-        weights = weights * net.features.gain[:, None]
+        f, gain, former = net.features.clipped(some), net.features.gain.clone(), self.towers_
         net.features.standardise(some)
-        weights = weights / net.features.gain[:, None]
-        f = net.features.clipped(some)
-        centred = f - f.mean(0)
-        # In float32, in half the time: components are told from noise to 1e-6.
-        sizes, axes = torch.linalg.eigh(centred.T @ centred / len(f))
-        sizes, axes = (each[..., -self.width :].flip(-1) for each in (sizes.clamp(min=0.0), axes))
-        axes = axes * (sizes > 1e-6 * sizes[0])
+        now = net.features.clipped(some)
+        self.towers_ = []
+        for i, (columns, variance) in enumerate(zip(net.features.towers, self.variances, strict=False)):
+            weights, scores = torch.zeros(len(gain[columns]), self.folds), torch.zeros(self.folds)
+            if former:
+                weights, biases = former[i].heads()
+                scores = torch.addmm(biases, f[:, columns], weights).mean(0)
+                weights = weights * (gain / net.features.gain)[columns, None]
+            self.towers_.append(Tower.over(now[:, columns], self.width, variance, weights, scores))
         if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
-            second = 2.0 * axes[:, 0] / sizes[0].clamp(min=1e-12).sqrt()
-            second = second if second @ net.weight[:, 1] >= 0 else -second  # its sign as it was
-            net.weight[:, 1::2], net.bias[1::2] = second[:, None], -(f.mean(0) @ second)
-        size = (VARIANCE / sizes.sum().clamp(min=1e-9)).sqrt()
-        self.w_ = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double()
-        self.axes_ = axes * size
-        self.centre_ = -(f.mean(0) @ self.axes_)
+            axis, columns = self.towers_[0].axes[:, 0], net.features.towers[0]
+            second = 2.0 * axis / (now[:, columns] @ axis).std().clamp(min=1e-12)
+            second = second if second @ net.weight[columns, 1] >= 0 else -second  # its sign as it was
+            net.weight[columns, 1::2], net.bias[1::2] = second[:, None], -(now[:, columns].mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """(n, C, T) -> (n, P), not standardised: computed once a label's number, and forgotten once that is not given."""
@@ -424,8 +478,8 @@ class FeatureReducer(Reducer):
     def get_state(self) -> dict[str, NDArray[Any]]:
         check_is_fitted(self, "net_")
         counts = np.array([*self.trace_shape_, self.n_fits_, self.n_seen_, self.n_iter_])
-        own = {"counts": counts, "losses": self.holdout_losses_, "axes": self.axes_.numpy(), "centre": self.centre_.numpy()}
-        own |= {"w": self.w_.numpy()}
+        own = {"counts": counts, "losses": self.holdout_losses_}
+        own |= {f"{name}.{i}": v.numpy() for i, each in enumerate(self.towers_) for name, v in each._asdict().items()}
         return own | {f"net.{name}": value.numpy().copy() for name, value in self.net_.state_dict().items()}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -433,7 +487,11 @@ class FeatureReducer(Reducer):
         self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
         self._build(channels, samples)
         self.net_.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in part(state, "net.").items()})
-        self.axes_, self.centre_, self.w_ = (torch.from_numpy(np.array(state[name])) for name in ("axes", "centre", "w"))
+        held = (part(state, f"{name}.") for name in Tower._fields)
+        self.towers_ = [
+            Tower(*(torch.from_numpy(np.array(v)) for v in each))
+            for each in zip(*(each.values() for each in held), strict=True)
+        ]
         self.n_fits_, self.n_seen_, self.holdout_losses_, self.note_ = n_fits, n_seen, np.array(state["losses"]), ""
         return self
 

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.special import logit
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
+from sklearn.metrics import roc_auc_score
 
 from dengine import DataEngine, Dataset, Recipe, RocketReducer
 from dengine.datasets.importing import import_labelled
@@ -15,7 +19,7 @@ from dengine.errors import SettingError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
-from dengine.reducers.features import FIRST_STEPS, MANY, fit_heads
+from dengine.reducers.features import FIRST_STEPS, MANY, fit_heads, masked_loss
 from dengine.reducers.rocket import RocketFeatures
 
 STEPS = StopRule(max_steps=20)
@@ -165,10 +169,11 @@ def test_a_head_that_would_do_worse_than_the_base_rate_says_it_and_the_others_do
     g = torch.from_numpy(rng.normal(size=(940, 50)).astype(np.float32))
     y = torch.from_numpy((rng.random(940) < 1 / (1 + np.exp(-2 * g[:, 0].numpy()))).astype(np.int64))
     outside = torch.arange(940) < torch.tensor([[900], [40]])  # head 1 learns from forty rows, head 0 from enough
-    w, loss, unsure, steps = fit_heads(g, y, outside, torch.zeros(2, 51, dtype=torch.float64), 0.01, 30, None)
+    w, left_out, unsure, steps = fit_heads(g, y, outside, torch.zeros(2, 51, dtype=torch.float64), 0.01, 30, None)
     assert unsure == [1]
     assert not w[1, :-1].any()
     assert torch.sigmoid(w[1, -1]) == pytest.approx(float(y[:40].double().mean()))
+    loss = masked_loss(left_out, y, outside.double())
     assert loss[0] < 0.5 < loss[1]
     assert steps < 30
 
@@ -192,22 +197,51 @@ def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_sec
     reducer = train(ConvReducer(), X[:60], y[:60])
     found = []
     for n in (80, 100, 160):
-        before = reducer.axes_, reducer.embed(X)
+        before = reducer.towers_[0].axes, reducer.embed(X)
         train(reducer, X[:n], y[:n])
-        found.append(reducer.axes_ is not before[0])
+        found.append(reducer.towers_[0].axes is not before[0])
         assert np.corrcoef(before[1][:, 0, 1], reducer.embed(X)[:, 0, 1])[0, 1] > 0.5
     assert found == [False, True, True]
 
 
-@pytest.mark.parametrize("kind", [ConvReducer, RocketReducer])
-def test_what_answers_is_the_components_and_then_the_heads(kind: type) -> None:
+@pytest.mark.parametrize("kind", [partial(ConvReducer, groups=0), RocketReducer, ConvReducer])
+def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(kind: Any) -> None:
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
     with torch.no_grad():
-        g = reducer.net_.features(torch.from_numpy(X)).double() @ reducer.axes_.double() + reducer.centre_
-        p = torch.sigmoid(g @ reducer.w_[:, :-1].T + reducer.w_[:, -1])
-    np.testing.assert_allclose(reducer.embed(X)[..., 0], p, atol=1e-5)
-    assert g.var(0).sum() == pytest.approx(150.0, rel=0.05)  # what a ridge of 1 is weighed against
+        f, logits = reducer.net_.features(torch.from_numpy(X)), []
+        for tower, columns, variance in zip(reducer.towers_, reducer.net_.features.towers, reducer.variances, strict=False):
+            g = f[:, columns].double() @ tower.axes.double() + tower.centre
+            logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
+            assert g.var(0).sum() == pytest.approx(variance, rel=0.05)  # what a ridge of 1 is weighed against
+    said = logit(reducer.embed(X)[..., 0].astype(float))
+    for k, space in enumerate(said.T):
+        off, across = space - logits[-1][:, k], (logits[0] - logits[-1])[:, k]
+        share = off @ across / max(across @ across, 1e-12)
+        np.testing.assert_allclose(off, share * across, atol=2e-3)
+        assert share == pytest.approx(round(10 * share) / 10, abs=1e-3) and 0.0 <= round(10 * share) <= 10
+
+
+def test_where_frequencies_tell_it_kernels_that_compete_find_them_and_the_logit_is_mostly_theirs() -> None:
+    rng = np.random.default_rng(0)
+    y = rng.integers(2, size=500)
+    noise = rng.standard_normal((500, 1, 410))
+    echo = np.cos((0.9 + 0.06 * y) * np.arange(10)[:, None]) * 0.8 ** np.arange(10)[:, None]
+    X = sum(noise[..., i : 400 + i] * own[:, None, None] for i, own in enumerate(echo)).astype(np.float32)
+    auc = [
+        roc_auc_score(y[300:], reducer.embed(X[300:])[..., 0].mean(1))
+        for reducer in (each.fit(X[:300], y[:300]) for each in (ConvReducer(groups=0), ConvReducer()))
+    ]
+    assert auc[1] > auc[0] + 0.02
+
+
+def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:
+    X, _ = traces(64)
+    encoder = ConvEncoder(1, X.shape[-1], 1, 28, 5, 3, 2).eval()
+    encoder.learn(torch.from_numpy(X), np.random.default_rng(0))
+    flat = torch.full((1, 1, X.shape[-1]), float(X.mean()))
+    flat[..., 0] += 1e-6  # as rounding would have it
+    assert encoder.raw(flat)[0, encoder.towers[1]].reshape(-1, 8).min() > 0.7
 
 
 def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
@@ -230,13 +264,13 @@ def test_features_of_very_many_traces_are_those_of_each_to_the_bit() -> None:
 @pytest.mark.parametrize("channels", [1, 3])
 def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(channels: int) -> None:
     samples, dilations, kernels = 60, 3, 4
-    encoder = ConvEncoder(channels, samples, 1, kernels, dilations, 3)
+    encoder = ConvEncoder(channels, samples, 1, kernels, dilations, 3, 0)
     a = torch.randn(5, channels, samples, generator=torch.Generator().manual_seed(0))
     encoder.learn_filters(a, np.random.default_rng(0))
-    found = torch.bmm(encoder.kernel.transpose(1, 2), encoder.windows(a)).view(dilations, kernels, -1, 5)
-    middle = encoder.taps.view(dilations, -1, 9)[:, :, 4]
+    found = torch.bmm(encoder.kernel, encoder.windows(encoder.seen(a), dilations)).view(dilations, kernels, -1, 5)
+    middle = encoder.taps.view(dilations, 9, -1)[:, 4]
     for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
-        weight = encoder.kernel[d].T.reshape(kernels, channels, 9)
+        weight = encoder.kernel[d].reshape(kernels, channels, 9)
         whole = torch.nn.functional.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, kernels, samples)
         torch.testing.assert_close(found[d], whole[:, :, middle[d]].permute(1, 2, 0))
 
@@ -256,7 +290,7 @@ def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_
 def test_traces_of_any_shape_have_finite_features_the_same_when_scripted(samples: int, channels: int) -> None:
     rng = np.random.default_rng(0)
     X = torch.from_numpy(rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32))
-    encoder = ConvEncoder(channels, samples, averaging(X), 28, 5, 3).eval()
+    encoder = ConvEncoder(channels, samples, averaging(X), 28, 5, 3, 2).eval()
     with torch.no_grad():
         encoder.learn(X, rng)
         encoder.standardise(encoder.raw(X))
