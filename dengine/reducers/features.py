@@ -249,8 +249,8 @@ class Tower(NamedTuple):
         sizes, axes = (each[..., -width:].flip(-1) for each in (sizes.clamp(min=0.0), axes))
         axes = axes * (sizes > 1e-6 * sizes[0])
         size = (variance / sizes.sum().clamp(min=1e-9)).sqrt()
-        w = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double()
-        return cls(axes * size, -(f.mean(0) @ axes) * size, w)
+        w, scaled = torch.cat([(axes.T @ weights / size).T, scores[:, None]], 1).double(), axes * size
+        return cls(scaled, -(f.mean(0) @ scaled), w)
 
     def components(self, f: Tensor) -> Tensor:
         """(n, P) -> (n, W)."""

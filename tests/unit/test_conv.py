@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.special import logit
+from scipy.special import expit, logit
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
@@ -214,12 +214,11 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
             g = f[:, columns].double() @ tower.axes.double() + tower.centre
             logits.append((g @ tower.w[:, :-1].T + tower.w[:, -1]).numpy())
             assert g.var(0).sum() == pytest.approx(variance, rel=0.05)  # what a ridge of 1 is weighed against
-    said = logit(reducer.embed(X)[..., 0].astype(float))
-    for k, space in enumerate(said.T):
-        off, across = space - logits[-1][:, k], (logits[0] - logits[-1])[:, k]
-        share = off @ across / max(across @ across, 1e-12)
-        np.testing.assert_allclose(off, share * across, atol=2e-3)
-        assert share == pytest.approx(round(10 * share) / 10, abs=1e-3)
+    for k, said in enumerate(reducer.embed(X)[..., 0].T.astype(float)):
+        across = (logits[0] - logits[-1])[:, k]
+        share = round(10 * (logit(said) - logits[-1][:, k]) @ across / max(across @ across, 1e-12)) / 10
+        assert 0.0 <= share <= 1.0
+        np.testing.assert_allclose(said, expit(logits[-1][:, k] + share * across), atol=1e-5)
 
 
 def test_where_frequencies_tell_it_kernels_that_compete_find_them_and_the_logit_is_mostly_theirs() -> None:
