@@ -15,7 +15,7 @@ from sklearn.metrics import roc_auc_score
 from dengine import DataEngine, Dataset, Recipe, RocketReducer
 from dengine.datasets.importing import import_labelled
 from dengine.decision.rule import script
-from dengine.errors import SettingError, TraceError
+from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.reducers.base import StopRule
 from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
@@ -318,3 +318,9 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(tmp_path,
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
     assert where == {"dengine-ahead_0"}  # neither in the opening nor in the retrain
+
+
+def test_a_model_of_other_sizes_is_refused_in_a_sentence_that_says_how_to_go_on() -> None:
+    state = fitted(groups=0)[0].get_state()
+    with pytest.raises(StoreError, match="other sizes; its labels are whole"):
+        ConvReducer().set_state(state)
