@@ -40,7 +40,7 @@ def data(source: DataChoice, out: Out | None) -> None:
     found = survey(dataset)
     tables: list[Any] = [facts(found.name, rows_of(found, "name", "faults", "drift"))]
     tables.append(facts("By tenths of the recorded order", map(_drift, found.drift), ("", "means", "")))
-    if found.near_repeats > SUSPICIOUS * found.looked_at:
+    if found.near_repeats > SUSPICIOUS:
         tables.append("Many traces nearly repeat another part's: if parts come twice, give their numbers (--part).")
     tell(
         {"data": source.data, "survey": found},

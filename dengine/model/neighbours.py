@@ -38,7 +38,7 @@ from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
 NEAR = 0.12  # of the distance to the tenth neighbour; of parts of their own about one in two hundred is as near
-SUSPICIOUS = 0.05  # share of such traces
+SUSPICIOUS = 25  # such traces: up to 15 were counted among 100 to 500 insertions of parts of their own, at any number
 NOVEL = REASONS.index(Reason.NOVEL)
 KINDS = 16  # compiled modules that a process keeps
 Predicted = tuple[int, int, float, float, int, int, Tensor]
@@ -479,6 +479,6 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
     """What to say of near repeats; "" where there are few."""
     n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
-    if n <= SUSPICIOUS * looked_at:
+    if n <= SUSPICIOUS:
         return ""
     return f"{n} of the newest {looked_at} traces nearly repeat another: if parts come twice, give their numbers (part=)"

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source
+from dengine import Action, DataEngine, Dataset, Decision, Policy, Reason, Recipe, Source, load_dataset
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.history.status import status
+from dengine.model.neighbours import repeats_note
 from dengine.store import SqlStore
 from tests.support.driving import drive as play
 
@@ -233,7 +234,10 @@ def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream: 
     assert "novel" in status(engine.store, last=200).alarm
 
 
-def test_repeats_that_nobody_names_are_noticed_and_named_ones_are_not(make_data) -> None:
+def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_own_are_not(make_data) -> None:
+    X, drawn = load_dataset("insertion").X, np.random.default_rng(0)
+    for n in (100, 200) * 10:
+        assert repeats_note(X[drawn.permutation(len(X))[:n], None], np.arange(n)) == ""
     base, rng = make_data(60, samples=60, seed=4, noise=0.1), np.random.default_rng(0)
     X = np.repeat(base.X, 5, 0)
     X = (X + rng.normal(0, 0.01, X.shape)).astype(np.float32)
