@@ -16,7 +16,8 @@ from .errors import TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .records import FITS, REASONS, Reason, TraceSpec, Window
 
-TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit)([ _\-.(\[].*)?", re.IGNORECASE)  # names of no channel
+# Names of no channel.
+TIME = re.compile(r"(time|timestamp|t|date|datetime|seconds|zeit|zeitstempel)([ _\-.(\[].*)?", re.IGNORECASE)
 NOT_FINITE, CONSTANT, SATURATED = (REASONS.index(r) for r in (Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED))
 
 

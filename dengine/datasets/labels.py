@@ -1,7 +1,7 @@
 """What a recording's label is: in its file's name, in a file of labels, or in a table's column.
 
-Words, in any case: true ok pass passed good success successful yes io 1; false nok ng fail failed bad failure no nio 0; and
-a word of the first kind after a not, as in `run_7_not_ok.csv`.
+Words, in any case: true ok pass passed good success successful yes io gut 1; false nok ng fail failed bad failure no nio
+schlecht 0; and a word of the first kind after a not, as in `run_7_not_ok.csv`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from ..errors import DataError
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
 from .text import read_table
 
-GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "1")
-BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "0")
+GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
+BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
 COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
-LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
-FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion")
+GERMAN = ("ergebnis", "bewertung")
+LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome", *GERMAN)
+FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion", "datei", "dateiname")
 
 Words = Mapping[str, bool]
 NONE: Words = {}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from itertools import count
@@ -19,7 +21,7 @@ from ..records import trace_in
 from ..traces import as_trace, spec_of
 from .bags import is_stream, read_bag
 from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
-from .labels import label_of, meanings
+from .labels import label_of, meanings, named
 from .tables import FORCE, from_frame, read_csv, read_folder, read_parquet
 from .text import rate_of
 from .triggers import Trigger
@@ -100,9 +102,23 @@ def _reader(source: Any, asked: Asked) -> tuple[str, Sequence[str], Callable[[],
     if str(source) in BUNDLED:
         path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
         return "a bundled set", (), partial(_read_npz, path, str(source), asked)
-    path = Path(source)
+    path = _alone(Path(source), asked)
     takes, read = _reader_of_files(path)
     return str(path), takes, partial(read, path, path.resolve().name if path.is_dir() else path.stem, asked)
+
+
+def _alone(path: Path, asked: Asked) -> Path:
+    """The one table or archive of a folder; the path itself where there are more, or where that one is an insertion."""
+    if not path.is_dir() or is_stream(path):
+        return path
+    seen = [p for p in path.rglob("[!.]*") if p.suffix.lower() in (*TABLES, ".npz")]
+    apart = [p for p in seen if p.suffix.lower() != ".csv"] or seen  # a list of labels may lie beside it
+    if len(apart) != 1 or len(seen) > 2 or (apart == seen and asked.labels is not None):
+        return path
+    with suppress(DataError):
+        named(asked.label, asked.words).find(apart[0].name)
+        return path
+    return apart[0]
 
 
 def _reader_of_files(path: Path) -> tuple[Sequence[str], Reader]:
@@ -158,6 +174,8 @@ def _read_npz(path: Path, name: str, asked: Asked) -> Dataset:
             X = X.astype(np.float32) * found["scale"].astype(np.float32)
         about: dict[str, Any] = {"part": found.get(asked.part), "cause": found.get("cause")}
         about |= {"unit": str(found.get("unit", "N")), "rate_hz": float(found.get("rate_hz", 500.0))}
+        if len(own) == 1 and X.ndim == 3:  # one array of several channels names none of them
+            own, asked = (), replace(asked, channels=())
         about["channels"] = own or tuple(map(str, found.get("channels", ())))
         return refit(make_dataset(X, _labels(found[label], asked), name=name, **about), asked)
 
@@ -169,7 +187,8 @@ def _wanted_arrays(path: Path) -> str:
     single = [name for name, x in found.items() if x.ndim == 1 and traces and len(x) == len(found[traces[0]])]
     told = min(single, key=lambda name: len(set(found[name].tolist())), default="")
     shapes = ", ".join(f"{name} {found[name].shape}" for name in have) or "none"
-    named = f", or their names, as in channel={traces[0]!r} and label={told!r}" if told else ""
+    channel = "" if "X" in have else f"channel={traces[0]!r} and " if traces else ""
+    named = f", or their names, as in {channel}label={told!r}" if told else ""
     return f"arrays X and y in {path}{named}; found {shapes}."
 
 
@@ -184,12 +203,23 @@ def _from_pair(X: Any, y: Any, asked: Asked) -> Dataset:
 
 def _labels(y: Any, asked: Asked) -> Any:
     """Labels as they came; words as 1 and 0."""
+    found = Collected("the array of labels", ())
+
+    def meant(word: Any) -> int:
+        try:
+            return label_of(word, asked.words)
+        except UnreadableError:
+            found.unknown[str(word)] += 1
+            return 0
+
     try:
         words = np.asarray(y)
         given = words.dtype.kind in "OUS" or asked.words
-        return np.array([label_of(each, asked.words) for each in words.tolist()]) if given else words
+        told = np.array([meant(each) for each in words.tolist()]) if given else words
     except (ValueError, TypeError) as error:
         raise DataError(f"Expected a label for each trace, 1 (success) or 0 (failure): {error}.") from error
+    found.must_mean_something()
+    return told
 
 
 def _from_list(traces: list[Any], labels: list[Any], asked: Asked) -> Dataset:

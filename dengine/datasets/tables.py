@@ -38,7 +38,9 @@ def read_folder(folder: Path, name: str, asked: Asked) -> Dataset:
     seen = {p.relative_to(folder): p for p in paths if p.resolve() != skipped}
     named = {p.as_posix(): path for p, path in seen.items() if not any(word.startswith(".") for word in p.parts)}
     if not named:
-        raise DataError(f"Expected CSV files, one an insertion, in the folder {folder}, found none.")
+        have = listed(sorted(p.name for p in folder.iterdir()))
+        do = f" among {have}; put what they hold into one table" if have else ""
+        raise DataError(f"Expected CSV files, one an insertion, in the folder {folder}, found none{do}.")
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
     if asked.labels is None:
@@ -174,8 +176,10 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     for name in (asked.part, time):
         if name not in frame:
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
-            raise DataError(f"Expected {wanted}, found {listed(frame.columns)}.")
+            advice = f"; name {names}" if (names := _long_columns(frame, asked)) else ""
+            raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
     label = None if asked.labels is not None else _label_column(frame, asked)
+    frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
     left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
     found.channels = _chosen(left, asked)
     times, odd = floats(frame[time])
@@ -202,17 +206,37 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     return as_dataset(found, asked)
 
 
-def _long_columns(frame: pd.DataFrame) -> str:
+def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.DataFrame:
+    """Of a table with a row a signal, told apart by tags, one with a column each; known : of parts, times, and labels."""
+    apart = [] if not frame.duplicated(known[:2]).any() else [name for name in frame if name not in known]
+    tags = [name for name in apart if floats(frame[name])[1] and not frame.duplicated([*known[:2], name]).any()]
+    values = [name for name in apart if name not in tags and not floats(frame[name])[1]]
+    if not tags or len(values) != 1:
+        return frame
+    have = frame[tags[0]].unique().tolist()
+    if not asked.channels or not set(asked.channels) <= set(have):
+        told = f"{listed(have)}, as column {tags[0]} calls them"
+        raise DataError(f"Expected the channel to be named, as in channel={have[0]!r}; there are {told}.")
+    picked = frame[frame[tags[0]].isin(asked.channels)]
+    wide = picked.pivot(index=known, columns=tags[0], values=values[0])  # noqa: PD010 - pivot_table would average
+    return wide.reset_index().set_axis(range(1, len(wide) + 1))
+
+
+def _long_columns(frame: pd.DataFrame, asked: Asked) -> str:
     """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
     numbered = Counter(found[1] for name in frame.columns if (found := NUMBERED.fullmatch(name)))
     time = next((name for name in frame.columns if is_time(name)), None)
-    changes = {name: int((frame[name] != frame[name].shift()).sum()) for name in frame.columns if name != time}
+    if time is None or max(numbered.values(), default=0) > 2:
+        return ""
+    rows = frame.bfill()  # a label may stand in a part's last row alone
+    changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in frame.columns if name != time}
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
-    if time is None or not few or max(numbered.values(), default=0) > 2:
+    if not few:
         return ""
     part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
     told = f"label={label!r}" if label != part else "labels='labels.csv', a file of parts and labels"
-    return f"the columns that tell which part it is, when, and the label, as in part={part!r}, time={time!r} and {told}"
+    told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
+    return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"
 
 
 def _chosen(have: Sequence[str], asked: Asked) -> tuple[str, ...]:
@@ -238,13 +262,16 @@ def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
             raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
     found = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
-    if asked.time is None and (advice := _long_columns(frame)):
+    if asked.time is None and (advice := _long_columns(frame, asked)):
         raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
     if found is not None:
         return str(frame.columns[found])
-    if asked.time is None and any(is_time(name) for name in frame.columns):
-        raise DataError(f"Expected a row an insertion, got {listed(frame.columns)}, as in one recording; give its folder.")
-    raise DataError(f"Expected a column of labels, y or label, found {listed(frame.columns)}; name it: label='...'.")
+    numbered = Counter(match[1] for name in frame.columns if (match := NUMBERED.fullmatch(name)))
+    left = [name for name in frame.columns if (match := NUMBERED.fullmatch(name)) is None or numbered[match[1]] == 1]
+    if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
+        raise DataError(f"Expected a row an insertion, got {listed(left)}, as in one recording; give its folder.")
+    have = listed(left or frame.columns)
+    raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label='...'.")
 
 
 def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LARGEST = 128 * 2**20  # bytes of one text file
 NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
 DECIMAL = re.compile(r"(?<![^\s;\"])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;\"])")  # a whole cell
+DAY_FIRST = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})")  # a German day
 GAP = 5.0  # median steps: a pause that a late message does not explain
 SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
 UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
@@ -155,7 +156,8 @@ def rate_of(frame: pd.DataFrame, time: str | None = None) -> float | None:
     times, odd = floats(column)
     unit = _unit_of(times, str(column.name))
     if 2 * len(odd) >= len(times):
-        stamps = pd.to_datetime(column, errors="coerce", format="ISO8601", utc=True)
+        said = column.astype(str).str.replace(DAY_FIRST, r"\3-\2-\1", regex=True).str.replace(",", ".")
+        stamps = pd.to_datetime(said, errors="coerce", format="ISO8601", utc=True)
         odd, unit = stamps.index[stamps.isna()].tolist(), 1.0
         times = (stamps - stamps.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
     if odd:

@@ -52,10 +52,10 @@ def test_an_engine_trained_from_a_folder_decides_on_a_raw_recording_of_another_l
 
 PLANTS = {  # what is given of five plants' recordings, as their errors say one by one
     "latin": "--labels 'latin/Prüfung.csv' --label-map i.O.=good,n.i.O.=bad",
-    "historian/export.parquet": "--part serial --time timestamp --label verdict",
-    "wide/shift.csv": "--channels FZ",
-    "bag/cell.mcap": "--trigger register@/phase --label /height_check/ok",
-    "lab/runs.npz": "--channels force --label accepted",
+    "historian": "--part serial --time timestamp --label verdict",
+    "wide": "--channels FZ",
+    "bag": "--trigger register@/phase --label /height_check/ok",
+    "lab": "--channels force --label accepted",
 }
 
 
@@ -76,6 +76,19 @@ def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say
         assert len(asked) < 20
     assert "pca on" in done.stdout
     assert ("read as Windows-1252" in done.stderr) == (source == "latin")
+
+
+def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    said, times = np.where(data.y, "heil", "ab"), [f"02.03.2026 06:00:00,{t:03d}" for t in range(0, 400, 10)] * 30
+    rows = {"zeitstempel": times, "teil": np.repeat(np.arange(30), 40), "urteil": np.repeat(said, 40)}
+    tags = [pd.DataFrame(rows | {"tag": tag, "value": scale * data.X.ravel()}) for tag, scale in (("Z", 1), ("X", -2))]
+    asked = {"label": "urteil", "label_map": "heil=good,ab=bad"}
+    table = load_dataset(pd.concat(tags), part="teil", time="zeitstempel", channel="Z,X", **asked)
+    np.savez(tmp_path / "lab.npz", data=table.X, urteil=said)
+    lab, X = load_dataset(tmp_path, channel="data", **asked), np.stack([data.X, -2 * data.X], axis=1)
+    np.testing.assert_array_equal(lab.X, X)
+    assert (table.rate_hz, table.y.tolist()) == (100.0, data.y.tolist())
 
 
 def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
