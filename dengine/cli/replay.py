@@ -163,8 +163,8 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Reducers and rivals, under one policy or a grid of them. UMAP takes a minute a replay. Ctrl-C shows the replays that
-    were finished.
+    Reducers and rivals, under one policy or a grid of them. UMAP takes much longer than the others. Ctrl-C
+    shows the replays that were finished.
     """
     if len({short_name(one) for one in asked}) < len(asked):
         raise click.UsageError(f"--reducers needs a name of its own for each, got {', '.join(map(short_name, asked))}.")
