@@ -221,7 +221,7 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
         np.testing.assert_allclose(said, expit(logits[-1][:, k] + share * across), atol=1e-5)
 
 
-def test_where_frequencies_tell_it_kernels_that_compete_find_them_and_the_logit_is_mostly_theirs() -> None:
+def test_where_a_resonance_tells_it_kernels_that_compete_sort_better_than_ramps_alone() -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(2, size=500)
     noise = rng.standard_normal((500, 1, 410))
