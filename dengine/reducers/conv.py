@@ -109,7 +109,7 @@ class ConvEncoder(Features):
 
     def windows(self, seen: Tensor, n: int) -> Tensor:
         """(C, n*9*P, B) -> (n, C*9, P*B): what each place of each dilation sees, so that a convolution is a product."""
-        channels, places = seen.size(0), seen.size(1) // (n * 9) * seen.size(2)  # said: of no traces -1 is no size
+        channels, places = seen.size(0), seen.size(1) // (n * 9) * seen.size(2)  # where n = 0, -1 could not be inferred
         if channels == 1:
             return seen.reshape(n, 9, places)
         return seen.reshape(channels, n, 9, places).transpose(0, 1).reshape(n, channels * 9, places)
@@ -126,7 +126,7 @@ class ConvEncoder(Features):
 
     def counts(self, windows: Tensor, b: int) -> Tensor:
         """(2D, C*9, Q*B) -> (B, 4*D*G*8): roots of how often a kernel answers most of its group, or least, by place."""
-        # Kernels of a group (RIVALS) stand in the middle. One deviation (NEARLY) is 1 by the kernels' size.
+        # The 8 is RIVALS, the kernels of a group; the 1.0 is NEARLY, by which `learn_filters` has divided the kernels.
         h = torch.bmm(self.rival, windows).view(2 * self.n_dilations * self.n_groups, 8, self.n_few * b)
         won = torch.empty(2, h.size(0), 8, h.size(2))
         torch.sub(h, h.amax(1, keepdim=True) - 1.0, out=won[0])
