@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..decision.intervals import INTERVALS, Bounds, level_of
+from ..decision.intervals import level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex, math_ceil
@@ -320,10 +320,6 @@ def is_score(policy: Policy, made: Decision) -> bool:
     return policy.guarantee == "pooled" and made.lower == made.upper
 
 
-def _bound(policy: Policy, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
-    return INTERVALS[policy.interval](n_success, n_failure, level_of(policy.alpha, policy.guarantee))
-
-
 def _needed(policy: Policy, made: Decision, threshold: float | None, success: int) -> int | None:
     if threshold is None:
         return None
@@ -331,7 +327,7 @@ def _needed(policy: Policy, made: Decision, threshold: float | None, success: in
     if is_score(policy, made):  # no count changes it
         return 0 if (made.lower >= threshold if success else made.upper <= threshold) else None
     counts = made.n_success + success * more, made.n_failure + (1 - success) * more
-    lower, upper = _bound(policy, *counts)
+    lower, upper = policy.bound(*counts)
     enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
     return int(enough[0]) if len(enough) else None
 
@@ -614,6 +610,6 @@ def _notes(past: StoredDecision, around: Ball | None, bound: Bound | None, found
                 f"and {recorded[1]}: a label was corrected since, or came while this part was being decided on."
             )
     if bound is not None and found.model is None and not is_score(policy, made):
-        given = _bound(policy, made.n_success, made.n_failure)
+        given = policy.bound(made.n_success, made.n_failure)
         if not np.allclose(given, (made.lower, made.upper), atol=1e-6):
             yield "By the store's present settings these counts give another bound; the recorded one is shown."
