@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .decision.policy import Policy, check_neighbourhood
+from .decision.policy import Policy, check_radius
 from .errors import SettingError, expect, listed
 from .records import is_number, is_whole
 
@@ -47,7 +47,7 @@ class Recipe:
     reducer : a name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer as it is.
     params : the reducer's own settings, where it is a name.
     policy : the user's two numbers, the interval, the rule, the audit rate.
-    radius, fraction, reject_fraction : the neighbourhood, as in `check_neighbourhood`.
+    radius : of the ball whose labels count, in units of the scaled embedding.
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
     budget : seconds of wall time that a retrain may take in a live engine.
@@ -61,8 +61,6 @@ class Recipe:
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
     radius: float = 0.3
-    fraction: float | None = None
-    reject_fraction: float | None = None
     folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
@@ -85,9 +83,7 @@ class Recipe:
         named = isinstance(self.reducer, str) or callable(getattr(self.reducer, "fit", None))
         expect(named, "a reducer's name, or a scikit-learn transformer", self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
-        check_neighbourhood(self.radius, self.fraction, self.reject_fraction)  # or every retrain would fail, one by one
-        if self.reject_fraction is not None and self.policy.guarantee == "pooled":
-            raise SettingError("Expected no reject_fraction beside the pooled guarantee: its evidence is about one ball.")
+        check_radius(self.radius)  # or every retrain would fail, one by one
 
     @property
     def name(self) -> str:
@@ -111,7 +107,7 @@ class Recipe:
         if not isinstance(recipe, str | os.PathLike):
             if not callable(getattr(recipe, "fit", None)) or isinstance(recipe, type):
                 raise SettingError(f"Expected a recipe, its name, or a scikit-learn transformer, got {recipe!r}.")
-            # A reducer of ours keeps the neighbourhood of its own recipe: a radius means something else in each.
+            # A reducer of ours keeps the radius of its own recipe: it means something else in each.
             base = RECIPES.get(type(recipe).__module__.removeprefix("dengine.reducers."), cls())
             return replace(base, reducer=recipe, params={})
         if str(recipe) in RECIPES:
@@ -160,11 +156,8 @@ class Recipe:
         return "\n".join(_table(name, values) for name, values in tables.items())
 
     def with_settings(self, **asked: Any) -> Recipe:
-        """The same with what was asked for; None asks for nothing. A radius takes the place of a share of the store."""
-        changes = {name: value for name, value in asked.items() if value is not None}
-        if "radius" in changes:
-            changes |= {"fraction": None, "reject_fraction": None}
-        return replace(self, **changes)
+        """The same with what was asked for; None asks for nothing."""
+        return replace(self, **{name: value for name, value in asked.items() if value is not None})
 
     def with_policy(self, **changes: Any) -> Recipe:
         """The same with another alpha, lower_bound, interval or audit_rate."""

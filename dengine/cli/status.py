@@ -60,7 +60,7 @@ def _tables(store: str, found: Status) -> list[Any]:
     now = [("look at", found.alarm)] if found.alarm else []
     now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie
-        now += rows_of(found.recipe, *(["radius"] if found.recipe.fraction else []))
+        now += rows_of(found.recipe)
     now += [("trace", "none yet: the first trace sets it" if found.trace is None else written("", found.trace))]
     now += [("accepted", found.certificate.sentence), ("rejected", found.certificate.sentence_on_rejects)]
     if reports := [each.report for each in found.retrains]:

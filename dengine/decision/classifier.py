@@ -12,7 +12,7 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ..records import ACTIONS
-from .policy import Policy, check_neighbourhood
+from .policy import Policy, check_radius
 from .references import Counts, RadiusIndex
 from .rule import DecisionRule, RadiusNeighbours
 
@@ -22,7 +22,6 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     radius : of the ball around a query, in the units of the embedding, surface included.
     alpha, lower_bound, interval : as in `Policy`.
-    fraction, reject_fraction : as in `check_neighbourhood`: a ball that grows to a share of the store instead.
     capacity : references held at most; the oldest leave first, blind to labels.
 
     The larger of two classes is the success (1 of 0 and 1). `predict` never abstains, an empty ball has probability 0.5;
@@ -36,16 +35,12 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         alpha: float = 0.05,
         lower_bound: float = 0.95,
         interval: str = "wilson",
-        fraction: float | None = None,
-        reject_fraction: float | None = None,
         capacity: int = 10_000,
     ) -> None:
         self.radius = radius
         self.alpha = alpha
         self.lower_bound = lower_bound
         self.interval = interval
-        self.fraction = fraction
-        self.reject_fraction = reject_fraction
         self.capacity = capacity
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
@@ -96,7 +91,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
 
     def policy(self) -> Policy:
         """The user's numbers among the settings; SettingError where one of all is out of range."""
-        check_neighbourhood(self.radius, self.fraction, self.reject_fraction)
+        check_radius(self.radius)
         return Policy(self.alpha, self.lower_bound, self.interval)
 
     def around(self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False) -> RadiusNeighbours:
@@ -105,8 +100,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         scored : whether the first axis is a probability of success, which a rule that only sorts takes for its score.
         """
         rule = rule or self.policy().rule()
-        near = self.radius, self.fraction or 0.0, self.reject_fraction or 0.0
-        return RadiusNeighbours(index, rule, *near, scored and rule.sorts)
+        return RadiusNeighbours(index, rule, self.radius, scored and rule.sorts)
 
     def _start(self, dim: int) -> None:
         self.index_ = RadiusIndex(dim, self.capacity)

@@ -1,8 +1,7 @@
-"""The user's two numbers, and what follows from them: which neighbours count, and how a bound becomes an action."""
+"""The user's two numbers, and what follows from them: how a bound becomes an action."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -21,6 +20,8 @@ RULES = {  # classes of `rule`, by guarantee and by what is known of stops
     "local": {"some": "DecisionRule", "all": "WatchedRule"},
     "pooled": {"some": "PooledRule", "all": "PooledRule"},
 }
+
+LARGEST_RADIUS = 1e18  # radius: squared it is finite in float32, so that a query's own part, infinitely far, is in no ball
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,17 +132,6 @@ class Policy:
         return ACTIONS[action_of(float(lower), float(upper), self.lower_bound, 1.0 - self.lower_bound)]
 
 
-def check_neighbourhood(radius: float, fraction: float | None, reject_fraction: float | None) -> None:
-    """Which references count for a query, chosen without looking at any label. SettingError for values out of range.
-
-    radius : the paper's fixed ball, in units of the scaled embedding. Used where `fraction` is None.
-    fraction : in (0, 1]: the ball grows until it holds this share of the references, nearest first.
-    reject_fraction : a second, smaller share that a rejection is decided by; None: the same ball for both. A ball wide
-        enough to certify the many successes blurs the few failures.
-    """
-    expect(is_number(radius) and 0.0 < radius < math.inf, "a finite radius > 0", radius)
-    for name, value in (("fraction", fraction), ("reject_fraction", reject_fraction)):
-        held = value is None or (is_number(value) and 0.0 < value <= 1.0)
-        expect(held, f"{name} in (0, 1] or None for the fixed radius", value)
-    if reject_fraction is not None and fraction is None:
-        raise SettingError("Expected reject_fraction only together with fraction; set both, or neither.")
+def check_radius(radius: float) -> None:
+    """SettingError for a radius out of range: of the ball whose labels count, in units of the scaled embedding."""
+    expect(is_number(radius) and 0.0 < radius <= LARGEST_RADIUS, f"a radius > 0 of at most {LARGEST_RADIUS:g}", radius)

@@ -62,13 +62,6 @@ def _rate_of_others(points: NDArray[np.float32], labels: NDArray[np.int8], part:
     return np.asarray((labels[nearest].sum(1) + 0.5) / (k + 1.0))
 
 
-def math_ceil(x: float) -> int:
-    """Smallest integer not below x; `math.ceil` under a name that scripts in a method."""
-    whole = int(x)
-    return whole if x <= float(whole) else whole + 1
-
-
-FARTHEST = 1e38  # squared: what is beyond all measure, the query's own part too, is in no ball
 Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
@@ -95,7 +88,7 @@ class RadiusIndex(nn.Module):
 
     def __init__(self, dim: int, capacity: int = 10_000) -> None:
         super().__init__()
-        self.dim, self.capacity, self.farthest = dim, capacity, FARTHEST
+        self.dim, self.capacity = dim, capacity
         self.register_buffer("points", torch.zeros(dim, capacity))
         self.register_buffer("labels", torch.ones(2, capacity))
         self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
@@ -166,19 +159,12 @@ class RadiusIndex(nn.Module):
         return distances
 
     @torch.jit.export
-    def count_near(self, distances: Tensor, radius: float, fraction: float) -> tuple[int, int]:
-        """(successes, failures) within `radius`, or, where 0 < fraction, among that fraction of the points, nearest first.
-
-        The fraction is rounded up and ties at its edge are all counted, so that no order of the points matters. Several
-        points of one part are worth less than as many parts: `votes`.
-        """
+    def count_near(self, distances: Tensor, radius: float) -> tuple[int, int]:
+        """(successes, failures) within `radius`. Several points of one part are worth less than as many parts: `votes`."""
         n = distances.size(0)
         if n == 0:
             return 0, 0
         limit = radius * radius
-        if fraction > 0.0:
-            limit = float(distances.kthvalue(min(n, int(math_ceil(fraction * n))))[0].item())
-            limit = min(limit, self.farthest)
         if int(self.repeats.item()) > 0:
             return self.votes(distances <= limit)
         inside = torch.le(distances, limit, out=torch.empty_like(distances))  # in float32, as the product takes it
@@ -274,15 +260,14 @@ class RadiusIndex(nn.Module):
         self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
         self.known = set(parts.tolist())
 
-    def count(self, queries: ArrayLike, radius: float, fraction: float = 0.0) -> Counts:
+    def count(self, queries: ArrayLike, radius: float) -> Counts:
         """(n_success, n_failure), each (n,): labels around each query (n, d), or (n, K, d) for K spaces.
 
         radius : of the ball, its surface included.
-        fraction : where positive, the ball grows instead until it holds this share of all points.
         """
         z = torch.from_numpy(np.array(queries, dtype=np.float32))
         z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
-        found = [self.count_near(self.squared_distances(query), radius, fraction) for query in z]
+        found = [self.count_near(self.squared_distances(query), radius) for query in z]
         counts = np.array(found, dtype=np.int64).reshape(-1, 2)
         return counts[:, 0], counts[:, 1]
 

@@ -368,23 +368,17 @@ class PooledRule(DecisionRule):
 class RadiusNeighbours(nn.Module):
     """Counts the references around one embedded trace and asks the rule.
 
-    Two looks, one for each tail of the interval: the wide ball may accept; where it does not, the narrow one may reject.
-    The counts and the bound that come back are those of the ball that decided, so the action follows from them alone.
-
-    radius, fraction, reject_fraction : as in `check_neighbourhood`, 0 for None.
+    radius : of the ball whose labels count, in units of the scaled embedding.
     scored : whether the first axis is each space's probability of success. Where the rule needs but a score, their mean,
         which knows of all labels but the part's own, stands for both ends of the interval; the counts are shown.
     """
 
-    def __init__(
-        self, ring: RadiusIndex, rule: DecisionRule, radius: float, fraction: float = 0.0, reject_fraction: float = 0.0,
-        scored: bool = False,
-    ) -> None:  # fmt: skip
+    def __init__(self, ring: RadiusIndex, rule: DecisionRule, radius: float, scored: bool = False) -> None:
         super().__init__()
         self.scored = scored
         self.ring: RadiusIndex = ring
         self.rule: DecisionRule = rule
-        self.radius, self.fraction, self.reject_fraction = float(radius), float(fraction), float(reject_fraction)
+        self.radius = float(radius)
         self.certain, self.uncertain, self.safe = CERTAIN, UNCERTAIN, SAFE
 
     @torch.jit.export
@@ -399,17 +393,11 @@ class RadiusNeighbours(nn.Module):
 
         part : the hash of its part, which has no vote; 0 for an unknown one.
         """
-        distances = self.ring.squared_distances(z, part)
-        n_success, n_failure = self.ring.count_near(distances, self.radius, self.fraction)
+        n_success, n_failure = self.ring.count_near(self.ring.squared_distances(z, part), self.radius)
         if self.scored:
             score = float(z.select(1, 0).mean().item())
             return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
-        if action == 0 and self.reject_fraction > 0.0:
-            few_success, few_failure = self.ring.count_near(distances, self.radius, self.reject_fraction)
-            few_action, few_lower, few_upper = self.rule(few_success, few_failure)
-            if few_action == 2:
-                return 2, few_lower, few_upper, few_success, few_failure
         return action, lower, upper, n_success, n_failure
 
 

@@ -155,9 +155,8 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
         half = half if probability else np.full(2, half.max())
         (x0, y0), (x1, y1) = (low + high) / 2 - half, (low + high) / 2 + half
         left.set(xlim=(-0.06, 1.06) if probability else (x0, x1), ylim=(y0, y1))
-        if recipe.fraction is None:  # one that grows with the references has no radius of its own
-            cut = ", cut off above and below" if probability else ""
-            _draw_balls(figure, z[known][-1], recipe.radius, f"ball around the newest part, radius {recipe.radius:g}{cut}")
+        cut = ", cut off above and below" if probability else ""
+        _draw_balls(figure, z[known][-1], recipe.radius, f"ball around the newest part, radius {recipe.radius:g}{cut}")
     for axes in () if probability else (left, right):
         axes.set_aspect("equal")
     return figure

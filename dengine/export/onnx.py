@@ -25,7 +25,6 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from ..decision.references import FARTHEST
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
 from ..errors import ExportError
 from ..model.base import Exportable
@@ -134,9 +133,8 @@ class Twin(nn.Module):
     def __init__(self, source: Exportable) -> None:
         super().__init__()
         model, index, limit = source.model, source.model.index, source.trace.limit
-        around = model.classifier.around(index, model.rule)
         self.rule: DecisionRule = model.rule
-        self.radius, self.fraction, self.reject_fraction = around.radius, around.fraction, around.reject_fraction
+        self.radius = float(model.classifier.radius)
         self.limit = float("inf") if limit is None else limit
         self.encoder = model.spaces.module()
         self.novelty = model.gate
@@ -146,7 +144,6 @@ class Twin(nn.Module):
         places[index.held("spaces"), :, np.arange(len(index))] = index.held("points")
         self.register_buffer("places", torch.from_numpy(places))
         self.register_buffer("success", torch.from_numpy(index.held("labels").astype(np.int64)))
-        self.n_references = len(index)
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
         """(C, T) float32 -> action, reason, lower, upper, n_success, n_failure, embedding (K, d)."""
@@ -175,21 +172,8 @@ class Twin(nn.Module):
         )
 
     def counted(self, distances: Tensor) -> tuple[Tensor, ...]:
-        """`RadiusNeighbours.forward` on (n,) squared distances."""
-        wide = self.look(distances, self.fraction)
-        if self.reject_fraction == 0.0:
-            return wide
-        narrow = self.look(distances, self.reject_fraction)
-        rejects = (wide[0] == 0) & (narrow[0] == 2)
-        return tuple(torch.where(rejects, few, many) for few, many in zip(narrow, wide, strict=True))
-
-    def look(self, distances: Tensor, fraction: float) -> tuple[Tensor, ...]:
-        """action, lower, upper, n_success, n_failure of one ball, as of `RadiusIndex.count_near`."""
-        if fraction == 0.0:
-            inside = distances <= self.radius * self.radius
-        else:
-            k = min(self.n_references, int(np.ceil(fraction * self.n_references)))
-            inside = distances <= distances.topk(k, largest=False)[0].max().clamp(max=FARTHEST)
+        """action, lower, upper, n_success, n_failure of (n,) squared distances, as of `RadiusNeighbours`."""
+        inside = distances <= self.radius * self.radius
         n_success = (inside & (self.success == 1)).to(torch.int64).sum()
         n_failure = (inside & (self.success == 0)).to(torch.int64).sum()
         lower, upper = self.bound(n_success.to(torch.float64), n_failure.to(torch.float64))

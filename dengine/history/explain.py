@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 from ..decision.intervals import level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
-from ..decision.references import RadiusIndex, math_ceil
+from ..decision.references import RadiusIndex
 from ..decision.rule import NOBODY, DecisionRule
 from ..errors import StoreError, UnknownDecisionError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
-from ..model.base import Embedding
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, Source, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, ModelVersion, StoredDecision, VersionError
@@ -309,10 +308,7 @@ def _reach(made: Decision, found: Circumstances) -> str:
     recipe = found.recipe
     if found.rival:
         return "as the model counts them"
-    if recipe.fraction is None:
-        return f"within the radius {recipe.radius:g}"
-    narrow = recipe.reject_fraction if made.predicted is Action.REJECT else None
-    return f"among the nearest {100 * (narrow or recipe.fraction):g} % of the references"
+    return f"within the radius {recipe.radius:g}"
 
 
 def is_score(policy: Policy, made: Decision) -> bool:
@@ -540,26 +536,12 @@ def _safe_mode(store: SqlStore, past: StoredDecision) -> str:
 
 def _around(past: StoredDecision, answering: Answering | None, recipe: Recipe) -> Ball | None:
     """The ball that decided; None where nothing placed the trace, or the version is not kept."""
-    made = past.decision
-    if answering is None or made.embedding is None:
+    placed = past.decision.embedding  # (K, d)
+    if answering is None or placed is None:
         return None
-    fractions = [recipe.fraction or 0.0]
-    if made.predicted is Action.REJECT and recipe.reject_fraction:
-        fractions.insert(0, recipe.reject_fraction)  # rejections may be judged by a narrow ball
-    index, part = answering.index, past.content_hash
-    balls = [_ball(index, made.embedding, part, recipe.radius, fraction) for fraction in fractions]
-    recorded = (made.n_success, made.n_failure)
-    return next((ball for ball in balls if (ball.n_success, ball.n_failure) == recorded), balls[-1])
-
-
-def _ball(index: RadiusIndex, z: Embedding, part: int, radius: float, fraction: float) -> Ball:
-    """What lies around a trace (K, d) of a part with this hash; radius, fraction : as the rule is asked, 0 for None."""
-    squared = index.squared_distances(torch.tensor(z, dtype=torch.float32), part)
-    n_success, n_failure = index.count_near(squared, radius, fraction)
-    distances = np.sqrt(squared.double().numpy())
-    if fraction > 0.0 and len(distances):
-        radius = float(np.sort(distances)[min(len(distances), math_ceil(fraction * len(distances))) - 1])
-    return Ball(distances, radius, n_success, n_failure)
+    squared = answering.index.squared_distances(torch.tensor(placed, dtype=torch.float32), past.content_hash)
+    counts = answering.index.count_near(squared, recipe.radius)
+    return Ball(np.sqrt(squared.double().numpy()), recipe.radius, *counts)
 
 
 def _nearest(store: SqlStore, ball: Ball | None, answering: Answering | None, most: int) -> Iterator[Neighbour]:

@@ -43,7 +43,7 @@ class PartMap:
 
     version : of the model.  marks : oldest first, the known ones before the newest; none before the first model, and
         for a model that keeps no references.
-    radius : of the ball around the newest, None where it is not fixed.  probability : whether x is one.
+    radius : of the ball around the newest, None where there is none.  probability : whether x is one.
     """
 
     version: int
@@ -59,8 +59,7 @@ def part_map(store: SqlStore, recipe: Recipe, version: int) -> PartMap:
     shown, parts = {mark.id for mark in newest}, {made.id: made.part for made in recent}
     known = [mark for mark in _known(store, recipe, version, parts) if mark.id not in shown] if version else []
     kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
-    radius = recipe.radius if recipe.fraction is None and newest else None
-    return PartMap(version, (*known, *newest), radius, bool(getattr(kind, "own_unit", False)))
+    return PartMap(version, (*known, *newest), recipe.radius if newest else None, bool(getattr(kind, "own_unit", False)))
 
 
 def _newest(store: SqlStore, ids: list[str]) -> Iterator[Mark]:

@@ -200,9 +200,8 @@ class ModelPrediction(EngineModel):
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
         """The untrained model that a recipe describes."""
         policy = recipe.policy
-        near = {name: getattr(recipe, name) for name in ("radius", "fraction", "reject_fraction")}
         own = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
-        classifier = WilsonRadiusClassifier(**near, **own, capacity=recipe.window)
+        classifier = WilsonRadiusClassifier(recipe.radius, **own, capacity=recipe.window)
         return cls(reducer_of(recipe, seed), classifier, recipe.folds, policy.rule(), recipe.novelty)
 
     @property
@@ -218,8 +217,7 @@ class ModelPrediction(EngineModel):
         """The recipe with the classifier's numbers."""
         own = self.classifier
         policy = replace(recipe.policy, alpha=own.alpha, lower_bound=own.lower_bound, interval=own.interval)
-        near = replace(recipe, radius=own.radius, fraction=own.fraction, reject_fraction=own.reject_fraction)
-        return replace(near, policy=policy, folds=max(2, self.folds), novelty=self.novelty)
+        return replace(recipe, radius=own.radius, policy=policy, folds=max(2, self.folds), novelty=self.novelty)
 
     @property
     def n_spaces(self) -> int:

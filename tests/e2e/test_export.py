@@ -39,11 +39,9 @@ def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export_torchscript(audited, tmp_path_factory.mktemp("export") / "model.ts")
 
 
-@pytest.mark.parametrize(
-    "neighbourhood", [{}, {"fraction": 0.1}, {"fraction": 0.3, "reject_fraction": 0.08, "windows": WINDOWS}]
-)
-def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp_path: Path, neighbourhood) -> None:
-    with trained(make_data(400, SAMPLES), audit_rate=0.3, **neighbourhood) as engine:
+@pytest.mark.parametrize("settings", [{}, {"radius": 0.5, "windows": WINDOWS}])
+def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp_path: Path, settings) -> None:
+    with trained(make_data(400, SAMPLES), audit_rate=0.3, **settings) as engine:
         exported = load_exported(export_torchscript(engine, tmp_path / "model.ts"))
         decisions = [engine.decide(x) for x in many]
     found = exported.decide_many(many)
@@ -55,7 +53,7 @@ def test_the_file_decides_exactly_as_the_engine(make_data, many: np.ndarray, tmp
             np.testing.assert_array_equal(ours.embedding, np.array(theirs.embedding, dtype=np.float32))
     reasons = {d.reason for d in found}
     outside = {d.action for d in found if d.reason is Reason.OUTSIDE}
-    assert outside == ({Action.VERIFY, Action.REJECT} if "windows" in neighbourhood else set())
+    assert outside == ({Action.VERIFY, Action.REJECT} if "windows" in settings else set())
     assert reasons >= {Reason.CERTAIN, Reason.NOVEL, Reason.AUDIT, Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED}
     assert {d.action for d in found} == set(Action)
 
@@ -83,9 +81,7 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:
-    settings = recipe(
-        audit_rate=0.1, guarantee=guarantee, stops=stops, fraction=0.1, label_within=2000, windows=["0.1:0.15:-20:"]
-    )
+    settings = recipe(audit_rate=0.1, guarantee=guarantee, stops=stops, label_within=2000, windows=["0.1:0.15:-20:"])
     engine = DataEngine.from_recipe(settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True)
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
@@ -144,7 +140,7 @@ def test_what_waits_is_kept_apart_from_what_is_told_out_of_turn(make_data: Calla
 def lenient_engine(make_data: Callable[..., Dataset]) -> DataEngine:
     """Accepts whatever comes, and silence confirms it: 300 references."""
     data, spec = make_data(300, SAMPLES, failures=0.02), TraceSpec(SAMPLES)
-    return trained(data, trace=spec, lower_bound=0.6, stops="all", fraction=0.9, novelty=0.0)
+    return trained(data, trace=spec, lower_bound=0.6, stops="all", radius=10.0, novelty=0.0)
 
 
 def test_checking_a_file_teaches_it_nothing(make_data: Callable[..., Dataset], tmp_path: Path) -> None:

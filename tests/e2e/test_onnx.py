@@ -20,7 +20,7 @@ from dengine.records import Action, Reason
 from tests.support.exports import fitted, trained
 
 SPEC = TraceSpec(100, limit=500.0)
-BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "fraction": 0.3}, {"fraction": 0.3, "reject_fraction": 0.08}]
+BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "radius": 0.5}]
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,6 @@ from dengine.reducers.base import LabelFree, Reducer
 
 ESTIMATORS = (
     WilsonRadiusClassifier(),
-    WilsonRadiusClassifier(fraction=0.1, reject_fraction=0.05),
     ConvReducer(),
     RocketReducer(),
     PcaReducer(),
@@ -114,7 +113,7 @@ def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(n
 @every_reducer
 def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: str) -> None:
     X, y = traces()
-    pipeline = make_pipeline(clone(SMALL[name]), WilsonRadiusClassifier(fraction=0.2))
+    pipeline = make_pipeline(clone(SMALL[name]), WilsonRadiusClassifier(radius=0.5))
     assert cross_val_score(pipeline, X, y, cv=3, error_score="raise").mean() > y.mean() + 0.1
 
 

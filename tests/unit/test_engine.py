@@ -43,7 +43,7 @@ def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Datase
             asked.extend([said[name]] if name in said else [])
             return super().__getattribute__(name)
 
-    engine = make(replace(RECIPE, fraction=0.3, reject_fraction=0.1))
+    engine = make(replace(RECIPE, radius=0.4))
     cycles = list(engine.run(Listening(data), len(data)))
     assert asked == [str(c.decision.action) for c in cycles]
     assert {c.decision.action for c in cycles} == set(Action)
@@ -175,11 +175,10 @@ def test_other_lengths_and_several_channels_go_the_whole_way(samples: int, chann
 
 
 def test_a_finite_trace_beyond_all_measure_is_verified(data: Dataset) -> None:
-    for recipe in (RECIPE, replace(RECIPE, fraction=0.2)):
-        engine = make(recipe)
-        play(engine, data, 0, 150)
-        for scale in (1e15, 1e30):
-            assert engine.decide(good(data) * np.float32(scale)).action is Action.VERIFY
+    engine = make()
+    play(engine, data, 0, 150)
+    for scale in (1e15, 1e30):
+        assert engine.decide(good(data) * np.float32(scale)).action is Action.VERIFY
 
 
 class Failing(Counting):

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,8 +92,6 @@ def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_n
     assert ball.get_radius() == RECIPE.radius
     np.testing.assert_array_equal(ball.get_center(), MANY_RIGHT.position[-1])
     assert "root mean square radius = 1" in figure.axes[0].get_ylabel()
-    grown = replay_of(["accept"] * 50, [1] * 50, recipe=replace(RECIPE, fraction=0.3))
-    assert len(embedding_map(grown).axes[0].patches) == 0  # one that grows has no radius to draw
 
 
 def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() -> None:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dengine.decision.policy import LARGEST_RADIUS
 from dengine.decision.references import FEWEST_PARTS, RadiusIndex, label_agreement
 
 
@@ -67,22 +68,11 @@ def test_counts_over_k_spaces_are_the_sum_of_the_counts_in_each(K: int, d: int, 
         assert (n_success[0], n_failure[0]) == tuple(np.sum(each, axis=0))
 
 
-@settings(deadline=None)
-@given(n=st.integers(1, 120), fraction=st.floats(0.01, 1.0), seed=st.integers(0, 2**16))
-def test_a_fraction_counts_the_nearest_by_sorting_ties_included(n: int, fraction: float, seed: int) -> None:
-    Z, y = points(n, seed=seed)
-    Z = np.round(Z, 1)  # ties happen
-    query = np.round(points(1, seed=seed + 1)[0], 1)
-    d = distances(Z, query[0])
-    inside = d <= np.sort(d)[min(n, int(np.ceil(fraction * n))) - 1]
-    n_success, n_failure = filled(Z, y).count(query, 0.001, fraction)
-    assert (n_success[0], n_failure[0]) == (y[inside].sum(), (1 - y[inside]).sum())
-
-
-def test_a_query_beyond_all_measure_has_no_neighbours_even_by_fraction() -> None:
+@pytest.mark.parametrize("radius", [0.5, LARGEST_RADIUS])
+def test_a_query_beyond_all_measure_has_no_neighbours_however_large_the_ball(radius: float) -> None:
     Z, y = points(50)
     for query in (np.inf, np.nan, 1e30):  # squared, the last overflows float32
-        n_success, n_failure = filled(Z, y).count(np.full((1, 2), query), 0.5, fraction=0.3)
+        n_success, n_failure = filled(Z, y).count(np.full((1, 2), query), radius)
         assert (n_success[0], n_failure[0]) == (0, 0)
 
 

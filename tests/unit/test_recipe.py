@@ -13,13 +13,11 @@ from dengine import INTERVALS, Policy, Recipe
 from dengine.errors import SettingError
 from dengine.recipe import RECIPES
 
-shares = st.one_of(st.just((None, None)), st.tuples(st.floats(0.001, 1.0), st.one_of(st.none(), st.floats(0.001, 1.0))))
 values = st.one_of(st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text())
 
 
 @st.composite
 def recipes(draw) -> Recipe:
-    fraction, reject_fraction = draw(shares)
     return Recipe(
         reducer=draw(st.sampled_from([*RECIPES, "pca", "other"])),
         params=draw(st.dictionaries(st.from_regex(r"\A[a-z_]{1,12}\Z"), values, max_size=4)),
@@ -30,8 +28,6 @@ def recipes(draw) -> Recipe:
             draw(st.floats(0.0, 0.999)),
         ),
         radius=draw(st.floats(1e-6, 1e6)),
-        fraction=fraction,
-        reject_fraction=reject_fraction,
         folds=draw(st.integers(2, 10)),
         retrain_every=draw(st.integers(1, 10_000)),
         budget=draw(st.floats(1e-3, 1e3)),
@@ -77,8 +73,6 @@ def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None
         ("policy = 3", "mine"),
         ("params = 3", "params"),
         ("radius = -1.0", "radius > 0"),
-        ("fraction = 'none'\nreject_fraction = 0.1", "reject_fraction only together"),
-        ("fraction = 0.0", "fraction in"),
         ("folds = 1", "folds to be an integer of at least 2, got 1"),
         ("retrain_every = 0", "retrain_every"),
         ("window = 9", "window"),

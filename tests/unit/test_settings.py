@@ -41,8 +41,6 @@ def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
     assert engine.recipe == expected
     assert engine.policy is engine.recipe.policy
     assert engine.store.settings()["recipe"] == expected.to_toml()
-    engine = DataEngine(recipe=replace(RECIPES["pca"], fraction=0.3, reject_fraction=0.1), radius=0.4)
-    assert (engine.recipe.radius, engine.recipe.fraction, engine.recipe.reject_fraction) == (0.4, None, None)
 
 
 REFUSED = [  # settings, and the words that say why not

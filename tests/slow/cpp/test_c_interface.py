@@ -35,7 +35,7 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     run("cmake", "--build", build)
     store, key = tmp_path / "engine.db", tmp_path / "cell.key"
     assert command("export", "--make-key", key).exit_code == 0
-    with trained(make_data(400, SAMPLES), store, fraction=0.3, reject_fraction=0.08) as engine:
+    with trained(make_data(400, SAMPLES), store) as engine:
         file = export_torchscript(engine, tmp_path / "model.ts", key=key)
     X = make_data(120, SAMPLES, seed=9).X
     X[3, 4], X[5] = np.nan, 1.5

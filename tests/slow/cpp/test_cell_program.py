@@ -29,9 +29,9 @@ class Learned(NamedTuple):
 
 
 POLICIES = {
-    "local": {"guarantee": "local", "stops": "some", "fraction": 0.3, "reject_fraction": 0.08, "windows": WINDOWS},
-    "pooled": {"guarantee": "pooled", "stops": "some", "fraction": 0.1, "audit_rate": 0.6},  # its only evidence
-    "all": {"guarantee": "pooled", "stops": "all", "fraction": 0.1},
+    "local": {"guarantee": "local", "stops": "some", "windows": WINDOWS},
+    "pooled": {"guarantee": "pooled", "stops": "some", "audit_rate": 0.6},  # its only evidence
+    "all": {"guarantee": "pooled", "stops": "all"},
 }
 
 

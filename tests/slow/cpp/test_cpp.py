@@ -18,12 +18,10 @@ from dengine.records import Action, Reason
 from tests.support.exports import SAMPLES, cell_journal, fitted, trained, wild_traces
 from tests.support.programs import Program, must_agree
 
-BALLS = {"fraction": 0.3, "reject_fraction": 0.08}
-
 
 @pytest.fixture(scope="module")
 def engine(make_data: Callable[..., Dataset]) -> Iterator[DataEngine]:
-    with trained(make_data(400, SAMPLES), audit_rate=0.3, **BALLS) as engine:
+    with trained(make_data(400, SAMPLES), audit_rate=0.3) as engine:
         yield engine
 
 
@@ -69,7 +67,7 @@ def test_traces_of_other_lengths_are_fitted_as_python_does_and_come_back_from_th
     programs: Path, make_data: Callable[..., Dataset], tmp_path: Path, fit: str
 ) -> None:
     store, journal = tmp_path / "engine.db", tmp_path / "cell.csv"
-    with trained(make_data(200, SAMPLES), store, TraceSpec(SAMPLES, fit=fit), fraction=0.1) as engine:
+    with trained(make_data(200, SAMPLES), store, TraceSpec(SAMPLES, fit=fit)) as engine:
         path = export_torchscript(engine, tmp_path / "model.ts")
     lengths = [98, 100, 103, 60, 150, 30, 230, 1] * 5
     traces = [x[:n] for x, n in zip(make_data(40, 240, seed=4).X, lengths, strict=True)]

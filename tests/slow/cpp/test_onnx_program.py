@@ -31,7 +31,7 @@ def library() -> Path:
 def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A model of the bundled data, and the key that it was signed with."""
     data, folder = load_dataset("insertion"), tmp_path_factory.mktemp("onnx")
-    classifier = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9, fraction=0.05)
+    classifier = WilsonRadiusClassifier(alpha=0.1, lower_bound=0.9)
     model = ModelPrediction("pca", classifier).fit(data.X[:700], data.y[:700])
     key = make_key(folder / "cell.key")
     return export_onnx(model, folder / "model.onnx", trace=TraceSpec(1000, limit=500.0), key=key), key
