@@ -43,7 +43,6 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python -m tests.slow.proof --only null": "--repeats 2",
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --cycles 0 --samples 100",
-    "python training/benchmark_recording.py": "--insertions 4 --speed 0 --samples 100",
     "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
     "cmake --build build/cpp": "--parallel 2",
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20",
