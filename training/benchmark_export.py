@@ -22,7 +22,7 @@ from common import options, tell, wall_time
 from rich.progress import track
 
 from dengine import DataEngine, Dataset, Recipe, export_torchscript, load_dataset, load_exported
-from dengine.datasets.importing import import_labelled, train_until_done
+from dengine.datasets.importing import import_labelled
 from dengine.export.onnx import export_onnx, load_onnx
 from dengine.records import Action
 from dengine.store import SqlStore
@@ -40,12 +40,12 @@ def finding(what: str, value: float, unit: str = "", target: str = "") -> Row:
     return {"what": what, "value": round(float(value)), "unit": unit, "target": target}
 
 
-def train(data: Dataset, recipe: Recipe, retrains: int, **policy: Any) -> DataEngine:
+def train(data: Dataset, recipe: Recipe, **policy: Any) -> DataEngine:
     """An engine that has every trace of a data set as a reference, and audits."""
     store = SqlStore()
     import_labelled(store, data, recipe.with_policy(audit_rate=AUDIT_RATE, **policy))
     engine = DataEngine.open(store)
-    list(train_until_done(engine, retrains))
+    engine.retrain()
     return engine
 
 
@@ -98,7 +98,7 @@ def ask(cell: Path, file: Path, X: np.ndarray) -> tuple[list[list[Any]], np.ndar
 def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
     """Every row of the table."""
     data, rng = load_dataset(args.data), np.random.default_rng(1)
-    engine = train(data, Recipe.load(args.reducer), args.retrains)
+    engine = train(data, Recipe.load(args.reducer))
     X, known = np.concatenate([as_traces(data.X), random_traces(data, args.random, rng)]), as_traces(data.X)
     expected = [engine.decide(x) for x in track(X, description="engine")]
     file = export_torchscript(engine, folder / "model.ts")
@@ -131,7 +131,6 @@ def main() -> None:
     """Parse, measure, print."""
     parser = options(__doc__, data="insertion", out=Path("out"))
     parser.add_argument("--reducer", default="conv", help="a recipe's name or TOML file")
-    parser.add_argument("--retrains", type=int, default=3, help="at most, each within the recipe's budget")
     parser.add_argument("--random", type=int, default=10_000, help="random traces compared beside the data set's own")
     parser.add_argument("--calls", type=int, default=5000, help="calls timed")
     parser.add_argument("--cell", type=Path, help="the built C++ program; without it C++ is left out")

@@ -15,7 +15,6 @@ from .output import EndAskedError, Out, end_interrupted, facts, progress, rows_o
 
 if TYPE_CHECKING:
     from ..experiments.survey import Drift
-    from ..records import RetrainReport
 
 MOST = 10  # faults that are named
 CLEAR = 0.01  # p-values below it are called drift
@@ -84,35 +83,26 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
     tell(record, f"Simulated {n} insertions ({scenario}): {good} successes. Wrote {path}")
 
 
-WITHIN = "At most so many, each within the recipe's seconds and going on from the last; umap and pca need but one."
-
-
 @verb("dengine train --data insertion --store engine.db --reducer conv")
 @options.data_options(None)
 @options.store_option("Where the engine remembers; made if need be.", "--cell", required=True)
 @options.recipe_options
 @options.allow_import_option
 @options.new_seed_option
-@click.option("--retrains", type=options.COUNT, default=10, show_default=True, help=WITHIN)
-def train(
-    choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, retrains: int, allow_import: bool
-) -> None:
+def train(choice: RecipeChoice, source: DataChoice, store: str, seed: int | None, allow_import: bool) -> None:
     """Import labelled traces into a store and train on them.
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant) is kept, but never
     trained on. A store that has been used keeps its own recipe and seed. Ctrl-C keeps what was imported; the same
     command goes on from there.
     """
-    from ..datasets.importing import form_in, import_labelled, train_until_done
+    from ..datasets.importing import form_in, import_labelled
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
     from ..store.opening import UNHURRIED
 
     before = form_in(store, source.data)  # of what the store has, where no other form was asked for
     data = replace(source, how={**before, **source.how}).load()
-    reports: list[RetrainReport] = []
-    interrupted = False
-
     try:
         with steps(f"importing {data.name}", len(data)) as count:
             imported = import_labelled(store, data, choice.if_asked(), seed, count, allow_import)
@@ -121,24 +111,17 @@ def train(
         end_interrupted(f"Interrupted: {there}; the same command goes on from there.")
     asked: dict[str, Any] = {"recipe": choice.if_asked(), "allow_import": allow_import}
     with DataEngine.open_or_create(store, wait=UNHURRIED, **asked) as engine:
+        name, record = short_name(engine.recipe.name), {"store": store, "faults": data.faults, "import": imported}
         if not (imported.imported or engine.new_labels) and engine.version:
-            record = {"store": store, "interrupted": False, "faults": data.faults, "import": imported, "retrains": []}
-            name = short_name(engine.recipe.name)
-            tell(record, f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers.")
+            said = f"{store} knows all of {data.name}, nothing was done. Version {engine.version} of {name} answers."
+            tell(record | {"retrain": None}, said)
             return
-        try:
-            with steps("training", retrains) as count:
-                for report in train_until_done(engine, retrains):
-                    reports.append(report)
-                    count(1)
-        except EndAskedError:
-            interrupted = True
-        name, labels = short_name(engine.recipe.name), engine.store.status()["labels"]
-    answers = f"Version {reports[-1].version} of {name} answers. {retrain_line(reports)}"
-    answers = answers if reports[-1].version else "No version answers yet: every part is verified."
-    record = {"store": store, "interrupted": interrupted, "faults": data.faults, "import": imported, "retrains": reports}
-    tell(record, facts(f"{data.name} into {store}", rows_of(imported)), answers, f"{store} holds {labels} labels.")
-    if interrupted:
-        end_interrupted(f"Interrupted after {len(reports)} of at most {retrains} retrains; they are in {store}.")
-    if not reports[-1].accepted:
-        raise click.ClickException(f"The last retrain was {reports[-1].reason}.")
+        with progress("training", None):
+            report = engine.retrain()
+        labels = engine.store.status()["labels"]
+    answers = f"Version {report.version} of {name} answers. {retrain_line([report])}"
+    answers = answers if report.version else "No version answers yet: every part is verified."
+    table = facts(f"{data.name} into {store}", rows_of(imported))
+    tell(record | {"retrain": report}, table, answers, f"{store} holds {labels} labels.")
+    if not report.accepted:
+        raise click.ClickException(f"The retrain was {report.reason}.")

@@ -188,8 +188,9 @@ COLUMNS |= {"FN": "false_negative", "novel": "novel", "safe": "safe_mode"}
 
 
 def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> None:
-    """Tell what a run did, and what the cell says of its clock or its recordings."""
+    """Tell what a run did, and what a robot's cell says of its recordings."""
     from ..experiments.figures import run_picture
+    from ..experiments.metrics import Costs
     from ..experiments.tables import figures, retrain_line
 
     total, stretches = log.stretch(), log.stretches(STRETCHES)
@@ -203,12 +204,15 @@ def _report(log: Replay, said: dict[str, Any], cell: Any, out: Out | None) -> No
             cells["good/h"] = written("", row["parts_per_hour"])
         rows.append(cells)
     lines: list[Any] = [] if about is None else [facts("What the cell says of it", rows_of(about))]
-    certain, each_s = total["accepted"] + total["rejected"], said["check_seconds"]
-    lines += [f"{certain} checks of {each_s:g} s were left out: {written('_s', certain * each_s)}."]
+    certain, costs = total["accepted"] + total["rejected"], Costs(said["check_seconds"])
+    net = costs.saved(certain, total["stops"], total["false_negative"])
+    lost = f"{costs.escape:g} s a stop and {costs.false_reject:g} s a good part sent back"
+    lines += [f"{certain} checks of {costs.check:g} s were left out; less {lost} that saved {net:,.0f} s."]
     lines += [retrain_line(log.retrains), *map(_mode_line, said["safe_mode_changes"]), said["certificate"]["sentence"]]
     worst = max((each.seconds for each in log.retrains), default=None)
+    said |= {"total": total | {"net_s": net}, "stretches": stretches, "cell": about}
     tell(
-        said | {"total": total, "stretches": stretches, "cell": about} | {"retrains": log.retrains, "retrain_max_s": worst},
+        said | {"retrains": log.retrains, "retrain_max_s": worst},
         figures(said["title"], rows, output.explained(CAPTION), total=True),
         *lines,
         out=out,

@@ -26,7 +26,7 @@ from ..engine.engine import DataEngine
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, own_hash
 from ..recipe import Recipe
-from ..records import REASONS, Action, Decision, Reason, RetrainReport, TraceSpec, as_success, source_of, trace_in
+from ..records import REASONS, Action, Decision, Reason, TraceSpec, as_success, source_of, trace_in
 from ..store.opening import UNHURRIED, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
@@ -164,17 +164,6 @@ def import_parts(
             on_traces(min(CHUNK, len(parts) - start))
     taken = counts["imported"], counts["quarantined"], counts["known"]
     return ImportReport(*taken, resumed=True, contradicted=counts["contradicted"])
-
-
-def train_until_done(engine: DataEngine, retrains: int) -> Iterator[RetrainReport]:
-    """Retrain up to so many times: a reducer that learns in steps goes on from the last one, each within its budget.
-
-    Ends after the first where no steps are taken (UMAP, PCA), and where a candidate was dropped.
-    """
-    for _ in range(retrains):
-        yield (report := engine.retrain())
-        if not report.accepted or report.n_steps == 0:
-            return
 
 
 def _verified(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:

@@ -35,7 +35,6 @@ LESS = {  # so that an example takes seconds; its own options are all read
     "replay": "--repeats 1 --cycles 150",
     "run": "--cycles 6",
     "simulate": "--n 4",
-    "train": "--retrains 1",
 }
 OWN_REDUCERS = """
 import os, signal
@@ -103,7 +102,7 @@ def example_of(verb: str) -> list[str]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of its traces."""
     folder = tmp_path_factory.mktemp("examples")
-    succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "pca", "--retrains", 1)
+    succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "pca")
     traces = load_dataset("insertion")
     lines = [
         f"part,p{i},{traces.y[i]},,verify,verify,uncertain,0.5,0.9,4,1,{','.join(f'{x:.9g}' for x in traces.X[i] + 1)}"
@@ -217,7 +216,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
 
 
 def test_a_store_goes_on_with_a_reducer_of_this_folder(data: Path, own: Path, monkeypatch) -> None:
-    for words in (["--reducer", "his:FirstAndLast"], ["--retrains", 1, "--allow-import"]):  # made, and opened again
+    for words in (["--reducer", "his:FirstAndLast"], ["--allow-import"]):  # made, and opened again
         monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(own)])
         sys.modules.pop("his", None)
         out = succeed("train", "--data", data, "--store", "e.db", *words)
@@ -254,7 +253,7 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
     assert "simulated" in succeed(*words).lower()
     shown = document(*words)  # and the resumed run sees new parts
     assert shown["simulated"] is True
-    assert shown["cell"]["parts_per_hour"] > 0
+    assert shown["total"]["parts_per_hour"] > 0
     with sqlite3.connect(tmp_path / "e.db") as connection:
         assert connection.execute("select count(distinct content_hash) from decision").fetchone() == (8,)
     path = tmp_path / "traces.npz"

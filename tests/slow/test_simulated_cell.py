@@ -55,7 +55,7 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
     assert np.median(np.abs(made - bundled)) < 0.02  # N; another processor may differ in the last digits
 
 
-def test_the_clock_charges_cycles_verifications_stops_and_good_parts_sent_back() -> None:
+def test_the_clock_charges_cycles_verifications_and_stops() -> None:
     cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=0.0))
     cell.insert()
     assert not cell.verify()
@@ -64,17 +64,13 @@ def test_the_clock_charges_cycles_verifications_stops_and_good_parts_sent_back()
             again()
     cell.insert()
     assert cell.proceed() is Outcome.STOPPED
-    report = cell.report()
-    assert (report.cycles, report.finished, report.verifications, report.stops) == (2, 0, 1, 1)
-    assert (cell.clock, report.seconds_saved) == (47 + 5 + 47 + 120, 5 - 120)
+    assert cell.clock == 47 + 5 + 47 + 120
     cell = SimulatedCell(ALWAYS_GOOD)
     assert cell.insert().shape == (1000,)
     cell.reject()
     cell.insert()
     cell.verify()
-    report = cell.report()
-    assert (report.finished, report.sent_back, cell.clock) == (1, 1, 47 + 47 + 5)
-    assert report.seconds_saved == (47 + 5) - cell.clock  # always verifying, one part would have taken 52 s
+    assert cell.clock == 47 + 47 + 5
 
 
 def test_scenarios_change_what_they_say_and_nothing_else() -> None:

@@ -2,7 +2,6 @@
 
     cell = SimulatedCell(seed=0)
     for cycle in DataEngine().run(cell, cycles=600): ...
-    print(cell.report())
 
 Nothing waits: the cell's clock counts the seconds that production would have taken.
 """
@@ -120,30 +119,6 @@ def _streams(seed: int, cycle: int) -> tuple[np.random.Generator, np.random.Gene
     return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
 
 
-@dataclass(frozen=True, slots=True)
-class CellReport:
-    """What a simulated run came to; the counts are of cycles.
-
-    clock_s : simulated seconds of production.
-    finished : good parts that were passed on, verified or not. verifications : height checks done.
-    stops : failed parts passed on that stopped the system. escapes : failed parts passed on in silence.
-    sent_back : good parts that were sent back to the bin unverified.
-    parts_per_hour : finished parts by the clock.
-    seconds_saved : against verifying every cycle: the checks left out, less the stops, less a verified cycle for each
-        good part sent back, which the line has to make good. Negative where the model cost more than it gave.
-    """
-
-    cycles: int
-    clock_s: float
-    finished: int
-    verifications: int
-    stops: int
-    escapes: int
-    sent_back: int
-    parts_per_hour: float
-    seconds_saved: float
-
-
 class SimulatedCell:
     """A `Cell` whose parts, forces and heights come from physics, and whose clock is simulated.
 
@@ -168,7 +143,6 @@ class SimulatedCell:
         self._change = find_scenario(scenario)
         self._waiting = False
         self._done = 0
-        self._counts = dict.fromkeys(("finished", "verifications", "stops", "escapes", "sent_back"), 0)
 
     @property
     def truth(self) -> bool:
@@ -190,8 +164,6 @@ class SimulatedCell:
         """Check the height; a good part goes on, a bad one back to the bin."""
         success = self._take("verify").success
         self.clock += self.parameters.verify_s
-        self._counts["verifications"] += 1
-        self._counts["finished"] += success
         return success
 
     def proceed(self) -> Outcome:
@@ -199,26 +171,15 @@ class SimulatedCell:
         success = self._take("proceed").success
         chance = float(_streams(self.seed, self._done - 1)[2].random())  # of this part, whatever was decided before
         if success:
-            self._counts["finished"] += 1
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
         if chance < self.parameters.silent_share:
-            self._counts["escapes"] += 1
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s
-        self._counts["stops"] += 1
         return Outcome.STOPPED
 
     def reject(self) -> None:
         """Send the part back to the bin unverified; a good one has to be picked and inserted once more."""
-        self._counts["sent_back"] += self._take("reject").success
-
-    def report(self) -> CellReport:
-        """Where the run stands, truth included."""
-        p, n = self.parameters, self._counts
-        left_out = self._done - self._waiting - n["verifications"]
-        lost = p.stop_s * n["stops"] + (p.cycle_s + p.verify_s) * n["sent_back"]
-        per_hour = 3600 * n["finished"] / self.clock if self.clock else 0.0
-        return CellReport(self._done, self.clock, parts_per_hour=per_hour, seconds_saved=p.verify_s * left_out - lost, **n)
+        self._take("reject")
 
     def _take(self, call: str) -> Insertion:
         if self.last is None or not self._waiting:

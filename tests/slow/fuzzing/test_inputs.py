@@ -44,7 +44,7 @@ import-labels cell.csv --store store.db --any-model
 data small.npz --samples 20 --fit cut --rate-hz 500 --part part
 replay --data small.npz --reducer pca --alpha 0.1 --lower-bound 0.9 --repeats 1 --cycles 4 --seed 0
 compare --data small.npz --reducers pca --alphas 0.1 --intervals wilson --repeats 1 --cycles 4
-train --data small.npz --store trained.db --reducer pca --seed 0 --retrains 1 --audit-rate 0.1
+train --data small.npz --store trained.db --reducer pca --seed 0 --audit-rate 0.1
 run --cell replay --data small.npz --store run.db --reducer pca --cycles 2 --guarantee local --stops all"""
 
 
