@@ -8,7 +8,8 @@
                 -> a ramp from 0 to 1 around a threshold, its mean over R regions, plus twice that over all (B, D*F*R)
     tower 2     -> conv, G groups of 8 kernels at each dilation, at Q places of the trace and of its differences
                 -> how often each of a group answers most, and least; roots                      (B, 4*D*G*8)
-    both        -> principal components and heads, one logit of two; see features.py             (B, K, d)
+    products    -> of every two of the four leading principal components of tower 1              (B, 16)
+    all three   -> principal components and heads, one logit of them; see features.py            (B, K, d)
 
 A network trained on labels would exist K times, each on few labels. The encoder is drawn, not trained, and shared by all K
 spaces. As in MiniRocket the kernels of tower 1 have fixed weights, and thresholds are drawn from what they give on the
@@ -173,6 +174,7 @@ class ConvReducer(FeatureReducer):
     """
 
     variances = 40.0, 5.0
+    leading = 4
     sizes = ("kernels", "dilations", "regions", "width")
 
     def __init__(
@@ -185,7 +187,7 @@ class ConvReducer(FeatureReducer):
         regions: int = 3,
         groups: int = 2,
         width: int = 128,
-        l2: float = 1.0,
+        l2: float = 0.5,
         max_iter: int = 20,
         random_state: Any = 0,
     ) -> None:

@@ -35,7 +35,9 @@ MIN_TRACES = 20  # that an engine's first model is trained on
 FIRST_STEPS = 3  # of heads that start from nothing, however late: without any, they would hold all parts for alike
 TRAIN_TRACES = 4000  # that the heads are fitted to at most, so that it ends in time however many references there are
 GROWN, FITS = 1.5, 20  # the components are found anew where traces have grown so, and at every so many-th fit
-SHARES = 11  # of the first tower in the logit, from 0 to 1
+PAIRS = 10.0  # of `variances`, for products
+DOUBT = 4.0  # nats that products must save to be the whole logit: by chance they would have a share where they tell nothing
+SHARES = 11  # of what came before a tower in the logit, from 0 to 1
 LEARNED = 256  # traces that channels' scales are read from: more tell no more
 MOST = 10**9  # of a parameter that is a whole number
 MANY = 3200  # traces, for which a second core is worth taking
@@ -139,14 +141,16 @@ class FeatureEmbedding(nn.Module):
 
     weight: Tensor
     bias: Tensor
+    of_pairs: Tensor
     unit: Tensor
 
-    def __init__(self, features: Features, folds: int, dim: int) -> None:
+    def __init__(self, features: Features, folds: int, dim: int, leading: int) -> None:
         super().__init__()
-        self.features, self.folds, self.dim = features, folds, dim
-        # Axis 2 is the same in every space; its copies cost less than an op to spread it.
-        self.register_buffer("weight", torch.zeros(len(features.gain), folds * dim))
-        self.register_buffer("bias", torch.zeros(folds * dim))
+        self.features, self.folds, self.dim, self.leading, self.n_scores = features, folds, dim, leading, folds * dim
+        # Axis 2 is the same in every space; its copies cost less than an op to spread it. Leading components come last.
+        self.register_buffer("weight", torch.zeros(len(features.gain), folds * dim + leading))
+        self.register_buffer("bias", torch.zeros(folds * dim + leading))
+        self.register_buffer("of_pairs", torch.zeros(leading * leading, folds * dim))
         self.register_buffer("unit", torch.tensor([1.0, SECOND_AXIS][:dim]).repeat(folds))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -156,7 +160,15 @@ class FeatureEmbedding(nn.Module):
     def places(self, f: Tensor) -> Tensor:
         """(B, P) clipped features -> (B, K, d)."""
         scores = torch.addmm(self.bias, f, self.weight)
+        if self.leading > 0:
+            pairs = products(scores.narrow(1, self.n_scores, self.leading))
+            scores = torch.addmm(scores.narrow(1, 0, self.n_scores), pairs, self.of_pairs)
         return scores.sigmoid_().mul_(self.unit).view(-1, self.folds, self.dim)
+
+
+def products(g: Tensor) -> Tensor:
+    """(n, m) -> (n, m * m): of every two."""
+    return (g.unsqueeze(2) * g.unsqueeze(1)).flatten(1)
 
 
 def fit_heads(
@@ -275,6 +287,7 @@ class FeatureReducer(Reducer):
     own_unit = True  # a radius of 0.07 is seven in a hundred, never rescaled
     width = 128  # W
     variances: tuple[float, ...] = (150.0,)  # of each tower's components together: what a head's ridge is weighed against
+    leading = 0  # components of the first tower whose products are a tower of their own; 0: none
     sizes: tuple[str, ...] = ()  # parameters of a kind that are whole numbers
     n_components: int
     folds: int
@@ -343,7 +356,8 @@ class FeatureReducer(Reducer):
     def _build(self, channels: int, samples: int) -> None:
         self.check()
         features = self.make_features(channels, samples)
-        self.net_ = FeatureEmbedding(features, self.folds, self.n_components).eval()
+        leading = min(self.leading, self.width, features.towers[0].stop)
+        self.net_ = FeatureEmbedding(features, self.folds, self.n_components, leading).eval()
         self.n_fits_ = self.n_seen_ = 0
         self.towers_ = []
         self._numbers = np.zeros(0, dtype=np.int64)  # of the labels that were seen last
@@ -369,30 +383,40 @@ class FeatureReducer(Reducer):
                     raise one_class_outside(k, int(some.sum()), classes)
             f, y, rows_of = self.net_.features.clipped(raw), torch.from_numpy(labels[rows]), torch.from_numpy(outside)
             towers, said = [], []
-            for tower, columns in zip(self.towers_, self.net_.features.towers, strict=True):
-                g = tower.components(f[:, columns])
-                w, *rest = fit_heads(g, y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
+            for tower, seen in zip(self.towers_, self._seen(f), strict=True):
+                w, *rest = fit_heads(tower.components(seen), y, rows_of, tower.w, self.l2, self.max_iter, stop, least)
                 towers.append(tower._replace(w=w))
                 said.append(rest)
             left_out, unsure, steps = zip(*said, strict=True)
-            # Leave-one-out logits of rows outside fold k alone weigh the towers of head k.
-            shares = torch.linspace(0.0, 1.0, SHARES if len(towers) > 1 else 1, dtype=torch.float64)[:, None, None]
-            mixed = shares * left_out[0] + (1.0 - shares) * left_out[-1]
-            losses, best = masked_loss(mixed, y, rows_of.double()).min(0)
-            self._answer_by(towers, shares[best, 0, 0].float())
+            # Leave-one-out logits of rows outside fold k alone weigh the towers of head k, one after the other.
+            mixed, own, tried = left_out[0], [torch.ones(self.folds)], torch.linspace(0.0, 1.0, SHARES).double()
+            for i, each in enumerate(left_out[1:], 1):
+                losses = masked_loss(each + tried[:, None, None] * (mixed - each), y, rows_of.double())
+                doubt = DOUBT if i == len(self.net_.features.towers) else 0.0  # of products
+                share = tried[(losses + doubt * (1.0 - tried)[:, None] / rows_of.sum(1)).argmin(0)]
+                mixed = each + share[:, None] * (mixed - each)
+                own = [*(share.float() * former for former in own), 1.0 - share.float()]
+            self._answer_by(towers, own)
+            losses = masked_loss(mixed, y, rows_of.double())
         self.towers_, self.n_iter_ = towers, max(steps)
         self.holdout_losses_, self.n_fits_ = losses.numpy(), self.n_fits_ + 1
         heads = ", ".join(map(str, sorted(set.intersection(*map(set, unsure)))))
         self.note_ = f"head {heads} says the base rate: it would have done worse" if heads else ""
 
-    def _answer_by(self, towers: list[Tower], share: Tensor) -> None:
-        """Put the towers' heads into what answers; share (K,) of the first one, and the last has the rest."""
-        net, first = self.net_, slice(None, None, self.n_components)
+    def _answer_by(self, towers: list[Tower], shares: list[Tensor]) -> None:
+        """Put the towers' heads into what answers, each head in its share (K,) of the logit."""
+        net, first = self.net_, slice(0, self.net_.n_scores, self.n_components)
         net.bias[first] = 0.0
-        for tower, columns, own in zip(towers, net.features.towers, (share, 1.0 - share)[-len(towers) :], strict=True):
+        weights = [*(net.weight[columns] for columns in net.features.towers), net.of_pairs]
+        for tower, own, held in zip(towers, shares, weights, strict=False):
             weight, bias = tower.heads()
-            net.weight[columns, first] = own * weight
+            held[:, first] = own * weight
             net.bias[first] += own * bias
+
+    def _seen(self, f: Tensor) -> list[Tensor]:
+        """What each tower sees of features (n, P): its own ones, the last of all products of leading components."""
+        seen = [f[:, columns] for columns in self.net_.features.towers]
+        return [*seen, products(self.towers_[0].components(seen[0])[:, : self.net_.leading])] if self.leading else seen
 
     def trained_on(self, folds: Ints) -> NDArray[np.bool_]:
         """(n,) -> (K, n): fold k never trains head k, or its labels would count themselves."""
@@ -413,11 +437,16 @@ class FeatureReducer(Reducer):
                 scores = torch.addmm(biases, f[:, columns], weights).mean(0)
                 weights = weights * (gain / net.features.gain)[columns, None]
             self.towers_.append(Tower.over(now[:, columns], self.width, variance, weights, scores))
+        columns, n, first = net.features.towers[0], net.n_scores, self.towers_[0]
+        if self.leading:  # their heads begin anew: the products are of other components
+            blank = torch.zeros(net.leading**2, self.folds), torch.zeros(self.folds)
+            self.towers_.append(Tower.over(self._seen(now)[-1], self.width, PAIRS, *blank))
+            net.weight[columns, n:], net.bias[n:] = first.axes[:, : net.leading], first.centre[: net.leading]
         if self.n_components == 2:  # the second axis is the first component, of one deviation at both sides in the sigmoid
-            axis, columns = self.towers_[0].axes[:, 0], net.features.towers[0]
+            axis = first.axes[:, 0]
             second = 2.0 * axis / (now[:, columns] @ axis).std().clamp(min=1e-12)
             second = second if second @ net.weight[columns, 1] >= 0 else -second  # its sign as it was
-            net.weight[columns, 1::2], net.bias[1::2] = second[:, None], -(now[:, columns].mean(0) @ second)
+            net.weight[columns, 1:n:2], net.bias[1:n:2] = second[:, None], -(now[:, columns].mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """(n, C, T) -> (n, P), not standardised: computed once a label's number, and forgotten once that is not given."""
