@@ -10,6 +10,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.model_selection import cross_val_score
 from sklearn.neighbors import NeighborhoodComponentsAnalysis
 from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from dengine import ConvReducer, CrossFitted, PcaReducer, RocketReducer, UmapReducer, WilsonRadiusClassifier
@@ -113,7 +114,7 @@ def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(n
 @every_reducer
 def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: str) -> None:
     X, y = traces()
-    pipeline = make_pipeline(clone(SMALL[name]), WilsonRadiusClassifier(radius=0.5))
+    pipeline = make_pipeline(clone(SMALL[name]), StandardScaler(), WilsonRadiusClassifier(radius=0.5))  # in one unit
     assert cross_val_score(pipeline, X, y, cv=3, error_score="raise").mean() > y.mean() + 0.1
 
 
