@@ -220,8 +220,8 @@ def _table(name: str, values: Mapping[str, Any]) -> str:
 def _value(value: Any) -> str:
     if value is None or isinstance(value, str):  # a string is written as in JSON, but for one character
         return json.dumps("none" if value is None else value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, tuple):  # of windows
-        return f"[{', '.join(_value(str(each)) for each in value)}]"
+    if isinstance(value, tuple):  # of windows, or prices
+        return f"[{', '.join(_value(each if isinstance(each, PLAIN) else str(each)) for each in value)}]"
     plain = value.item() if isinstance(value, np.generic) else value  # NumPy's repr names its type, which is not TOML
     return str(plain).lower() if isinstance(plain, bool) else repr(plain)
 

@@ -192,8 +192,9 @@ _ALPHA = "Two-sided error level of the confidence bound, a probability.  [defaul
 _LB = "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: the recipe's]"
 _GUARANTEE = (
     "What keeps to LB: the ball around each part, at one look (local); all its members together (pooled); or a rule of "
-    "your own."
+    "your own. With cost, what is expected to be cheaper than a check passes, by --prices."
 )
+_PRICES = "Of a check, a bad part accepted and a good one rejected, in one unit, under cost.  [default: 5,120,47.5]"
 _STOPS = "Which bad accepted parts stop the system: some, or all; with all, one that no stop follows counts as good."
 _AUDITS = "Share of what the model is certain of that is verified all the same; rejects are known by it alone."
 _NOVELTY = "Verify a trace so many times less like the learned ones than these are like each other; 0: off."
@@ -209,6 +210,7 @@ POLICY = {
     "guarantee": click.option("--guarantee", type=Known("guarantee", RULE), help=_GUARANTEE),
     "stops": click.option("--stops", type=Known("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
+    "prices": click.option("--prices", type=Listed(click.FloatRange(0.0)), help=_PRICES),
     "windows": click.option("--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS),
 }
 SETTINGS = POLICY | {"novelty": click.option("--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY)}

@@ -289,7 +289,7 @@ PRICES = {
 
 @verb("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 @options.data_options()
-@options.gathered("prices", dict, PRICES)
+@options.gathered("each", dict, PRICES)
 @click.option("--cost-unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @options.recipe_options
 @options.gathered("lists", options.given, LISTS)
@@ -298,7 +298,7 @@ PRICES = {
 @options.out_option
 def costs(
     choice: RecipeChoice,
-    prices: dict[str, float],
+    each: dict[str, float],
     cost_unit: str,
     lists: Mapping[str, Any],
     source: DataChoice,
@@ -307,18 +307,18 @@ def costs(
 ) -> None:
     """Say which alpha and LB pay.
 
-    What a part of your recordings costs under each, and where everything is verified. All costs are in one unit, as
+    What a part of your recordings costs under each, where everything is verified, and, with --stops all or audits, where
+    parts pass by these costs (--guarantee cost). All costs are in one unit, as
     seconds of production or money. Ctrl-C shows the curve of the shuffles that every policy has finished.
     """
     _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of
+    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of, priced_tasks
     from ..experiments.figures import cost_picture
-    from ..experiments.grid import grid_tasks
     from ..experiments.metrics import Costs
     from ..experiments.tables import figures
 
-    priced, tried = Costs(**prices), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
-    tasks = grid_tasks([choice.contender()], **tried, seeds=stream.seeds, cycles=stream.cycles)
+    priced, tried = Costs(**each), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
+    tasks = priced_tasks(choice.contender(), priced, **tried, seeds=stream.seeds, cycles=stream.cycles)
     finished = _played(source.load(), tasks, stream)
     seeds = [each.seed for each in finished.replays]
     if finished.interrupted and sum(seeds.count(seed) == len(tasks) / len(stream.seeds) for seed in set(seeds)) < 2:
@@ -346,6 +346,7 @@ def costs(
 
 def _cells(row: PolicyCost, chosen: bool) -> tuple[str, ...]:
     numbers = (f"{row.policy.alpha:g}", percent(row.policy.lower_bound, "g"))
+    numbers = ("by cost", "-") if row.policy.guarantee == "cost" else numbers
     cost = f"{row.cost:.3g}" + (f"\n{row.lower:.3g} to {row.upper:.3g}" if row.certain else "")
     shares = (percent(row.verified, ".0f"), _wrong(row.bad), _wrong(row.good))
     return (">" if chosen else "", *numbers, cost, f"{row.late:.3g}", *shares)

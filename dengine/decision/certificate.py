@@ -148,13 +148,26 @@ class Certificate:
     """What can be said, at level 1 - alpha and at any moment, of the parts that the model decided alone.
 
     accepted : the bound on the mean probability that an accepted part was bad.  rejected : that a rejected one was good.
-    tolerance : what the user allows of either, 1 - lower_bound. Each bound holds at 1 - alpha by itself.
+    tolerance : what is allowed of the accepted, by default 1 - lower_bound. Each bound holds at 1 - alpha by itself.
+    prices : of a check, an escape and a false reject where they are what decides, see `Policy`; else None.
     """
 
     alpha: float
     tolerance: float
     accepted: Bounded
     rejected: Bounded
+    prices: tuple[float, float, float] | None = None
+
+    @property
+    def saved(self) -> float | None:
+        """At least so much, in the unit of the prices, was saved by not checking what is accepted, less what bad ones cost.
+
+        Expected, as the bound is: n check - escape n upper, for all moments together. None where nothing is priced.
+        """
+        if self.prices is None:
+            return None
+        check, escape, _ = self.prices
+        return self.accepted.n * (check - escape * self.accepted.upper)
 
     @property
     def kept(self) -> bool:
@@ -165,7 +178,11 @@ class Certificate:
     def sentence(self) -> str:
         """What a plant manager may rely on about accepted parts, in one sentence."""
         unknown = "silence is no success: set audit_rate, or stops='all' where every bad part stops the system"
-        return self._sentence(self.accepted, "that went on without a check", "accept", "bad", unknown)
+        said = self._sentence(self.accepted, "that went on without a check", "accept", "bad", unknown)
+        if self.saved is None or self.accepted.upper >= 1.0:
+            return said
+        known = f"at least {math.floor(self.saved):,}" if self.saved > 0.0 else "nothing for certain"
+        return f"{said} By the prices not checking them saved {known}."
 
     @property
     def sentence_on_rejects(self) -> str:

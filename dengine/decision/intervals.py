@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import SettingError
 
+SORTED = ("pooled", "cost")  # guarantees under which the interval around a trace only sorts
 SORTING = 0.5  # two-sided error level of an interval that only sorts: z = 0.67
 Bounds = tuple[Any, Any]  # two floats for scalar counts, two float64 arrays otherwise
 Interval = Callable[[ArrayLike, ArrayLike, float], Bounds]
@@ -27,8 +28,8 @@ FloatArray = NDArray[np.float64]
 
 
 def level_of(alpha: float, guarantee: str) -> float:
-    """Error level of the interval around a trace: under "pooled" it only sorts."""
-    return SORTING if guarantee == "pooled" else alpha
+    """Error level of the interval around a trace, for each guarantee."""
+    return SORTING if guarantee in SORTED else alpha
 
 
 def normal_quantile(alpha: float) -> float:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from numpy.typing import ArrayLike
 
 from ..errors import SettingError, expect
 from ..records import ACTIONS, Action, Window, find_class, is_number, is_whole
 from .certificate import Certificate, Outcomes, certify
-from .intervals import INTERVALS, Bounds, level_of, normal_quantile
+from .intervals import INTERVALS, SORTED, Bounds, level_of, normal_quantile
 
 if TYPE_CHECKING:
     from .rule import DecisionRule
@@ -19,6 +20,7 @@ Stops = Literal["all", "some"]
 RULES = {  # classes of `rule`, by guarantee and by what is known of stops
     "local": {"some": "DecisionRule", "all": "WatchedRule"},
     "pooled": {"some": "PooledRule", "all": "PooledRule"},
+    "cost": {"some": "PricedRule", "all": "PricedRule"},
 }
 
 LARGEST_RADIUS = 1e18  # radius: squared it is finite in float32, so that a query's own part, infinitely far, is in no ball
@@ -32,7 +34,8 @@ class Policy:
     lower_bound : the paper's LB, in (0.5, 1): accept where lower >= LB, reject where upper <= 1 - LB.
     interval : a name in `INTERVALS`.
     guarantee : the rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a `DecisionRule` of your
-        own. "local", the paper's, speaks of the ball around one trace, "pooled" of all parts together: see `rule`.
+        own. "local", the paper's, speaks of the ball around one trace, "pooled" of all parts together, "cost" of what they
+        cost by `prices`, and neither of the two numbers above but for the safe mode: see `rule`.
     stops : "all" where every bad accepted part stops the system and is reported before the next decision: then silence
         until that decision confirms the part. "some", the default, where silence says nothing.
     audit_rate : share of certain decisions that are verified all the same, in [0, 1]; a guarantee on rejects needs it, and
@@ -41,6 +44,9 @@ class Policy:
     label_within : decisions within which a verification or an audit is reported, at least 1; what is owed for longer counts
         as a wrong decision, in the certificate and in the evidence of a rule, until it is reported. Decisions, and not
         seconds: a cell that stands still owes nothing by that, and a replay repeats.
+    prices : of a check, of a bad part that is accepted, and of a good one that is rejected, in one unit, by which "cost"
+        decides: accept what fails with less than check / escape, reject what succeeds with less than check / false reject.
+        An error costs more than two checks.
     windows : an operator's limits beside the model, each a `Window`, or its text. What leaves one is verified, or rejected,
         whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
     Raises SettingError for a value out of its range.
@@ -55,6 +61,7 @@ class Policy:
     shadow: bool = False
     label_within: int = 1000
     windows: tuple[Window, ...] = ()
+    prices: tuple[float, float, float] = (5.0, 120.0, 47.5)
 
     def __post_init__(self) -> None:
         for name in ("alpha", "lower_bound", "audit_rate"):
@@ -76,11 +83,24 @@ class Policy:
             all(isinstance(each, Window) for each in windows), "a list of windows, each a Window, or its text", self.windows
         )
         object.__setattr__(self, "windows", windows)
-        if self.guarantee == "pooled" and self.stops == "some" and self.audited_share == 0.0:
+        known = isinstance(self.prices, tuple | list) and len(self.prices) == 3 and all(map(is_number, self.prices))
+        prices = tuple(float(each) for each in self.prices) if known else (0.0, 0.0, 0.0)
+        known = 0.0 < 2.0 * prices[0] < min(prices[1:]) and max(prices) < math.inf
+        expect(known, "prices of a check, an escape and a false reject, errors above two checks", self.prices, "as in 5,120,47.5")
+        object.__setattr__(self, "prices", prices)
+        if self.guarantee in SORTED and self.stops == "some" and self.audited_share == 0.0:
             raise SettingError(
-                "Expected audits, or stops='all', beside the pooled guarantee, which can claim nothing of parts that "
-                "nobody hears of; set audit_rate=0.1, or stops='all' where every bad accepted part stops the system."
+                f"Expected audits, or stops='all', beside the {self.guarantee} guarantee, which can claim nothing of parts "
+                "that nobody hears of; set audit_rate=0.1, or stops='all' where every bad accepted part stops the system."
             )
+
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """The share of the accepted that may be bad, and of the rejected that may be good."""
+        if self.guarantee != "cost":
+            return 1.0 - self.lower_bound, 1.0 - self.lower_bound
+        check, *errors = self.prices
+        return check / errors[0], check / errors[1]
 
     @property
     def audited_share(self) -> float:
@@ -108,9 +128,11 @@ class Policy:
         found = find_class(self.guarantee) if own is None else getattr(rule, own[self.stops])
         if not issubclass(found, rule.DecisionRule):
             raise SettingError(f"Expected a subclass of DecisionRule as guarantee, {self.guarantee} is none.")
-        rate = {"rate": self.known_share} if issubclass(found, rule.PooledRule) else {}
+        more: dict[str, Any] = {"tolerances": self.tolerances} if issubclass(found, rule.PricedRule) else {}
+        if issubclass(found, rule.PooledRule | rule.PricedRule):
+            more["rate"] = self.known_share
         try:
-            made: DecisionRule = found(self.alpha, self.lower_bound, self.interval, **rate)
+            made: DecisionRule = found(self.alpha, self.lower_bound, self.interval, **more)
         except TypeError as error:
             raise SettingError(f"Expected {self.guarantee} to take alpha, lower_bound and interval: {error}.") from error
         return made
@@ -119,7 +141,8 @@ class Policy:
         """What may be said of the parts so far; where all stops are known, a part counts once its silence is over."""
         if self.stops == "all":
             outcomes = replace(outcomes, accepted=outcomes.stops + outcomes.forgotten_accepts + outcomes.confirmed)
-        return certify(outcomes, self.alpha, 1.0 - self.lower_bound, self.stops, self.audited_share)
+        said = certify(outcomes, self.alpha, self.tolerances[0], self.stops, self.audited_share)
+        return replace(said, prices=self.prices) if self.guarantee == "cost" else said
 
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """(lower, upper) of the success probability, by the policy's interval."""

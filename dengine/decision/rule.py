@@ -28,6 +28,14 @@ at does not help a level that came later. Rejections are the mirror image; where
 is rejected: its members are those checked, and no claim is made of what was rejected. Beside it, the newest 50 told of a
 level may hold at most so many wrong ones, or it is not aimed at: a mean of all members is slow to notice drift.
 
+*Priced.* Levels from where an error is expected to cost as much as a check upwards, `Policy.tolerances`; and an account in
+place of the bet. With theta = check / escape, it is the sum of x / q - theta over the members that were asked for: what
+accepting them all would have cost beyond checking them all, in escapes. Parts that reach the level are accepted while it
+stands at `ADVANCE` or less. Where every outcome is known (q = 1), that is no statement of chance: at each accept the
+members before it had cost at most so many escapes more than their checks, whatever the truth does. Where audits tell, it is
+so of an unbiased estimate. A bet must be won before anything is accepted, and the parts checked for it cost more than its
+certainty is worth. What rejecting costs is counted likewise, without an advance.
+
 *Safe mode.* A claim on the mean of all members is slow to notice drift. So what is accepted is watched by a restarting
 test, a CUSUM against twice the tolerance (`certificate.cusum`), and so is the share of novel traces. At an alarm everything
 is verified, and what held must be shown anew, by members decided since: by each side for itself. The safe mode lasts until
@@ -60,6 +68,8 @@ BET = 0.55  # of the largest; best for failure rates of nearly half of the toler
 NEWEST = 50  # told parts of a level that are tested by themselves
 RARE = 0.2  # probability of so many wrong ones among them at the tolerance itself, at most
 NOBODY = 2.0  # a level that no bound reaches
+ADVANCE = 1.0  # escapes that the account of the priced rule may stand at: the first accepted parts may be so unlucky
+STRICTER = (0.5, 1.0)  # of the tolerance: what a part of a level of the priced rule may fail with
 FALSE_ALARMS = 100.0  # at the tolerance itself, one in 100 / alpha watched parts on average at most
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
 FEW_NOVEL = 25.0  # traces in a row that are not; one that is takes back as many as come with it at that share
@@ -107,6 +117,7 @@ class TableBound:
 
 
 Bound = Callable[[int, int, float], tuple[float, float]]
+Pair = tuple[float, float]  # by side: of accepts, of rejects
 SCALAR_BOUNDS: dict[str, Bound] = {"wilson": wilson_bound, "binomial": binomial_bound}
 
 
@@ -119,12 +130,29 @@ def most_wrong(tolerance: float) -> int:
     return k
 
 
+def log_steps(tolerance: float, rate: float) -> list[float]:
+    """Log capital that a checked part adds, and a wrong one besides; then an audited one, of propensity `rate`."""
+    stake = BET / (1.0 - BET * tolerance)
+    pairs = [(math.log1p(each * tolerance), math.log1p(each * (tolerance - 1.0))) for each in (stake * rate, stake)]
+    return [step for good, wrong in pairs for step in (good, wrong - good)]
+
+
+def weighed(told: list[int], steps: list[float]) -> float:
+    """The sum of what so many parts of each kind count for."""
+    total = 0.0
+    for n, step in zip(told, steps):  # noqa: B905  strict is not TorchScript
+        total += n * step
+    return total
+
+
 class Evidence(nn.Module):
     """What a rule has seen: members, what its levels are worth, drift detectors, and the level that each side must reach.
 
-    levels : of the score, the strictest first.
-    assumed : whether the first level holds until an alarm, as the paper's does; else all must be shown.
+    tolerances : by side, the largest share of wrong decisions.
+    levels : by side, of the score, the strictest first; as many on each.
     rate : probability with which the outcome of a certain decision is asked for; 1 where all are known.
+    rule : "watched": the first level holds until an alarm, as the paper's does; "pooled": all must be shown, by the bet;
+        "priced": by the account.
 
     Side 0 accepts, side 1 rejects; novelty is watched besides, as 2. The score of an accept is the lower bound, of a reject
     1 - upper.  open (2,) float64: the level that a part's score must reach, by side.  aim (2,) int64: position of the
@@ -140,25 +168,28 @@ class Evidence(nn.Module):
     watch: Tensor
     mode: Tensor
 
-    def __init__(self, alpha: float, tolerance: float, levels: list[float], assumed: bool, rate: float = 1.0) -> None:
+    def __init__(
+        self, alpha: float, tolerances: Pair, levels: list[list[float]], rate: float = 1.0, *, rule: str = "pooled"
+    ) -> None:
         super().__init__()
-        self.levels, self.assumed, self.rate = levels, assumed, rate
+        self.levels, self.assumed, self.priced, self.rate = levels, rule == "watched", rule == "priced", rate
         self.enough = math.log(1.0 / alpha)
-        self.most, self.span, self.nobody = most_wrong(tolerance), NEWEST, NOBODY
-        # Steps of log capital: for a part that was checked, and for a wrong one besides; then for an audited one.
-        stake = BET / (1.0 - BET * tolerance)
-        pairs = [(math.log1p(each * tolerance), math.log1p(each * (tolerance - 1.0))) for each in (stake * rate, stake)]
-        self.steps = [step for good, wrong in pairs for step in (good, wrong - good)]
+        self.most, self.span, self.nobody = [most_wrong(each) for each in tolerances], NEWEST, NOBODY
+        # By side what counts for it: of a part that was checked, and of a wrong one besides; then of an audited one.
+        self.steps = [log_steps(each, rate) for each in tolerances]
+        self.least = [-ADVANCE, 0.0]
+        self.account = [[each, -1.0, each / rate, -1.0 / rate] for each in tolerances]
         # Of a detector, what a wrong part adds, where a right one takes 1, and the sum that is an alarm.
-        detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (tolerance, tolerance, NOVEL_SHARE)]
+        detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
         self.worse, self.alarm_at = [float(step) for step, _ in detectors], [float(limit) for _, limit in detectors]
         self.better, self.few, self.back = -1.0, FEW_NOVEL, 1.0 / NOVEL_SHARE - 1.0
-        self.register_buffer("told", torch.zeros(2, 2, len(levels) + 1, 2, 2, dtype=torch.int64))
-        self.register_buffer("newest", torch.zeros(2, len(levels), NEWEST, dtype=torch.int64))
+        self.register_buffer("told", torch.zeros(2, 2, len(levels[0]) + 1, 2, 2, dtype=torch.int64))
+        self.register_buffer("newest", torch.zeros(2, len(levels[0]), NEWEST, dtype=torch.int64))
         self.register_buffer("watch", torch.zeros(3, dtype=torch.float64))
         self.register_buffer("mode", torch.zeros((), dtype=torch.int64))
         self.register_buffer("aim", torch.zeros(2, dtype=torch.int64))
-        self.register_buffer("open", torch.full((2,), levels[0] if assumed else NOBODY, dtype=torch.float64))
+        first = [each[0] if self.assumed else NOBODY for each in levels]
+        self.register_buffer("open", torch.tensor(first, dtype=torch.float64))
 
     def action(self, lower: float, upper: float) -> int:
         """What a bound allows at this moment; a part that could as well be accepted as rejected is verified."""
@@ -197,14 +228,14 @@ class Evidence(nn.Module):
             if looked == 0.0:  # it came unasked
                 return
             kind = int(looked < 1.0)
-        reached = 0
-        for level in self.levels:
+        reached, levels = 0, self.levels[side]
+        for level in levels:
             reached += int(level <= score)
         # Whatever was certain is a member, where its label came late, too.
-        member = reached > len(self.levels) - 1 - int(self.aim[side].item()) or predicted == side + 1
+        member = reached > len(levels) - 1 - int(self.aim[side].item()) or predicted == side + 1
         if reached == 0 and not member:
             return
-        first = len(self.levels) - reached
+        first = len(levels) - reached
         n = self.told[side, 0, 1 + first :, :, 0].sum(1, keepdim=True)  # before it: it takes the place of the oldest
         self.newest[side, first:].scatter_(1, n % self.span, int(wrong))
         counts = self.told[side, :, :, kind]
@@ -238,23 +269,27 @@ class Evidence(nn.Module):
         since: list[list[int]] = self.told[side, 1].flatten(1).tolist()
         ever: list[int] = self.told[side, 0, 0].flatten().tolist()
         if self.assumed:  # only an alarm closes it
-            if float(self.open[side].item()) >= self.nobody and self.shown(since[1]):
-                self.open[side].fill_(self.levels[0])  # assigned, a scripted float goes through float32
+            if float(self.open[side].item()) >= self.nobody and self.shown(side, since[1]):
+                self.open[side].fill_(self.levels[side][0])  # assigned, a scripted float goes through float32
             return
         wrong: list[int] = self.newest[side].sum(1).tolist()
-        lowest = len(self.levels) - 1
-        while lowest >= 0 and not (wrong[lowest] <= self.most and self.shown(since[lowest + 1])):
+        lowest = len(wrong) - 1
+        while lowest >= 0 and not (wrong[lowest] <= self.most[side] and self.passes(side, since[lowest + 1])):
             lowest -= 1
         self.aim[side].fill_(max(0, lowest))
-        held = lowest >= 0 and self.shown(ever) and (since[0] == ever or self.shown(since[0]))
-        self.open[side].fill_(self.levels[lowest] if held else self.nobody)
+        anew = since[0] != ever or int(self.mode.item()) != 0
+        held = lowest >= 0 and self.passes(side, ever) and (not anew or self.shown(side, since[0]))
+        self.open[side].fill_(self.levels[side][lowest] if held else self.nobody)
 
-    def shown(self, told: list[int]) -> bool:
+    def passes(self, side: int, told: list[int]) -> bool:
+        """Whether parts, checked and audited, allow more of their kind: by the bet, or by the account."""
+        if self.priced:
+            return weighed(told, self.account[side]) >= self.least[side]
+        return self.shown(side, told)
+
+    def shown(self, side: int, told: list[int]) -> bool:
         """Whether parts, checked and audited, say that their mean failure probability keeps the tolerance."""
-        log = 0.0
-        for n, step in zip(told, self.steps):  # noqa: B905  strict is not TorchScript
-            log += n * step
-        return log >= self.enough
+        return weighed(told, self.steps[side]) >= self.enough
 
 
 class DecisionRule(nn.Module):
@@ -340,8 +375,9 @@ class WatchedRule(DecisionRule):
     """The paper's rule with a safe mode: for cells in which silence after an accept counts as a success."""
 
     def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
-        levels = [float(lower_bound)]
-        super().__init__(alpha, lower_bound, interval, Evidence(alpha, 1.0 - float(lower_bound), levels, assumed=True))
+        tolerance, levels = 1.0 - float(lower_bound), [float(lower_bound)]
+        evidence = Evidence(alpha, (tolerance, tolerance), [levels, levels], rule="watched")
+        super().__init__(alpha, lower_bound, interval, evidence)
 
 
 class PooledRule(DecisionRule):
@@ -356,13 +392,34 @@ class PooledRule(DecisionRule):
         tolerance = 1.0 - float(lower_bound)
         step = 0.5 * tolerance
         levels = [float(lower_bound) - i * step for i in range(int((lower_bound - LOWEST) / step + 1e-9) + 1)]
-        super().__init__(alpha, lower_bound, interval, Evidence(alpha, tolerance, levels, assumed=False, rate=rate))
+        evidence = Evidence(alpha, (tolerance, tolerance), [levels, levels], rate)
+        super().__init__(alpha, lower_bound, interval, evidence)
         self.rate = rate
 
     @torch.jit.unused
     def anew(self) -> DecisionRule:
         """The same rule before it was told anything."""
         return type(self)(self.alpha, self.accept_at, self.interval, self.rate)
+
+
+class PricedRule(DecisionRule):
+    """Accept what is expected to cost less than its check while the members' account stands for it; reject likewise.
+
+    tolerances : by side, the share of wrong decisions at which they cost as much as checks, `Policy.tolerances`.
+    rate : as in `Evidence`.
+    """
+
+    sorts = True
+
+    def __init__(self, alpha: float, lower_bound: float, interval: str, tolerances: Pair, rate: float = 1.0) -> None:
+        levels = [[1.0 - share * each for share in STRICTER] for each in tolerances]
+        super().__init__(alpha, lower_bound, interval, Evidence(alpha, tolerances, levels, rate, rule="priced"))
+        self.tolerances, self.rate = tolerances, rate
+
+    @torch.jit.unused
+    def anew(self) -> DecisionRule:
+        """The same rule before it was told anything."""
+        return type(self)(self.alpha, self.accept_at, self.interval, self.tolerances, self.rate)
 
 
 class RadiusNeighbours(nn.Module):

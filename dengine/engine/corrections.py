@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..decision.intervals import SORTED
 from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
 from ..errors import ReportError, SettingError
@@ -26,7 +27,8 @@ from .settings import EvidenceWindow, SettingsInForce
 from .trainer import HUNG
 from .versions import ModelVersions
 
-SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops")  # what a rule is made of, and its evidence measured by
+# What a rule is made of, and its evidence measured by.
+SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
 SHADOW = {True: "shadow mode: every part is verified from now on", False: "the shadow mode ended: the model decides again"}
 SAID = {True: "success", False: "failure"}
 
@@ -110,9 +112,9 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; every earlier one keeps the bounds that it was decided by.
 
-        Where anything but the audit rate changes, under "pooled" where that does, too, the rule starts anew, told of what
-        is decided from now on: a tolerance chosen after the data was seen is not one of those that alpha was spent on, and
-        old bounds are of another scale.
+        Where anything but the audit rate changes, under "pooled" and "cost" where that does, the rule starts anew, told of
+        what is decided from now on: a tolerance chosen after the data was seen is not one of those that alpha was spent
+        on, and old bounds are of another scale.
         `certificate` speaks of what is decided since this change; one who may choose among m policies' certificates errs
         with up to m alpha. A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that was
         accepted before, and of which nothing was heard, stays unobserved.
@@ -139,7 +141,7 @@ class Corrections:
             )
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
-        asked = policy.guarantee == "pooled" and policy.known_share != now.recipe.policy.known_share
+        asked = policy.guarantee in SORTED and policy.known_share != now.recipe.policy.known_share
         anew = not own and (asked or any(name in new for name in SCORING))
         since = 0 if versions.answering is None else versions.next_number
         evidence = EvidenceWindow(since, SAFE_MODE.index(versions.newest.safe_mode)) if anew else now.evidence

@@ -23,9 +23,9 @@ import numpy as np
 
 from ..decision.policy import Policy
 from ..errors import expect, percent
-from .grid import Folder, grid_tasks, play_tasks
+from .grid import Folder, Task, grid_tasks, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
-from .replay import Replay
+from .replay import Contender, Replay
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,7 +65,8 @@ class PolicyCost:
 class CostCurve:
     """What a part costs under each policy that was tried, in recordings of `dataset`.
 
-    rows : by alpha, from the largest, then LB.  recipe : its name.  cycles : of each shuffle.
+    rows : by alpha, from the largest, then LB; last the guarantee of costs, where it was tried.
+    recipe : its name.  cycles : of each shuffle.
     choosing, reporting : how many shuffles did what.
     """
 
@@ -108,6 +109,7 @@ class CostCurve:
         """The result, for people."""
         row, every = self.cheapest, f"verifying everything costs {self.baseline:g} a part"
         who = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
+        who = "the cost guarantee" if row.policy.guarantee == "cost" else who
         between = f"with the errors at the ends of their 95 % intervals {row.lower:.3g} to {row.upper:.3g}"
         if not any(each.certain for each in self.rows):
             return f"Nothing pays yet: {every}, and under each policy that was tried everything was verified. Record more."
@@ -129,7 +131,7 @@ class CostCurve:
 
         frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")  # policy_alpha, bad_rate …
         own = [name for name in frame if not name.startswith("policy_")]
-        two = {"policy_alpha": "alpha", "policy_lower_bound": "lower_bound"}
+        two = {f"policy_{name}": name for name in ("guarantee", "alpha", "lower_bound")}
         return frame[[*two, *own]].rename(columns=two).assign(chosen=[row.policy == self.policy for row in self.rows])
 
 
@@ -148,7 +150,7 @@ def cost_curve(
     n_jobs: int = 1,
     keep: Folder | None = None,
 ) -> CostCurve:
-    """Replay recordings under every alpha and lower bound, and say what a part cost.
+    """Replay recordings under every alpha and lower bound, and by the costs themselves, and say what a part cost.
 
     dataset : anything `load_dataset` takes, such as a folder of recordings.
     check, escape, false_reject : as in `Costs`, in one unit.
@@ -159,8 +161,25 @@ def cost_curve(
     """
     costs = Costs(check, escape, false_reject)
     expect(repeats >= 2, "2 or more repeats", repeats, "one half chooses, the other one reports")
-    tasks = grid_tasks([recipe], alphas, lower_bounds, seeds=range(seed, seed + repeats), cycles=cycles)
+    tasks = priced_tasks(recipe, costs, alphas, lower_bounds, range(seed, seed + repeats), cycles)
     return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep), costs)
+
+
+def priced_tasks(
+    who: Any,
+    costs: Costs,
+    alphas: Sequence[float],
+    lower_bounds: Sequence[float],
+    seeds: Sequence[int],
+    cycles: int | None = None,
+) -> list[Task]:
+    """Every alpha and lower bound; then dengine's guarantee of costs, where it takes them and outcomes are heard of."""
+    one, prices = Contender.load(who), (costs.check, costs.escape, costs.false_reject)
+    policy, tasks = one.recipe.policy, grid_tasks([who], alphas, lower_bounds, seeds=seeds, cycles=cycles)
+    heard = policy.stops == "all" or policy.audited_share > 0.0
+    if one.rival is None and heard and 2.0 * costs.check < min(prices[1:]):
+        tasks += grid_tasks([one.with_policy(guarantee="cost", prices=prices)], seeds=seeds, cycles=cycles)
+    return tasks
 
 
 def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
@@ -175,7 +194,7 @@ def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
     half = len(seeds) // 2
     rows = [
         _row(policy, [of[policy, seed] for seed in seeds[:half]], [of[policy, seed] for seed in seeds[half:]], costs)
-        for policy in sorted(policies, key=lambda each: (-each.alpha, each.lower_bound))
+        for policy in sorted(policies, key=lambda each: (each.guarantee == "cost", -each.alpha, each.lower_bound))
     ]
     one = replays[0]
     return CostCurve(costs, tuple(rows), one.dataset, one.name, len(one), half, len(seeds) - half)

@@ -305,16 +305,20 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     how = f"{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the ends of their 95 % intervals"
     figure = blank(9.0, 7.2, title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    bounds = sorted({row.policy.lower_bound for row in curve.rows})
-    alphas = sorted({row.policy.alpha for row in curve.rows}, reverse=True)
+    asked = [row for row in curve.rows if row.policy.guarantee != "cost"]
+    bounds = sorted({row.policy.lower_bound for row in asked})
+    groups = {
+        f"alpha {row.policy.alpha:g}": [each for each in asked if each.policy.alpha == row.policy.alpha] for row in asked
+    }
+    groups |= {"by cost": [row for row in curve.rows if row not in asked]} if len(asked) < len(curve.rows) else {}
     top.axhline(curve.baseline, label="verify everything", **LIMIT)
-    for i, alpha in enumerate(alphas):
-        rows = [row for row in curve.rows if row.policy.alpha == alpha]
+    for i, (label, rows) in enumerate(groups.items()):
         # The alphas' whiskers side by side.
-        x = np.array([bounds.index(row.policy.lower_bound) for row in rows]) + 0.08 * (i - (len(alphas) - 1) / 2)
+        places = [bounds.index(row.policy.lower_bound) if row in asked else len(bounds) for row in rows]
+        x = np.array(places) + 0.08 * (i - (len(groups) - 1) / 2)
         cost, lower, upper = np.array([(row.cost, row.lower, row.upper) for row in rows]).T
         look: Look = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
-        look["label"] = f"alpha {alpha:g}"
+        look["label"] = label
         # A replay's mean lies within what its errors' intervals allow, but for rounding.
         top.errorbar(x, cost, yerr=np.maximum([cost - lower, upper - cost], 0.0), capsize=3, elinewidth=1.0, **look)
         bottom.plot(x, [100 * row.certain for row in rows], **look)
@@ -322,12 +326,13 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
             if row.policy == curve.policy:
                 ring: Look = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
                 top.scatter(at, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
-    means, wide = [row.cost for row in curve.rows], len(alphas) + 2
+    means, wide = [row.cost for row in curve.rows], len(groups) + 2
     lowest, highest = min(0.0, *means), 1.25 * max(curve.baseline, *means)
     finish(top, wide, ylim=(lowest, highest), ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
     finish(bottom, wide, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
-    bottom.set_xticks(range(len(bounds)), [f"{100 * bound:g}" for bound in bounds])
+    ticks = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * ("by cost" in groups)
+    bottom.set_xticks(range(len(ticks)), ticks)
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
     return figure
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..decision.intervals import level_of
+from ..decision.intervals import SORTED, level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
@@ -300,7 +300,7 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
     if found.levels is None:
         return None, None, "the levels that held then are not kept"
     accept_at, reject_at = found.levels
-    held = "the lowest level that held then" if policy.guarantee == "pooled" else "what held in safe mode"
+    held = "the lowest level that held then" if policy.guarantee in SORTED else "what held in safe mode"
     return accept_at if accept_at < NOBODY else None, 1.0 - reject_at if reject_at < NOBODY else None, held
 
 
@@ -313,7 +313,7 @@ def _reach(made: Decision, found: Circumstances) -> str:
 
 def is_score(policy: Policy, made: Decision) -> bool:
     """Whether a decision was sorted by its heads' score, and not by an interval."""
-    return policy.guarantee == "pooled" and made.lower == made.upper
+    return policy.guarantee in SORTED and made.lower == made.upper
 
 
 def _needed(policy: Policy, made: Decision, threshold: float | None, success: int) -> int | None:

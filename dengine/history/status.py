@@ -222,8 +222,8 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
         accepted=outcomes.accepted,
         rejected=tally.by("action")[Action.REJECT],
         stops=outcomes.stops,
-        would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy),
-        would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy),
+        would_accept=_judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0]),
+        would_reject=_judged(outcomes.audited_rejects, outcomes.audited_rejects_good, policy.tolerances[1]),
         bad_accepts=bad_accepts(outcomes, policy),
         unlabelled=tally.count(lambda kind: kind.action is Action.VERIFY and kind.success is None),
         retrains=len(here),
@@ -234,10 +234,10 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
 
 
 def _judged(
-    known: int, wrong: int, policy: Policy, alpha: float = 0.05, n: int | None = None, by: str = "audits"
+    known: int, wrong: int, tolerance: float, alpha: float = 0.05, n: int | None = None, by: str = "audits"
 ) -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
-    lower, upper, tolerance = 1.0 - high, 1.0 - low, 1.0 - policy.lower_bound
+    lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
     return Judged(known if n is None else n, known, wrong, by, lower, upper, tolerance, _verdict(lower, upper, tolerance))
 
@@ -254,8 +254,8 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> Judged:
     """
     n, heard = outcomes.accepted + outcomes.audited_accepts, outcomes.stops + outcomes.confirmed
     if heard and (policy.stops == "all" or outcomes.accepted == heard):
-        return _judged(heard, outcomes.stops, policy, policy.alpha, n, "every outcome")
-    said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy, policy.alpha, n)
+        return _judged(heard, outcomes.stops, policy.tolerances[0], policy.alpha, n, "every outcome")
+    said = _judged(outcomes.audited_accepts, outcomes.audited_accepts_bad, policy.tolerances[0], policy.alpha, n)
     quiet = outcomes.accepted - outcomes.stops
     lower = max(said.lower, 1.0 - wilson_interval(quiet, outcomes.stops, policy.alpha)[1])
     upper = max(said.upper, outcomes.stops / max(1, outcomes.accepted))
@@ -298,7 +298,7 @@ def course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
     """Read what a picture is drawn from; by : as of `SqlStore.stretches`, of which the newest are drawn."""
     modes = [event for event in store.events() if event.kind in MODES]
     stretches = store.stretches(max(1, min(STRETCHES, store.tally().count() // FEWEST)), **by)[-STRETCHES:]
-    return Course(stretches, store.versions(own=True), modes, 1.0 - recipe.policy.lower_bound, last)
+    return Course(stretches, store.versions(own=True), modes, recipe.policy.tolerances[0], last)
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:

@@ -76,8 +76,9 @@ def a_stream(make_data: Callable[..., Dataset], n: int, seed: int) -> Iterator[t
         yield x, bool(y) != changed, part
 
 
-@pytest.mark.parametrize("guarantee", ["local", "pooled"])
-@pytest.mark.parametrize("stops", ["some", "all"])
+@pytest.mark.parametrize(
+    ("guarantee", "stops"), [("local", "some"), ("local", "all"), ("pooled", "some"), ("pooled", "all"), ("cost", "all")]
+)
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any
 ) -> None:

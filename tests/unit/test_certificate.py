@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from dengine import Policy
 from dengine.decision.certificate import Certificate, Outcomes, certify, failure_bound, log_evidence
 from dengine.errors import SettingError
 
@@ -105,6 +106,16 @@ def test_what_is_known_of_accepted_parts(stops: str, audit_rate: float, seen: di
     found = certificate(stops, audit_rate, **seen).accepted
     assert (found.n, found.n_looked_at, found.n_bad, found.propensity) == known
     assert found.upper == failure_bound(found.n, found.n_bad, found.alpha, found.propensity)
+
+
+def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not_certain() -> None:
+    policy = Policy(0.05, guarantee="cost", stops="all", prices=(5, 120, 47.5))
+    found = policy.certificate(Outcomes(accepted=1203, confirmed=1179, stops=24))
+    upper = certificate("all", accepted=1203, stops=24).accepted.upper
+    assert (found.tolerance, found.saved) == (5 / 120, pytest.approx(1203 * 5 - 120 * 1203 * upper))
+    assert found.sentence.endswith(f"not checking them saved at least {int(found.saved):,}.")
+    assert policy.certificate(Outcomes(accepted=60, confirmed=58, stops=2)).sentence.endswith("saved nothing for certain.")
+    assert certificate("all", accepted=1203, stops=24).saved is None
 
 
 def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of_rejected_parts() -> None:

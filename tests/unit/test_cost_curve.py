@@ -102,7 +102,7 @@ def test_a_shuffle_that_not_every_policy_has_played_is_left_out() -> None:
 
 @pytest.fixture(scope="module")
 def found(make_data: Callable[..., Dataset]) -> CostCurve:
-    return cost_curve(make_data(160), check=5, escape=20, false_reject=10, **HOW)
+    return cost_curve(make_data(160), check=5, escape=20, false_reject=11, **HOW)
 
 
 def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: CostCurve, make_data) -> None:
@@ -110,6 +110,8 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(found: Co
     again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
     assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
     assert found.rows[0].cost == pytest.approx(np.mean([cost_a_part(one, found.costs) for one in again]))
+    by_cost = found.rows[-1]
+    assert (by_cost.policy.guarantee, by_cost.policy.prices) == ("cost", (5.0, 20.0, 11.0))
     assert (found.cycles, found.choosing, found.reporting, found.dataset) == (120, 2, 2, "insertion-like")
 
 
@@ -117,12 +119,12 @@ def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> 
     figure = cost_picture(found, unit="EUR")
     top, bottom = figure.axes
     assert top.get_ylabel() == "cost a part [EUR]"
-    assert [text.get_text() for text in bottom.get_xticklabels()] == ["80", "95"]
+    assert [text.get_text() for text in bottom.get_xticklabels()] == ["80", "95", "by cost"]
     labels = [text.get_text() for text in top.get_legend().get_texts()]
     assert "verify everything" in labels
     assert "alpha 0.5" in labels
     assert any(label.startswith("the choice: ") for label in labels) == (found.policy is not None)
-    assert "check 5 EUR, escape 20 EUR, false reject 10 EUR" in figure.get_suptitle()
+    assert "check 5 EUR, escape 20 EUR, false reject 11 EUR" in figure.get_suptitle()
 
 
 def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Path, monkeypatch) -> None:
@@ -140,4 +142,5 @@ def test_the_verb_shows_a_table_and_writes_the_curve(data: Dataset, tmp_path: Pa
     assert [row["alpha"] for row in told["rows"]] == [0.5, 0.1]
     assert told["sentence"] in " ".join(shown.split())
     assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
+    assert "by cost" in succeed(*words.replace("reject 10", "reject 11").split(), "--stops", "all")
     assert "name those to be tried, --alphas" in " ".join(dengine(*words.split(), "--alpha", "0.1").output.split())

@@ -18,6 +18,7 @@ from dengine.decision.rule import (
     Evidence,
     PooledRule,
     WatchedRule,
+    PricedRule,
     most_wrong,
     script,
 )
@@ -100,7 +101,7 @@ def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
 
 def adversary(rule: PooledRule, rng: np.random.Generator, tolerance: float) -> bool:
     """Whether anything ever passes, where every part is beyond the tolerance: who sees the levels tries one by one."""
-    for level in reversed(rule.evidence.levels):
+    for level in reversed(rule.evidence.levels[0]):
         for _ in range(60):
             rule.tell(level, 1.0, bool(rng.random() >= 1.02 * tolerance))
             if rule.action(level, 1.0) == ACCEPT:
@@ -115,8 +116,8 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
     def each_level_by_itself(self: Evidence, side: int) -> None:
         ask(self, side)
         aim = int(self.aim[side])
-        if self.shown(self.told[side, 1, 1 + aim].flatten().tolist()):
-            self.open[side].fill_(self.levels[aim])
+        if self.shown(side, self.told[side, 1, 1 + aim].flatten().tolist()):
+            self.open[side].fill_(self.levels[side][aim])
 
     ask, honest = Evidence.ask, false_claims()
     assert stats.binomtest(honest, 40, 0.2, alternative="greater").pvalue > 1e-3
@@ -131,6 +132,60 @@ def test_a_level_that_its_members_contradict_stays_shut_below_the_ones_that_hold
     tell(rule, 0.7, *[False, True, True, True, True] * 20)
     assert rule.action(0.9, 1.0) == ACCEPT
     assert rule.action(0.7, 1.0) == VERIFY
+
+
+def priced(rate: float = 1.0) -> PricedRule:
+    return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), rate)
+
+
+@pytest.mark.parametrize("share_bad", [0.02, 0.06, 0.3])
+def test_by_costs_a_part_passes_only_while_the_members_had_cost_at_most_one_escape_beyond_their_checks(share_bad) -> None:
+    for seed in range(20):
+        rule, rng, cost, passed = priced(), np.random.default_rng(seed), 0.0, 0
+        for _ in range(400):
+            if rule.action(1.0, 1.0) == ACCEPT:
+                passed += 1
+                assert cost <= 120 + 1e-6
+            good = bool(rng.random() >= share_bad)
+            rule.tell(1.0, 1.0, good)
+            cost += 0 if good else 120
+            cost -= 5
+        assert passed > 0
+
+
+def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() -> None:
+    rule = priced()
+    tell(rule, 1.0, *[True] * 100)
+    tell(rule, 0.0, *[False] * 100, upper=0.0)
+    assert [rule.action(1 - p, 1.0) for p in (0.041, 0.043)] == [ACCEPT, VERIFY]
+    assert [rule.action(0.0, p) for p in (0.105, 0.106)] == [REJECT, VERIFY]
+
+
+def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> None:
+    rule = priced(rate=0.1)
+    tell(rule, 1.0, *[True] * 30)
+    rule.tell(1.0, 1.0, False, predicted=1, looked=0.0)
+    assert rule.action(1.0, 1.0) == ACCEPT
+    rule.tell(1.0, 1.0, False, predicted=1, looked=0.1)  # ten escapes
+    assert rule.action(1.0, 1.0) == VERIFY
+
+
+def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_that_it_pays() -> None:
+    rule = priced()
+    tell(rule, 1.0, *[True] * 400, *[False] * 12)
+    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (1, VERIFY)
+    assert (400 + 12) * 5 > 12 * 120  # by the account alone it could go on
+    n = 0
+    while rule.action(1.0, 1.0) == VERIFY:
+        tell(rule, 1.0, True)
+        n += 1
+    assert n >= enough(0.1, 5 / 120)
+
+
+@pytest.mark.parametrize("prices", [(5, 120), (0, 120, 47.5), (5, 9, 47.5), (5, 120, math.inf), ("5", 120, 47.5), 5])
+def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object) -> None:
+    with pytest.raises(SettingError, match="prices of a check, an escape and a false reject, errors above two checks"):
+        Policy(prices=prices)
 
 
 def test_a_part_that_both_sides_claim_is_verified() -> None:
@@ -208,9 +263,10 @@ def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
     assert many.safe_mode() == 0
 
 
-@pytest.mark.parametrize("kind", [DecisionRule, PooledRule, WatchedRule])
-def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(kind: type[DecisionRule]) -> None:
-    eager, scripted = kind(0.1, 0.9), script(kind(0.1, 0.9))
+@pytest.mark.parametrize(("guarantee", "stops"), [("local", "some"), ("local", "all"), ("pooled", "all"), ("cost", "all")])
+def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, stops: str) -> None:
+    policy = Policy(0.1, 0.9, guarantee=guarantee, stops=stops)
+    eager, scripted = policy.rule(), script(policy.rule())
     rng = np.random.default_rng(2)
     for _ in range(400):
         lower = float(rng.random())

@@ -17,12 +17,12 @@ from typing import Any
 
 from .certificate import PROPENSITIES, STREAMS
 from .pieces import Piece, finish
-from .replays import noise_cases, planted_cases
+from .replays import noise_cases, planted_cases, priced_cases
 from .report import write_report
 
 QUICK = ("conv", "pca", "rocket")
-CASES = {"planted": planted_cases, "noise": noise_cases}
-PARTS = ("null", "certificate", "planted", "noise", "garbage")
+CASES = {"planted": planted_cases, "cost": priced_cases, "noise": noise_cases}
+PARTS = ("null", "certificate", "planted", "cost", "noise", "garbage")
 
 
 def pieces_of(part: str, repeats: int) -> list[Piece]:

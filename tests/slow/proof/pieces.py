@@ -20,7 +20,7 @@ import dengine
 
 from .certificate import ever_wrong
 from .garbage import garbage
-from .replays import judge
+from .replays import judge, spend
 
 Row = dict[str, Any]
 BESIDE = ("cli", "export", "store", "figures", "tables")  # sources that decide nothing here
@@ -44,6 +44,7 @@ FUNCTIONS: dict[str, Callable[..., Row | list[Row]]] = {
     "null": null,
     "noise": judge,
     "planted": judge,
+    "cost": spend,
     "certificate": certified,
     "garbage": garbage,
 }

@@ -21,6 +21,7 @@ from .truths import planted
 
 Row = dict[str, Any]
 POLICY = ("alpha", "lower_bound", "interval", "guarantee", "stops", "audit_rate", "label_within")
+LOOKS = 25  # parts between two certificates
 FEW = 30  # accepted parts: a mean over fewer is not looked at
 SIDES = {"accepted": Action.ACCEPT, "rejected": Action.REJECT}
 WHEN = ("ever", "end")
@@ -134,6 +135,31 @@ def judge(seed: int, case: Case) -> Row:
     }
 
 
+def spend(seed: int, case: Case) -> Row:
+    """Under prices: the members' account in escapes, the most at which a part passed, and what the certificate said.
+
+    saved : at the end what not checking the accepted saved less what they cost, by their true probabilities of failure.
+    bound : what the certificate said of it then.  untrue : whether it ever said more.
+    """
+    stream, policy = planted(case.truth, case.cycles, case.lower_bound, seed, case.rate, case.order), case.recipe.policy
+    (check, escape, _), accepted = policy.prices, Mean()
+    account, most, bound, untrue = 0.0, float("nan"), 0.0, False
+    with DataEngine.from_recipe(case.recipe, seed=seed, replaying=True) as engine:
+        for i, (x, y, p) in enumerate(zip(stream.data.X, stream.data.y, stream.p, strict=True)):
+            decision, before = engine.decide(x), _members(engine, 0)
+            if decision.action is Action.ACCEPT:
+                most = float(np.fmax(most, account))
+            accepted.add(1.0 - p, decision.action is Action.ACCEPT)
+            if decision.action is not Action.REJECT:
+                engine.report(decision.id, bool(y))
+            account += (_members(engine, 0) > before) * (1.0 - y - policy.tolerances[0])
+            if i % LOOKS == LOOKS - 1:
+                bound = engine.certificate().saved or 0.0
+                untrue |= bound > check * accepted.n - escape * accepted.sum
+    saved = check * accepted.n - escape * accepted.sum
+    return {"accepted": accepted.n, "account": most, "saved": saved, "bound": bound, "untrue": untrue}
+
+
 def broken(rows: Iterable[Row], what: str, tolerance: float) -> int:
     """In how many replays a mean of `judge` exceeds the tolerance."""
     return sum(row[what] > tolerance + 1e-9 for row in rows)
@@ -162,6 +188,12 @@ def planted_cases() -> list[Case]:
     return [Case(truth, truth) for truth in (*HELD, *MOVING)] + [
         Case(f"{truth}, {name}", truth, **factor) for name, factor in FACTORS.items() for truth in ("soft", "trap")
     ]
+
+
+def priced_cases() -> list[Case]:
+    """Truths under the guarantee of costs."""
+    truths = ("soft", "trap", "edge", "mesa", "drifting", "jumping")
+    return [Case(truth, truth, share=0.2, guarantee="cost") for truth in truths]
 
 
 def noise_cases() -> list[Case]:

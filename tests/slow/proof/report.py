@@ -23,6 +23,12 @@ HEADS = {
         "claimed: of members at the end alone, of the parts that passed, at any moment from 30 on and at the end, of the "
         "local rule, and of rejects without audits. The interval is Clopper and Pearson's, 95 %.",
     ),
+    "cost": (
+        "Planted truths: what the cost guarantee spent",
+        "At 5 a check and 120 an escape. Account: the most that the members stood at when a part passed, in escapes beyond "
+        "their checks, over all replays; the rule allows 1. Saved: by accepted parts' true failure probabilities. Bound: "
+        "what the certificate said of it at the end. Broke: it ever said more.",
+    ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),
     "null": ("The null test", "Labels independent of the trace, four in five good: certain decisions of a replay."),
     "certificate": ("Certificate", "Streams of 2000 parts in which the bound, at any moment, was wrong; alpha 10 %."),
@@ -52,6 +58,13 @@ def replay_row(settings: Row, rows: list[Row]) -> Row:
     return out | {name: f"({k / n:.0%})" for name, k in shares.items()}
 
 
+def cost_row(settings: Row, rows: list[Row]) -> Row:
+    """One configuration under prices."""
+    out: Row = {"replays": len(rows)} | {name: _mean(row[name] for row in rows) for name in ("accepted", "saved", "bound")}
+    out["account"] = float(np.nanmax([row["account"] for row in rows]))
+    return out | share_row(sum(row["untrue"] for row in rows), len(rows), settings["case"].alpha)
+
+
 def null_row(settings: Row, rows: list[Row]) -> Row:
     """Each replay's, and their mean."""
     certain = [r["certain"] for r in rows]
@@ -72,6 +85,7 @@ def garbage_rows(settings: Row, rows: list[Row]) -> list[Row]:
 
 ROWS: dict[str, Callable[[Row, list[Row]], Any]] = {
     "planted": replay_row,
+    "cost": cost_row,
     "noise": replay_row,
     "null": null_row,
     "certificate": certificate_row,
