@@ -17,8 +17,8 @@ from dengine.decision.rule import (
     DecisionRule,
     Evidence,
     PooledRule,
-    WatchedRule,
     PricedRule,
+    WatchedRule,
     most_wrong,
     script,
 )
