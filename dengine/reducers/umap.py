@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..errors import SettingError
 from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class UmapReducer(Reducer):
     """umap-learn's UMAP, fitted on one thread where a random_state is given, so that a run repeats exactly.
 
@@ -24,20 +26,11 @@ class UmapReducer(Reducer):
 
     single_tolerance = 0.3
 
-    def __init__(
-        self,
-        *,
-        n_components: int = 2,
-        n_neighbors: int = 15,
-        min_dist: float = 0.1,
-        n_epochs: int | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.n_components = n_components
-        self.n_neighbors = n_neighbors
-        self.min_dist = min_dist
-        self.n_epochs = n_epochs
-        self.random_state = random_state
+    n_components: int = 2
+    n_neighbors: int = 15
+    min_dist: float = 0.1
+    n_epochs: int | None = None
+    random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for fewer than n_neighbors + 1 traces."""
