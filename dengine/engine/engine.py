@@ -30,7 +30,7 @@ from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
-from ..history.explain import Circumstances, Explanation, explain
+from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
@@ -630,9 +630,7 @@ class DataEngine:
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
-        now = self._settings.now
-        under = None if now.trace is None else Circumstances(now.recipe, now.trace, now.model, now.seed)
-        return explain(self.store, decision_id, neighbours, under)
+        return explain(self.store, decision_id, neighbours)
 
     def __enter__(self) -> Self:
         return self
