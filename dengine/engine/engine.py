@@ -584,7 +584,8 @@ class DataEngine:
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return self.policy.certificate(self.store.outcomes(self._settings.now.policy_since, self.policy.label_within))
+        policy, since = self.policy, self._settings.now.policy_since
+        return policy.certificate(self.store.tally(since_version=since, within=policy.label_within).outcomes)
 
     @property
     def new_labels(self) -> int:

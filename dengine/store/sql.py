@@ -14,7 +14,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import sqlalchemy as sa
@@ -52,7 +52,6 @@ from .records import (
     ModelVersion,
     NewLabel,
     News,
-    Outcomes,
     StoredDecision,
     StoredVersion,
     VersionError,
@@ -73,9 +72,6 @@ from .records import (
 )
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, RESERVED, SETTING, TRACE, VERSION, hold
 from .views import LABELS, HistoryFilter, Kind, PastLabel, Stretch, Tally
-
-if TYPE_CHECKING:
-    from .verification import HistoryReport
 
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
@@ -325,13 +321,6 @@ class SqlStore:
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
         return int(self._read(query.where(mine, since(LABEL, since_version)))[0][0])
-
-    def outcomes(self, since_version: int = 0, within: int | None = None) -> Outcomes:
-        """Count what became of what the model was certain of.
-
-        within : decisions after which an audit that was not reported is overdue; None: none is.
-        """
-        return self.tally(since_version=since_version, within=within).outcomes
 
     def status(self) -> dict[str, Any]:
         """Count decisions and labels, by what they are. Of retrains tells `versions`, of events `events`."""
@@ -590,12 +579,6 @@ class SqlStore:
         every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
         rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n)), **by))
         return [Stretch(*row) for row in rows]
-
-    def verify(self, expect: str | None = None) -> HistoryReport:
-        """Check this cell's history against its ledger. See `verify_history`."""
-        from .verification import verify_history
-
-        return verify_history(self.database.url.render_as_string(hide_password=False), self.cell_id, expect)
 
     # The one engine that owns the cell
 

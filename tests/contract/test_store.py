@@ -19,7 +19,18 @@ from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
 from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision
 from tests.support.plans import plans
-from tests.support.stores import decision, execute, label, labelled, put_decision, put_label, put_labels, report, trace
+from tests.support.stores import (
+    decision,
+    execute,
+    label,
+    labelled,
+    put_decision,
+    put_label,
+    put_labels,
+    report,
+    trace,
+    verified,
+)
 
 
 def put(store: SqlStore, name: str, seed: int = 0, content_hash: int = 7, quarantined: bool = False) -> np.ndarray:
@@ -99,7 +110,7 @@ def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> 
     found = store.labelled(limit)
     assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
     assert (store.last_version(), store.retrains()) == (None, [])
-    assert (store.unreported_accepts(), store.silent_total(), store.outcomes()) == ([], 0, Outcomes())
+    assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == ([], 0, Outcomes())
 
 
 def test_traces_of_two_shapes_are_an_error_that_names_both(store: SqlStore) -> None:
@@ -163,7 +174,7 @@ def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None
         put_decision(store, replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
         if success is not None:
             put_label(store, str(i), success, Source.AUDIT, 0, None)
-    assert store.outcomes() == Outcomes(
+    assert store.tally().outcomes == Outcomes(
         accepted=6,
         stops=2,
         confirmed=1,
@@ -270,7 +281,7 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         np.testing.assert_array_equal(store.last_version().state["w"], values)
         assert store.past_labels(0, 1)[0].point.tolist() == [0.5]
         assert store.get_decision("unreported") is not None
-        assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
+        assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes.accepted) == (["accepted"], 4, 1)
         assert store.get_decision("accepted").decision.part == "SN-1"
         assert [event.text for event in store.events()] == ["for the first time"]
         store.put_event("started", "again")
@@ -292,7 +303,7 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         put_decision(ours, decision("c"), trace(), 1, False)
         put_label(ours, "c", True, Source.VERIFICATION, 0, None, silent=3)
         assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
-        assert other.outcomes().accepted == 0
+        assert other.tally().outcomes.accepted == 0
         other.put_event("note", "other's")
         assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
         assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
@@ -317,8 +328,8 @@ def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_
         assert sorted(seqs) == list(range(1, 31))
         assert one.labelled().seq.tolist() == list(range(1, 31))
         assert [event.number for event in two.events()] == list(range(1, 31))
-        assert one.verify().ok  # one chain
-        assert one.verify().cells[0].rows == 120
+        assert verified(one).ok  # one chain
+        assert verified(one).cells[0].rows == 120
 
 
 def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:

@@ -21,6 +21,7 @@ from tests.conftest import DATABASES, insertion_like, url_of
 from tests.support.command_line import dengine, document, succeed
 from tests.support.driving import learn
 from tests.support.plans import plans
+from tests.support.stores import verified
 
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
@@ -211,7 +212,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fl
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
     assert second.new_labels == first.new_labels
-    found = [engine.store.verify() for engine in (first, second)]
+    found = [verified(engine.store) for engine in (first, second)]
     assert [report.faults for report in found] == [(), ()]
     assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
@@ -231,7 +232,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     evidence = [len(engine.store.evidence_since(0).seq) for engine in (first, second)]
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
-    assert first.store.outcomes() != second.store.outcomes()
+    assert first.store.tally().outcomes != second.store.tally().outcomes
     assert rule(second)["evidence.told"] != rule(fleet.engine("c", recipe=POOLED))["evidence.told"]
     assert second.store.get_decision("nobody") is None
 

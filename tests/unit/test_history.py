@@ -124,7 +124,6 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
         )
         assert {astuple(kind) for kind in found.kinds} == {(*kind, n) for kind, n in kinds.items()}
         assert (found.first, found.last) == (some[0].time, some[-1].time)
-    assert store.tally().outcomes == store.outcomes()
 
 
 def counted(some: list[StoredDecision]) -> Stretch:

@@ -111,11 +111,11 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
         put_labels(store, NewLabel(str(i), True, Source.AUDIT, 0, None))
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")
-    o = store.outcomes()
+    o = store.tally().outcomes
     assert (o.accepted, o.stops, o.confirmed, o.forgotten_accepts) == (2, 1, 0, 1)
     assert (o.audited_accepts, o.audited_accepts_bad, o.forgotten_audited_accepts) == (1, 1, 1)
     assert (o.audited_rejects, o.audited_rejects_good, o.forgotten_audited_rejects) == (1, 0, 1)
-    later = store.outcomes(since_version=1)
+    later = store.tally(since_version=1).outcomes
     assert (later.accepted, later.stops, later.forgotten_accepts, later.audited_accepts) == (1, 0, 1, 0)
 
 
