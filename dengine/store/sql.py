@@ -20,7 +20,7 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, shortened
+from ..errors import StoreError, listed, shortened
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
@@ -76,7 +76,6 @@ from .views import LABELS, HistoryFilter, Kind, PastLabel, Stretch, Tally
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
-NAMED = 20  # decisions that an event names
 
 
 class SqlStore:
@@ -279,8 +278,7 @@ class SqlStore:
     def _tell_of(self, damaged: Sequence[str], what: str) -> None:
         """Damage that was read is an event, once that transaction is over."""
         if damaged:
-            more = f" and {len(damaged) - NAMED} more" if len(damaged) > NAMED else ""
-            named = f"decision {', '.join(damaged[:NAMED])}{more}; see dengine verify"
+            named = f"decision {listed(damaged)}; see dengine verify"
             self._note("damaged", f"left out, since the {what} is not as it was stored: {named}")
 
     # What became of decisions
