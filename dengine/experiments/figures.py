@@ -21,9 +21,8 @@ from ..datasets import Dataset
 from ..errors import OutputError
 from ..files import write_output
 from ..history.explain import Bound, Explanation
-from ..recipe import Recipe
 from ..records import Action
-from ..reducers import reducer_class
+from ..reducers import has_own_unit
 from ..traces import as_traces
 from .costs import CostCurve
 from .replay import Replay
@@ -118,12 +117,6 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
-def is_probability(recipe: Recipe) -> bool:
-    """Whether the recipe's first axis is a predicted probability of success, which is never scaled."""
-    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
-    return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
-
-
 def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
     """Where the newest parts of a replay lie, by what they were and by what was decided; each retrain moves the map.
 
@@ -135,7 +128,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known, probability = np.isfinite(z).all(axis=1), is_probability(recipe)
+    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe)
     first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
     if probability:
         first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"

@@ -87,6 +87,12 @@ def reducer_of(recipe: Recipe, seed: int) -> Any:
     return make_reducer(recipe.reducer, **own | dict(recipe.params))
 
 
+def has_own_unit(recipe: Recipe) -> bool:
+    """Whether a recipe's embedding is never scaled, its first axis a predicted probability; see `Reducer.own_unit`."""
+    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
+    return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
+
+
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _NAMED}
 
 __getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs=_LAZY)
