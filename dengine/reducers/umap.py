@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -41,7 +43,7 @@ class UmapReducer(Reducer):
             )
         from umap import UMAP
 
-        with _Contained():
+        with _contained():
             self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
@@ -52,23 +54,21 @@ class UmapReducer(Reducer):
     def transform(self, X: ArrayLike) -> Floats:
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
-        with _Contained():
+        with _contained():
             return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
 
 
-class _Contained(warnings.catch_warnings):
+@contextmanager
+def _contained() -> Iterator[None]:
     """Keep umap-learn's warnings and its number of threads out of the process.
 
     Its first kernel makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others.
     """
-
-    def __enter__(self) -> None:
-        super().__enter__()
-        self.threads = torch.get_num_threads()
-        warnings.filterwarnings("ignore", module=r"umap\..*")
-        warnings.filterwarnings("ignore", module=r"sklearn\.manifold\..*")
-
-    def __exit__(self, *raised: Any) -> None:
-        super().__exit__(*raised)
-        if torch.get_num_threads() != self.threads:
-            torch.set_num_threads(self.threads)
+    threads = torch.get_num_threads()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(umap|sklearn\.manifold)\..*")
+        try:
+            yield
+        finally:
+            if torch.get_num_threads() != threads:
+                torch.set_num_threads(threads)
