@@ -1,7 +1,5 @@
 """Files: written whole or not at all and never over what is there; NumPy archives from anywhere, read safely."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -8,8 +8,6 @@ engine would use it: label-free in one space, label-using cross-fitted. Honest c
 `labels_of_a_fold_move_nothing_in_its_space`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,5 @@
 """What the engine drives: a cell that inserts, verifies, proceeds and rejects."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import numpy as np

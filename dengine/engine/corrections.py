@@ -7,8 +7,6 @@ Each is an event that is kept for ever. Nothing is overwritten: a correction is 
 again as a new one, and what was decided stays as it was decided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Reducers by name: trace -> embedding, each a scikit-learn transformer, interchangeable everywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from inspect import signature

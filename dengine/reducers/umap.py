@@ -1,7 +1,5 @@
 """UMAP, the paper's reducer: label-free, so one space serves every fold."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager

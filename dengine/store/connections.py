@@ -3,8 +3,6 @@
 A deleted file, a fork, and a row that the database refuses are each met here.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

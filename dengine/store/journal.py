@@ -6,8 +6,6 @@ records, and the newest entry of its ledger: a store that was cut off, or put ba
 small file beside it, its head, knows that entry too, for where the journal went with the store.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

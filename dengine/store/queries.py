@@ -1,7 +1,5 @@
 """Whose rows a query is about, a cell's own or those of all cells of its product, and what several queries are made of."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """What stores take and hand back: decisions, labels, traces, versions, events; and how a row holds each."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
