@@ -1,7 +1,5 @@
 """The process in which a served engine retrains, and what goes there and back."""
 
-from __future__ import annotations
-
 import copy
 import os
 import signal
