@@ -31,14 +31,16 @@ N, SAMPLES, FOLDS = 100, 120, 2
 SHAPES = ((1, 152), (1, 800), (3, 90))  # channels, samples
 
 
-def toy_traces(n: int = N, samples: int = SAMPLES, channels: int = 1, seed: int = 0) -> tuple[Floats, Ints]:
+def toy_traces(
+    n: int = N, samples: int = SAMPLES, channels: int = 1, seed: int = 0, failures: float = 0.2, noise: float = 0.5
+) -> tuple[Floats, Ints]:
     """Traces (n, C, T) of two shapes with noise, and labels (n,): a success bottoms late, a failure meets the rim early."""
     rng = np.random.default_rng(seed)
-    y = (rng.random(n) >= 0.2).astype(np.int64)
+    y = (rng.random(n) >= failures).astype(np.int64)
     t = np.linspace(0.0, 1.0, samples)[None, None, :]
     onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
     height = rng.normal(20.0, 2.0, (n, channels, 1))
-    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, 0.5, (n, channels, samples))
+    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, noise, (n, channels, samples))
     return X.astype(np.float32), y
 
 
