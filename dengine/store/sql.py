@@ -283,21 +283,19 @@ class SqlStore:
 
     # What became of decisions
 
-    def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
-        """Of this cell alone.
+    def evidence_since(self, seq: int, since_version: int = 0) -> list[Evidence]:
+        """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
         label = counted()
         novel = DECISION.c.reason == Reason.NOVEL.value
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label, novel, LABEL.c.silent, *how_looked())
+        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
         query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
-        columns = zip(*self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq)), strict=True)
-        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64, np.int64, np.float64)
-        arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
-        return Evidence(*arrays)
+        rows = self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq))
+        return [Evidence(*row) for row in rows]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""

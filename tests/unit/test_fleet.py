@@ -229,7 +229,7 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(120))
     learn(second, parts, range(120, 160))
-    evidence = [len(engine.store.evidence_since(0).seq) for engine in (first, second)]
+    evidence = [len(engine.store.evidence_since(0)) for engine in (first, second)]
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
     assert first.store.tally().outcomes != second.store.tally().outcomes

@@ -99,10 +99,8 @@ def test_a_journal_brings_bounds_parts_and_sources(data: Dataset, make_data, tmp
         if stops == "some":  # of the second nothing is known
             lower, success, hashes = (values[:1] + values[2:] for values in (lower, success, hashes))
             silent = [0, 1, 0, 0, 0]
-        assert known.lower.tolist() == lower
-        assert known.success.tolist() == success
-        assert known.silent.tolist() == silent
-        assert known.novel.tolist() == [False] * (n - 1) + [True]
+        told = [(each.lower, each.success, each.silent, each.novel) for each in known]
+        assert told == list(zip(lower, success, silent, [False] * (n - 1) + [True], strict=True))
         assert last.hashes.tolist() == hashes
         assert (outcomes.stops, outcomes.audited_accepts, outcomes.audited_accepts_bad) == (1, 1, 1)
         assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
@@ -120,7 +118,7 @@ def test_a_journal_that_grew_adds_what_is_new(data: Dataset, make_data, tmp_path
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:
             known = engine.store.evidence_since(200)
-            found[len(cuts)] = (known.lower.tolist(), known.silent.tolist(), engine.store.tally().outcomes)
+            found[len(cuts)] = ([(each.lower, each.silent) for each in known], engine.store.tally().outcomes)
             engine.decide(X[0])
             engine.report(engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True)  # silence adds up: no StoreError
     assert found[1] == found[3] == found[7]
