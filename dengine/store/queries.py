@@ -127,11 +127,6 @@ def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("looked")
 
 
-def since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
-    """Rows by model versions from this one on."""
-    return sa.true() if version <= 0 else table.c.model_version >= int(version)
-
-
 SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten
 
 

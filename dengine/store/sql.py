@@ -36,7 +36,6 @@ from .queries import (
     how_looked,
     n_decisions,
     past_query,
-    since,
     stretches_query,
     training_query,
 )
@@ -294,7 +293,7 @@ class SqlStore:
         of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
         query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
-        rows = self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq))
+        rows = self._read(query.where(DECISION.c.model_version >= since_version).order_by(LABEL.c.seq))
         return [Evidence(*row) for row in rows]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
@@ -310,13 +309,13 @@ class SqlStore:
     def _unheard_of(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
         query = sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false())
-        return query.where(since(DECISION, since_version)).order_by(DECISION.c.number)
+        return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(self._read(query.where(mine, since(LABEL, since_version)))[0][0])
+        return int(self._read(query.where(mine, LABEL.c.model_version >= since_version))[0][0])
 
     def status(self) -> dict[str, Any]:
         """Count decisions and labels, by what they are. Of retrains tells `versions`, of events `events`."""
@@ -561,7 +560,7 @@ class SqlStore:
         kind = (*columns, aged, SAID.label("success"), LABEL.c.source, sa.func.count().label("n"))
         times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
         query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, LABEL.c.source)
-        query = query.where(DECISION.c.cell_id == self.cell_id, since(DECISION, since_version))
+        query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
