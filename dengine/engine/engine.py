@@ -16,7 +16,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from signal import SIGINT
 from types import FrameType
@@ -149,7 +149,7 @@ class Alone:
             self._used.release()
 
 
-class DataEngine:
+class DataEngine(AbstractContextManager["DataEngine"]):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -632,9 +632,6 @@ class DataEngine:
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
         return explain(self.store, decision_id, neighbours)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()

@@ -14,7 +14,8 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -77,7 +78,7 @@ WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for al
 MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
 
 
-class SqlStore:
+class SqlStore(AbstractContextManager["SqlStore"]):
     """What an engine needs of its memory, in a database. Everything belongs to one cell.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for replays and trials.
@@ -629,9 +630,6 @@ class SqlStore:
             self.database.close()
         if self._journal is not None:
             self._journal.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
