@@ -308,12 +308,10 @@ class FeatureReducer(Reducer):
         """The features of traces (C, T)."""
         raise NotImplementedError
 
-    def fit(
-        self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None, stop: StopRule | None = None
-    ) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit afresh.
 
-        folds : (n,) permanent folds; None: by content.  stop : asked before each step; None: until done.
+        folds : (n,) permanent folds; None: by content.
         Raises SettingError where a setting is out of range, or a head would see one class alone.
         """
         traces = self.check_traces(X, reset=True)
@@ -322,7 +320,7 @@ class FeatureReducer(Reducer):
         within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
         expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         self._start(traces)
-        self._fit_heads(self.raw_features(traces), labels, folds, stop)
+        self._fit_heads(self.raw_features(traces), labels, folds)
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
@@ -367,7 +365,7 @@ class FeatureReducer(Reducer):
         self._raw = torch.empty(0, len(features.gain))
 
     def _fit_heads(
-        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None, numbers: Ints | None = None
+        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None
     ) -> None:
         """Train head k on rows outside fold k of the features (n, P), from the present weights."""
         with torch.no_grad():

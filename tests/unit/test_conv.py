@@ -97,7 +97,8 @@ def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_th
 def test_no_step_begins_after_the_deadline():
     X, y = traces()
     ticks = iter(range(1000))
-    reducer = ConvReducer().fit(X, y, stop=StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
+    reducer = ConvReducer()
+    reducer.train(X, y, content_fold(X, 5), StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
     assert reducer.n_iter_ == 5
     before = reducer.embed(X)
     reducer.train(X, y, content_fold(X, 5), stop := StopRule(deadline=-1.0, clock=lambda: 0.0))
@@ -108,7 +109,8 @@ def test_no_step_begins_after_the_deadline():
 
 def test_a_first_model_that_comes_too_late_has_learned_something_all_the_same():
     X, y = traces()
-    late = ConvReducer().fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
+    late = ConvReducer()
+    late.train(X, y, content_fold(X, 5), StopRule(deadline=-1.0, clock=lambda: 0.0))
     assert late.n_iter_ == FIRST_STEPS
     apart = late.embed(X)[..., 0].mean(1)
     assert apart[y == 1].mean() > apart[y == 0].mean() + 0.5
