@@ -316,7 +316,6 @@ def sqlite_file(url: Any) -> Path:
 
 
 def head_path(journal: Path) -> Path:
-    """Where a journal's head lies."""
     return journal.with_name(f"{journal.name}.head")
 
 

@@ -60,7 +60,6 @@ class Scope:
 
 
 def cells_of(product: str) -> sa.Select[Any]:
-    """The cells of a product."""
     return sa.select(SETTING.c.cell_id).where(SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product)
 
 

@@ -340,12 +340,10 @@ def _read(value: Any, kind: type) -> Any:
 
 
 def decision_row(item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `decision`."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
 def trace_row(item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `trace`."""
     channels, samples = item.trace.shape
     return {"decision_id": item.decision.id, "channels": channels, "samples": samples, "data": pack(item.trace)}
 

@@ -108,7 +108,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
-        """Open or create the store."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
