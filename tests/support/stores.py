@@ -8,7 +8,6 @@ import numpy as np
 
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store import NewLabel, SqlStore, StoredDecision
-from dengine.store.verification import HistoryReport, verify_history
 
 
 def decision(name: str, action: Action = Action.VERIFY, reason: Reason = Reason.UNCERTAIN, version: int = 0) -> Decision:
@@ -32,10 +31,6 @@ def execute(file: Path, *statements: str) -> None:
     with sqlite3.connect(file) as connection:
         for statement in statements:
             connection.execute(statement)
-
-
-def verified(store: SqlStore) -> HistoryReport:
-    return verify_history(store.database.url.render_as_string(hide_password=False), store.cell_id)
 
 
 def put_decision(

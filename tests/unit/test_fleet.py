@@ -15,13 +15,13 @@ from sklearn.decomposition import PCA
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
+from dengine.store import verify_history
 from dengine.store.peers import list_cells
 from dengine.store.records import address
 from tests.conftest import DATABASES, insertion_like, url_of
 from tests.support.command_line import dengine, document, succeed
 from tests.support.driving import learn
 from tests.support.plans import plans
-from tests.support.stores import verified
 
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
@@ -212,7 +212,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fl
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
     assert second.new_labels == first.new_labels
-    found = [verified(engine.store) for engine in (first, second)]
+    found = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in found] == [(), ()]
     assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
