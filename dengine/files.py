@@ -1,7 +1,5 @@
 """Files: written whole or not at all and never over what is there; NumPy archives from anywhere, read safely."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -44,12 +42,12 @@ def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
     return secret
 
 
-def must_fit(size: float, what: object, limit: int | None = None) -> None:
-    """DataError for more bytes of arrays than `limit`; None: 8 GB, or half of the machine's memory where that is less."""
-    most = MOST if limit is None else limit
+def must_fit(size: float, what: object) -> None:
+    """DataError for more bytes of arrays than `MOST`, or than half of the machine's memory where that is less."""
+    most = MOST
     with suppress(AttributeError, ValueError, OSError):  # of a system that does not tell
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        most = min(MOST, memory // 2) if limit is None and memory > 0 else most
+        most = min(MOST, memory // 2) if memory > 0 else MOST
     if size > most:
         raise DataError(
             f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; split it, or read it where there is "
@@ -81,16 +79,11 @@ def _size(n_bytes: float) -> str:
 
 
 def read_archive(
-    source: str | os.PathLike[str] | bytes,
-    names: Collection[str] | None = None,
-    *,
-    name: str = "",
-    limit: int | None = None,
+    source: str | os.PathLike[str] | bytes, names: Collection[str] | None = None, *, name: str = ""
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The arrays of an .npz by name, and the names of all that it holds.
 
     source : a file, or its content.  names : of the arrays that are wanted; None: all.  name : for errors.
-    limit : bytes that the wanted arrays may take together; None: as `must_fit`.
     DataError for what is no archive, is damaged, holds Python objects, or claims too much: nothing is unpacked then.
     """
     called = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
@@ -100,7 +93,7 @@ def read_archive(
             raise ValueError("it is a single array")
         members = {each.filename.removesuffix(".npy"): each.file_size for each in archive.zip.infolist()}
         wanted = [key for key in members if names is None or key in names]
-        must_fit(sum(members[key] for key in wanted), called, limit)
+        must_fit(sum(members[key] for key in wanted), called)
         return {key: np.asarray(archive[key]) for key in wanted}, list(members)
 
 

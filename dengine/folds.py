@@ -6,8 +6,6 @@ that a controller that knows only the samples computes the same. The content's h
 arithmetic is 64-bit integers that wrap around, the same in NumPy, TorchScript and C++.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

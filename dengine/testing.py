@@ -8,8 +8,6 @@ engine would use it: label-free in one space, label-using cross-fitted. Honest c
 `labels_of_a_fold_move_nothing_in_its_space`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,20 +25,22 @@ from .decision.rule import script
 from .engine.engine import DataEngine
 from .folds import content_fold
 from .recipe import Recipe
-from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer, uses_labels
+from .reducers.base import Floats, Ints, Reducer, as_reducer, uses_labels
 
 N, SAMPLES, FOLDS = 100, 120, 2
 SHAPES = ((1, 152), (1, 800), (3, 90))  # channels, samples
 
 
-def toy_traces(n: int = N, samples: int = SAMPLES, channels: int = 1, seed: int = 0) -> tuple[Floats, Ints]:
+def toy_traces(
+    n: int = N, samples: int = SAMPLES, channels: int = 1, seed: int = 0, failures: float = 0.2, noise: float = 0.5
+) -> tuple[Floats, Ints]:
     """Traces (n, C, T) of two shapes with noise, and labels (n,): a success bottoms late, a failure meets the rim early."""
     rng = np.random.default_rng(seed)
-    y = (rng.random(n) >= 0.2).astype(np.int64)
+    y = (rng.random(n) >= failures).astype(np.int64)
     t = np.linspace(0.0, 1.0, samples)[None, None, :]
     onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
     height = rng.normal(20.0, 2.0, (n, channels, 1))
-    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, 0.5, (n, channels, samples))
+    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, noise, (n, channels, samples))
     return X.astype(np.float32), y
 
 
@@ -201,7 +201,7 @@ def _trained(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reduce
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)
     for _ in range(times):
-        trained.train(X, y if labels is None else labels, content_fold(X, trained.n_spaces), StopRule(max_steps=8))
+        trained.train(X, y if labels is None else labels, content_fold(X, trained.n_spaces))
     return trained
 
 

@@ -15,12 +15,12 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[1]
 os.environ.setdefault("NUMBA_CACHE_DIR", str(REPO / "build" / "numba"))  # before umap: what it compiled is kept
 
-import numpy as np
 import pytest
 import torch
 
 from dengine import Dataset, SqlStore
 from dengine.export import export_sources
+from dengine.testing import toy_traces
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
@@ -62,15 +62,9 @@ def pytest_xdist_node_collection_finished(node, ids: list[str]) -> None:
 def insertion_like(
     n: int = 200, samples: int = 100, channels: int = 1, *, seed: int = 0, failures: float = 0.2, noise: float = 0.5
 ) -> Dataset:
-    """n traces of two shapes: a success bottoms late, a failure meets the rim early and stays on a plateau (newtons)."""
-    rng = np.random.default_rng(seed)
-    y = (rng.random(n) >= failures).astype(np.int8)
-    t = np.linspace(0.0, 1.0, samples)[None, None, :]
-    onset = np.where(y == 1, 0.7, 0.35)[:, None, None] + rng.normal(0.0, 0.03, (n, 1, 1))
-    height = rng.normal(20.0, 2.0, (n, channels, 1))
-    X = height / (1.0 + np.exp(-40.0 * (t - onset))) + rng.normal(0.0, noise, (n, channels, samples))
-    X = X.astype(np.float32)
-    return Dataset(X[:, 0] if channels == 1 else X, y, name="insertion-like")
+    """n traces as `toy_traces` has them: a failure that met the rim early stays on a plateau (newtons)."""
+    X, y = toy_traces(n, samples, channels, seed, failures, noise)
+    return Dataset(X[:, 0] if channels == 1 else X, y.astype("int8"), name="insertion-like")
 
 
 @pytest.fixture(scope="session")

@@ -6,8 +6,6 @@ Each round runs both revisions, one after the other, each in a process of its ow
 the worst of each quantity on both sides, and the median ratio, round by round.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -5,8 +5,6 @@
 Run it on an idle machine. Prints a table with the median and the worst case of each quantity, and writes it to --out.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ parity over every trace of the data set and random ones, bad ones and audits amo
 decision differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

@@ -15,8 +15,6 @@ each, and the versions that are kept.
 is for the user who runs the server, or root.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import shlex

@@ -8,8 +8,6 @@ whole `engine.retrain()`: from taking the data until the new version is committe
 against the budget of 0.45 s too (`RetrainReport.seconds` ends where the version answers).
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

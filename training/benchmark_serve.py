@@ -8,8 +8,6 @@ time. --folder is where the stores are: a decision under a caller's own id is on
 disk counts. What kills take back, `python -m tests.slow.faults` counts.
 """
 
-from __future__ import annotations
-
 import http.client
 import json
 import os

@@ -1,7 +1,5 @@
 """What several scripts have: options, a stopwatch, a table on the screen and as CSV."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

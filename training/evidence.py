@@ -12,8 +12,6 @@ Recorded sets are shuffled by the seed; of a made one each seed draws new parts,
 the same parts in the same order: differences are paired, to conv's replay of the same seed, with Student's interval.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

@@ -3,8 +3,6 @@
 python training/make_insertion.py --out dengine/data
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import time

@@ -13,8 +13,6 @@ cut, and one whose force has another name. The same seed writes the same files.
 their labels apart; a historian's long Parquet; a wide CSV of two channels; a ROS 2 bag; and .npz by other names.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path

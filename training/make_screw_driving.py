@@ -8,8 +8,6 @@ repeat their last value. `y` is the controller's result, 1 for OK. Source: West 
 Copyright (c) 2023 Nikolai West.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections import Counter

@@ -8,8 +8,6 @@ successes among the radius neighbours in all K spaces, (n_s + 1) / (n_s + n_f + 
 trace. Writes learning.csv, a row an amount of labels, and model.ts with its checksum.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

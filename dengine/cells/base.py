@@ -1,7 +1,5 @@
 """What the engine drives: a cell that inserts, verifies, proceeds and rejects."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -16,16 +14,12 @@ class Cell(Protocol):
 
     def insert(self) -> NDArray[np.floating]:
         """Pick a part, insert it, return the recorded trace: (T,) or (channels, T)."""
-        ...
 
     def verify(self) -> bool:
         """Run the expensive verification of what was just inserted: True for a success."""
-        ...
 
     def proceed(self) -> Outcome:
         """Go on without the verification; say what became of the part, where that is known."""
-        ...
 
     def reject(self) -> None:
         """Send the part back to the bin."""
-        ...

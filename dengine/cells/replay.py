@@ -1,7 +1,5 @@
 """A recorded data set, driven as if it were a cell."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -7,8 +7,6 @@ Each is an event that is kept for ever. Nothing is overwritten: a correction is 
 again as a new one, and what was decided stays as it was decided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -18,7 +16,7 @@ import numpy as np
 from ..decision.intervals import SORTED
 from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
-from ..errors import ReportError, SettingError
+from ..errors import ReportError, SettingError, listed
 from ..records import as_success
 from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
@@ -85,8 +83,8 @@ class Corrections:
         known = self._to_correct(list(dict.fromkeys(decision_ids)))
         was = {each.decision.id: each.success for each in known if each.success is not None}
         if not was:
-            return self._unchanged("forget", f"{_listed([each.decision.id for each in known])} forgotten already")
-        text = f"{_listed(list(was))} forgotten" + (f": {reason}" if reason else "")
+            return self._unchanged("forget", f"{_labels([each.decision.id for each in known])} forgotten already")
+        text = f"{_labels(list(was))} forgotten" + (f": {reason}" if reason else "")
         data = {"decisions": {id_: {"was": label, "now": None} for id_, label in was.items()}, "reason": reason}
         return self._correct(Change("forget", text, data, author, tuple(was), None))
 
@@ -195,6 +193,5 @@ def _sentence(text: str) -> str:
     return text[0].upper() + text[1:]
 
 
-def _listed(ids: Sequence[str], most: int = 5) -> str:
-    shown = ", ".join(ids[:most]) + (f" and {len(ids) - most} more" if len(ids) > most else "")
-    return f"the labels of {shown} are" if len(ids) > 1 else f"the label of {shown} is"
+def _labels(ids: Sequence[str]) -> str:
+    return f"the labels of {listed(ids)} are" if len(ids) > 1 else f"the label of {ids[0]} is"

@@ -1,7 +1,5 @@
 """From one trace to a recorded decision: the gate, the model, the audits' coin; and what a report on it means."""
 
-from __future__ import annotations
-
 import logging
 import uuid
 from collections.abc import Callable

@@ -16,7 +16,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from signal import SIGINT
 from types import FrameType
@@ -30,7 +30,7 @@ from ..cells.base import Cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
-from ..history.explain import Circumstances, Explanation, explain
+from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Exportable, Model
 from ..recipe import Recipe
@@ -64,7 +64,7 @@ from .settings import (
     peers_trace,
     refuse_idle,
 )
-from .trainer import Clock, Limits, Retrainer, Window
+from .trainer import Clock, Retrainer, Window
 from .versions import ModelVersions
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class Alone:
             self._used.release()
 
 
-class DataEngine:
+class DataEngine(AbstractContextManager["DataEngine"]):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
     reducer : a name in `REDUCERS`, `module:Class`, or a scikit-learn transformer; None: the recipe's, or conv.
@@ -215,8 +215,8 @@ class DataEngine:
         reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
-        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
+        budget = None if replaying else settings.recipe.budget
+        retrainer = Retrainer(Window(settings.recipe.window), budget, executor, clock)
         self._outbox = Outbox(store, settings.recipe.window, not reading, replaying)
         weakref.finalize(self, _close, self._outbox)  # of a program that forgot to
         self._alone = Alone()
@@ -584,7 +584,8 @@ class DataEngine:
     def certificate(self) -> Certificate:
         """What can be said by now, at level 1 - alpha, of what was decided without a check under the policy in force."""
         self.flush()
-        return self.policy.certificate(self.store.outcomes(self._settings.now.policy_since, self.policy.label_within))
+        policy, since = self.policy, self._settings.now.policy_since
+        return policy.certificate(self.store.tally(since_version=since, within=policy.label_within).outcomes)
 
     @property
     def new_labels(self) -> int:
@@ -630,12 +631,7 @@ class DataEngine:
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
         """Why a decision came out as it did, with the `neighbours` nearest references; ReportError for an unknown id."""
-        now = self._settings.now
-        under = None if now.trace is None else Circumstances(now.recipe, now.trace, now.model, now.seed)
-        return explain(self.store, decision_id, neighbours, under)
-
-    def __enter__(self) -> Self:
-        return self
+        return explain(self.store, decision_id, neighbours)
 
     def __exit__(self, *exception: object) -> None:
         self.close()

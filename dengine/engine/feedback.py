@@ -6,8 +6,6 @@ retrain, or when 100 wait. A stop that comes later takes that back, in the store
 as unobserved, which is no success.
 """
 
-from __future__ import annotations
-
 import logging
 from collections import OrderedDict
 from collections.abc import Callable

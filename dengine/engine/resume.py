@@ -92,18 +92,16 @@ def change(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     return True
 
 
-def tell_all(model: EngineModel, known: Callable[[], Evidence], evidence: EvidenceWindow) -> None:
+def tell_all(model: EngineModel, known: Callable[[], list[Evidence]], evidence: EvidenceWindow) -> None:
     """Reset a model's rule and replay its evidence."""
     model.forget()
     model.begin_safely_in(evidence.began_in)
     tell(model, known)
 
 
-def tell(model: EngineModel, asked: Callable[[], Evidence]) -> None:
+def tell(model: EngineModel, asked: Callable[[], list[Evidence]]) -> None:
     """Tell a model's rule what became of parts, in the order of their labels; one that learns nothing asks for nothing."""
     if not model.remembers:
         return
-    known = asked()
-    columns = (known.lower, known.upper, known.success, known.novel, known.silent, known.predicted, known.looked)
-    for row in zip(*(column.tolist() for column in columns), strict=True):
-        model.tell_safely(*row)
+    for each in asked():
+        model.tell_safely(each.lower, each.upper, each.success, each.novel, each.silent, each.predicted, each.looked)

@@ -157,7 +157,7 @@ class ModelVersions:
         if self.fleet is not None:
             self.fleet.resume()
 
-    def _evidence(self, after: int = 0) -> Evidence:
+    def _evidence(self, after: int = 0) -> list[Evidence]:
         """What the rule is told of labels after that number, which are held to the ledger."""
         self.outbox.hold_to_ledger(after)
         return self.store.evidence_since(after, self.evidence.since)

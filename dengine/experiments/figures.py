@@ -21,9 +21,8 @@ from ..datasets import Dataset
 from ..errors import OutputError
 from ..files import write_output
 from ..history.explain import Bound, Explanation
-from ..recipe import Recipe
 from ..records import Action
-from ..reducers import reducer_class
+from ..reducers import has_own_unit
 from ..traces import as_traces
 from .costs import CostCurve
 from .replay import Replay
@@ -76,11 +75,6 @@ def fitting(window: int, replays: Sequence[Replay]) -> int:
     return min(window, max(1, max(map(len, replays)) // 3))
 
 
-def numbers(n: int) -> NDArray[np.int64]:
-    """(n,) of cycles, counted from 1."""
-    return np.arange(1, n + 1)
-
-
 def blank(width: float, height: float, title: str = "") -> Figure:
     """An empty figure, inches."""
     from matplotlib.figure import Figure
@@ -118,12 +112,6 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
-def is_probability(recipe: Recipe) -> bool:
-    """Whether the recipe's first axis is a predicted probability of success, which is never scaled."""
-    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
-    return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
-
-
 def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
     """Where the newest parts of a replay lie, by what they were and by what was decided; each retrain moves the map.
 
@@ -135,7 +123,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     positions = replay.position[-last:]
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]  # zeros where a reducer has but one dimension
-    known, probability = np.isfinite(z).all(axis=1), is_probability(recipe)
+    known, probability = np.isfinite(z).all(axis=1), has_own_unit(recipe)
     first, second = (f"embedding {i} [root mean square radius = 1]" for i in (1, 2))
     if probability:
         first, second = "predicted probability of success", "embedding 2 [for the eye, small against the radius]"
@@ -221,7 +209,7 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: i
 def _draw_replays(top: Axes, bottom: Axes, replays: Sequence[Replay], window: int, colour: str, lead: str = "") -> None:
     """Above the certain share with its spread, and the precision; below the errors, with their counts in the legend."""
     lines, counts = window_curves(replays, window, FEWEST), [each.stretch() for each in replays]
-    x = numbers(len(lines["certain"]))
+    x = np.arange(1, len(lines["certain"]) + 1)  # cycles are counted from 1
     top.fill_between(x, lines["certain_low"], lines["certain_high"], color=colour, alpha=0.15, linewidth=0)
     top.plot(x, lines["certain"], color=colour, label=f"{lead}certain, of all cycles")
     top.plot(x, lines["precision"], color=colour, linestyle="--", label=f"{lead}precision, of accepted")
@@ -270,7 +258,7 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
 
 def run_picture(log: Replay, title: str = "", window: int = 100) -> Figure:
     """A live run: verified share, errors so far and, with a clock, parts an hour."""
-    window, x, timed = fitting(window, [log]), numbers(len(log)), log.clock_s is not None
+    window, x, timed = fitting(window, [log]), np.arange(1, len(log) + 1), log.clock_s is not None
     figure = blank(9.0, 8.5 if timed else 6.0, title)
     axes = figure.subplots(3 if timed else 2, 1, sharex=True)
     axes[0].plot(x, 100 * sliding_mean(log.verified, window), color=VERIFIED)
@@ -434,7 +422,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
                 axes.plot(time_s, median, line, color=colour, linewidth=1.2, label=f"{name} ({len(some)})")
         finish(axes, legend=3 if shown.any() and not i else 0, xlabel="time [s]", ylabel=f"{names[i]}{unit}")
     share, level = below.subplots(2, 1, sharex=True)
-    window, x = max(1, len(y) // 10), numbers(len(y))
+    window, x = max(1, len(y) // 10), np.arange(1, len(y) + 1)
     full = x >= window  # a share of the first few jumps
     share.plot(x[full], 100 * sliding_mean(y, window)[full], color=VERIFIED, label=f"good, of the last {window}")
     share.axhline(100 * y.mean(), label="good, of all", **LIMIT)

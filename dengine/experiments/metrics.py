@@ -3,8 +3,6 @@
 >>> pooled_error(replays).rate, pooled_error(replays).upper     # of the accepted parts, the share of bad ones
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

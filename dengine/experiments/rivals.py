@@ -6,8 +6,6 @@ Without a bound: always, never, k neighbours that agree. With one of their own: 
 thresholds with a guaranteed risk. A rival's settings are the keyword-only fields of its class.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from abc import ABC, abstractmethod

@@ -3,8 +3,6 @@
 survey(load_dataset("cell_3/", channel="FZ_Base"))
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -10,8 +10,6 @@ check one can make one. Keep the key's file where only the exporter and the cont
 signed with the same key is as valid as the newest one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import io

@@ -11,8 +11,6 @@ come by a verb of their own:
     cmake -S cell_cpp -B build/cpp -DCMAKE_PREFIX_PATH="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
 """
 
-from __future__ import annotations
-
 import copy
 import io
 import json

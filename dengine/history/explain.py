@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -304,13 +304,6 @@ def _thresholds(found: Circumstances) -> tuple[float | None, float | None, str]:
     return accept_at if accept_at < NOBODY else None, 1.0 - reject_at if reject_at < NOBODY else None, held
 
 
-def _reach(made: Decision, found: Circumstances) -> str:
-    recipe = found.recipe
-    if found.rival:
-        return "as the model counts them"
-    return f"within the radius {recipe.radius:g}"
-
-
 def is_score(policy: Policy, made: Decision) -> bool:
     """Whether a decision was sorted by its heads' score, and not by an interval."""
     return policy.guarantee in SORTED and made.lower == made.upper
@@ -397,7 +390,7 @@ def _bound_sentences(made: Decision, bound: Bound, found: Circumstances) -> Iter
     if found.rival:
         yield f"{found.rival} gives {made.n_success} successes, {made.n_failure} failures, bound {reach}."
         return
-    ball, policy = _reach(made, found), found.recipe.policy
+    ball, policy = f"within the radius {found.recipe.radius:g}", found.recipe.policy
     counted = f"{made.n_success} of {n} labels {ball} are successes" if n else f"No label {ball}"
     name = policy.interval.replace("_", "-").capitalize()
     if is_score(policy, made):
@@ -487,22 +480,30 @@ class Explanation:
     _repr_html_ = in_html
 
 
-def explain(store: SqlStore, decision_id: str, neighbours: int = 10, under: Circumstances | None = None) -> Explanation:
+def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision, by what its store keeps.
 
-    neighbours : how many of the nearest references to show.  under : the engine's settings; None: as the store has them.
+    neighbours : how many of the nearest references to show.
     Raises ReportError for an id that the store does not hold, StoreError for a store that no engine has used.
     """
-    past = store.get_decision(decision_id)
-    under = _settings(store, past) if under is None else under
+    known, past = store.settings(), store.get_decision(decision_id)
+    if "recipe" not in known:
+        raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
     if past is None:
         got = f"{decision_id!r}, which its store does not hold; `dengine history STORE` lists the ids, newest last"
         raise UnknownDecisionError(f"Expected the id of a decision of cell {store.cell_id!r}, got {got}.")
-    made, trace, recipe = past.decision, past.trace, under.recipe
+    made, trace, recipe = past.decision, past.trace, Recipe.from_toml(known["recipe"])
+    channels, samples = trace.shape
     answering = as_it_stood(store, made.model_version, recipe, past) if made.model_version else None
-    found = replace(under, safe_mode=_safe_mode(store, past))
-    if answering is not None:
-        found = replace(found, levels=answering.levels, novelty=answering.novelty)
+    found = Circumstances(
+        recipe=recipe,
+        spec=trace_in(known) or TraceSpec(samples=samples, channels=channels),
+        model=known.get("model"),
+        seed=int(known.get("seed", "0")),
+        levels=None if answering is None else answering.levels,
+        novelty=None if answering is None else answering.novelty,
+        safe_mode=_safe_mode(store, past),
+    )
     around, bound = _around(past, answering, recipe), bound_of(made, found)
     return Explanation(
         decision=past,
@@ -516,15 +517,6 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10, under: Circ
         radius=None if around is None else around.radius,
         envelope=_envelope(store, past, answering, found.spec),
     )
-
-
-def _settings(store: SqlStore, past: StoredDecision | None) -> Circumstances:
-    known = store.settings()
-    if "recipe" not in known:
-        raise StoreError("Expected a store that an engine has used, this one is empty; make a DataEngine with it.")
-    channels, samples = (1, 1) if past is None else past.trace.shape
-    spec = trace_in(known) or TraceSpec(samples=samples, channels=channels)
-    return Circumstances(Recipe.from_toml(known["recipe"]), spec, known.get("model"), int(known.get("seed", "0")))
 
 
 def _safe_mode(store: SqlStore, past: StoredDecision) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..recipe import Recipe
 from ..records import Action
-from ..reducers import reducer_class
+from ..reducers import has_own_unit
 from ..store.views import HistoryFilter
 from .explain import as_it_stood
 
@@ -58,8 +58,7 @@ def part_map(store: SqlStore, recipe: Recipe, version: int) -> PartMap:
     newest = list(_newest(store, [made.id for made in recent[-NEWEST:] if made.model_version == version]))
     shown, parts = {mark.id for mark in newest}, {made.id: made.part for made in recent}
     known = [mark for mark in _known(store, recipe, version, parts) if mark.id not in shown] if version else []
-    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
-    return PartMap(version, (*known, *newest), recipe.radius if newest else None, bool(getattr(kind, "own_unit", False)))
+    return PartMap(version, (*known, *newest), recipe.radius if newest else None, has_own_unit(recipe))
 
 
 def _newest(store: SqlStore, ids: list[str]) -> Iterator[Mark]:

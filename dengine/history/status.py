@@ -175,7 +175,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     recipe, counts, retrains = Recipe.from_toml(settings["recipe"]), store.status(), store.versions(own=True)
     every, policy, events = store.tally(), recipe.policy, store.events()
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
-    outcomes = every.outcomes
+    outcomes, since = every.outcomes, int(settings.get("policy_since", 0))
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -192,7 +192,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         newest=_span(store.tally(last), retrains, policy),
         ever=_span(every, retrains, policy),
         unreported=outcomes.accepted - outcomes.stops - outcomes.confirmed,
-        certificate=policy.certificate(store.outcomes(int(settings.get("policy_since", 0)), policy.label_within)),
+        certificate=policy.certificate(store.tally(since_version=since, within=policy.label_within).outcomes),
         retrains=tuple(retrains),
         events=tuple(events[-EVENTS:]),
         watch=watch(store, recipe) if watching else None,

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol, Self, TypeVar, runtime_checkable
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 
@@ -86,23 +85,18 @@ class EngineModel(ABC):
 
     @abstractmethod
     def train(
-        self,
-        X: NDArray[np.float32],
-        y: NDArray[Any],
-        hashes: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
+        self, X: Floats, y: NDArray[Any], hashes: Ints, stop: StopRule | None = None, numbers: Ints | None = None
     ) -> Self:
         """Learn from traces (n, C, T), labels, parts' hashes and labels' numbers (n,), from where a training ended."""
 
-    def look_ahead(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default: nothing to begin with
         """Begin with a training on traces (n, C, T) with labels of these numbers; see `Reducer.look_ahead`."""
 
     @abstractmethod
-    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+    def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """What it says of one trace (C, T) of the part with this hash (0: it is nobody's), which has no vote on itself."""
 
-    def look(self, x: NDArray[np.float32], part: int | None, gate: Gate, limit: float) -> Looked:
+    def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
         """Fault and content hash of one trace (C, T), and what it says of it where there is no fault.
 
         part : the hash of its part's number; None: it goes by its content.  gate : `TraceGate` by the sensor's `limit`.
@@ -111,7 +105,7 @@ class EngineModel(ABC):
         return fault, content, None if fault else self.predict_one(x, content if part is None else part)
 
     @abstractmethod
-    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
+    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
         """Where a trace (C, T) with this hash lies as a reference; embedding : (K, d), where it is computed already."""
 
     @abstractmethod
@@ -190,7 +184,7 @@ class EngineModel(ABC):
 
     # No exception inside a model reaches the cell or costs a label. The engine's calls go through these five.
 
-    def look_ahead_safely(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:
+    def look_ahead_safely(self, X: Floats, numbers: Ints | None = None) -> None:
         """`look_ahead`, or nothing where it fails."""
         _guarded(lambda: self.look_ahead(X, numbers), "traces could not be looked at ahead of a retrain")
 
@@ -206,7 +200,7 @@ class EngineModel(ABC):
         """`prepare`; one that fails at it will verify, and say so, on every part."""
         _guarded(lambda: self.prepare(previous), "the model that was trained cannot be made to answer")
 
-    def place_safely(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats | None:
+    def place_safely(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats | None:
         """`reference_point`, or None where it fails."""
         failed = "the model cannot place a labelled trace; the next version learns it from the store"
         return _guarded(lambda: self.reference_point(x, hash_, embedding), failed)
@@ -245,11 +239,11 @@ class RivalAdapter(EngineModel):
         self.model = self.user_model = model
         self.name, self.description = type(model).__name__, type(model).__qualname__  # its settings are its author's affair
 
-    def train(self, X: NDArray[np.float32], y: NDArray[Any], *_: object, **__: object) -> Self:
+    def train(self, X: Floats, y: NDArray[Any], *_: object, **__: object) -> Self:
         self.model.fit(X.copy(), y)  # the window's own, which a rival may write to
         return self
 
-    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+    def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """The rival's own decision on one trace (C, T), with its evidence; it knows nothing of parts."""
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
@@ -261,7 +255,7 @@ class RivalAdapter(EngineModel):
             raise ValueError(f"Expected whole numbers of labels below 2**63, got {shortened((n_success, n_failure))}.")
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
-    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
+    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
         return x
 
     def add_reference(self, point: Floats, y: int, hash_: int, number: int = 0) -> None:

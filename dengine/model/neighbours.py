@@ -239,12 +239,7 @@ class ModelPrediction(EngineModel):
         return self.train(X, y, content_hash(X) if hashes is None else np.asarray(hashes, dtype=np.int64))
 
     def train(
-        self,
-        X: NDArray[np.float32],
-        y: NDArray[Any],
-        hashes: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
+        self, X: Floats, y: NDArray[Any], hashes: Ints, stop: StopRule | None = None, numbers: Ints | None = None
     ) -> Self:
         """Train the reducer, warm where it can be, and make every trace a reference."""
         y = y.astype(np.int64)
@@ -261,7 +256,7 @@ class ModelPrediction(EngineModel):
         self._predictor = None  # built by `prepare`, or when it is asked
         return self
 
-    def look_ahead(self, X: NDArray[np.float32], numbers: Ints | None = None) -> None:
+    def look_ahead(self, X: Floats, numbers: Ints | None = None) -> None:
         """`Reducer.look_ahead`; and where nothing answers yet, compile what will: a first retrain has no time for that."""
         blank = self.spaces.blank(X)
         with ThreadPoolExecutor(1, "dengine-ahead", torch.set_num_threads, (1,)) as pool:
@@ -305,7 +300,7 @@ class ModelPrediction(EngineModel):
         self.add_reference(self.reference_point(X[0], hash_), int(as_success(np.asarray(y))), hash_)
         return self
 
-    def reference_point(self, x: NDArray[np.float32], hash_: int, embedding: Embedding | None = None) -> Floats:
+    def reference_point(self, x: Floats, hash_: int, embedding: Embedding | None = None) -> Floats:
         if embedding is not None:
             return np.array(embedding[self._fold(hash_)], dtype=np.float32)
         with torch.inference_mode():
@@ -358,12 +353,12 @@ class ModelPrediction(EngineModel):
     def safe_mode(self) -> str:
         return SAFE_MODE[self.rule.safe_mode()]
 
-    def predict_one(self, x: NDArray[np.float32], hash_: int = 0) -> Prediction:
+    def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """The whole prediction on one trace (C, T); the part with this hash, if it is known, has no vote."""
         with torch.inference_mode():
             return self._prediction(self.predictor(torch.from_numpy(x), hash_ if hash_ in self.index.known else 0))
 
-    def look(self, x: NDArray[np.float32], part: int | None, gate: Gate, limit: float) -> Looked:
+    def look(self, x: Floats, part: int | None, gate: Gate, limit: float) -> Looked:
         predictor, known = self.predictor, self.index.known
         with torch._C._InferenceMode(True):  # as `torch.inference_mode`, whose entering costs 3 % of a decision
             fault, content, said = predictor.look(torch.from_numpy(x), part if part in known else 0, limit)
@@ -453,7 +448,7 @@ def trace_gate(trace_shape: tuple[int, ...]) -> TraceGate:
     return TraceGate(TraceSpec(channels=trace_shape[0], samples=trace_shape[1]))
 
 
-def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
+def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """How many of the newest traces (n, C, T) nearly repeat one of another part; parts (n,) hashes.
 
     Labels are counted as independent trials, so a part that is inserted again must be known as such (`part=`). This notices
@@ -474,7 +469,7 @@ def near_repeats(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> int:
     return int(((distances.numpy().min(1) < NEAR * tenth) & (tenth > 1e-6)).sum())
 
 
-def repeats_note(traces: NDArray[np.float32], parts: NDArray[np.int64]) -> str:
+def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     """What to say of near repeats; "" where there are few."""
     n, looked_at = near_repeats(traces, parts), min(len(traces), NEWEST)
     if n <= SUSPICIOUS:

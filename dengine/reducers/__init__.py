@@ -1,7 +1,5 @@
 """Reducers by name: trace -> embedding, each a scikit-learn transformer, interchangeable everywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from inspect import signature
@@ -85,6 +83,12 @@ def reducer_of(recipe: Recipe, seed: int) -> Any:
     # A reducer that cross-fits by itself takes the folds; any other is cross-fitted from outside.
     own = {name: value for name, value in (("random_state", seed), ("folds", recipe.folds)) if name in known}
     return make_reducer(recipe.reducer, **own | dict(recipe.params))
+
+
+def has_own_unit(recipe: Recipe) -> bool:
+    """Whether a recipe's embedding is never scaled, its first axis a predicted probability; see `Reducer.own_unit`."""
+    kind = reducer_class(recipe.reducer) if isinstance(recipe.reducer, str) else recipe.reducer
+    return bool(getattr(kind, "own_unit", False))  # scikit-learn's transformers say nothing of a unit
 
 
 REDUCERS: dict[str, Callable[..., Any]] = {name: partial(make_reducer, name) for name in _NAMED}

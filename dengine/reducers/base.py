@@ -45,14 +45,11 @@ class StopRule:
     """
 
     deadline: float | None = None
-    max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
     late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
         """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
-        if self.max_steps is not None and step >= self.max_steps:
-            return True
         self.late = self.deadline is not None and self.clock() >= self.deadline and step >= least
         return self.late
 
@@ -263,11 +260,11 @@ def as_reducer(transformer: Any, folds: int) -> Reducer:
     return CrossFitted(transformer, folds) if uses_labels(transformer) else LabelFree(transformer)
 
 
+@dataclass(eq=False, repr=False)
 class _Wrapping(Reducer):
     """A reducer that hands traces on to a transformer of somebody else's."""
 
     reducer: Any
-    dim_: int
 
     @property
     def own_unit(self) -> bool:  # type: ignore[override]  # a constant of a kind; here the wrapped one's
@@ -281,7 +278,7 @@ class _Wrapping(Reducer):
     @property
     def _n_features_out(self) -> int:
         check_is_fitted(self)
-        return self.dim_
+        return int(self.dim_)
 
 
 class LabelFree(_Wrapping):
@@ -289,9 +286,6 @@ class LabelFree(_Wrapping):
 
     reducer : the transformer; `fit` works on a clone, `reducer_`.
     """
-
-    def __init__(self, reducer: Any) -> None:
-        self.reducer = reducer
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         traces = self.check_traces(X, reset=True)
@@ -304,6 +298,7 @@ class LabelFree(_Wrapping):
         return as_points(self.reducer_.transform(handed))
 
 
+@dataclass(eq=False, repr=False)
 class CrossFitted(_Wrapping):
     """Any label-using transformer, K times: clone k is fitted on every trace outside fold k.
 
@@ -313,9 +308,7 @@ class CrossFitted(_Wrapping):
 
     uses_labels = True
 
-    def __init__(self, reducer: Any, folds: int = 2) -> None:
-        self.reducer = reducer
-        self.folds = folds
+    folds: int = 2
 
     @property
     def n_spaces(self) -> int:

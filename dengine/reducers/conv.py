@@ -24,6 +24,7 @@ also weighs the towers; Chernozhukov et al. (2018), Econometrics Journal 21.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -161,6 +162,7 @@ class ConvEncoder(Features):
                 self.rival[d] = rivals / (NEARLY * (rivals @ rows).std() + 1e-6)
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class ConvReducer(FeatureReducer):
     """Trace -> point, by a convolutional encoder and cross-fitted heads.
 
@@ -177,30 +179,12 @@ class ConvReducer(FeatureReducer):
     leading = 4
     sizes = ("kernels", "dilations", "regions", "width")
 
-    def __init__(
-        self,
-        *,
-        n_components: int = 2,
-        folds: int = 5,
-        kernels: int = 28,
-        dilations: int = 5,
-        regions: int = 3,
-        groups: int = 2,
-        width: int = 128,
-        l2: float = 0.5,
-        max_iter: int = 20,
-        random_state: Any = 0,
-    ) -> None:
-        self.n_components = n_components
-        self.folds = folds
-        self.kernels = kernels
-        self.dilations = dilations
-        self.regions = regions
-        self.groups = groups
-        self.width = width
-        self.l2 = l2
-        self.max_iter = max_iter
-        self.random_state = random_state
+    kernels: int = 28
+    dilations: int = 5
+    regions: int = 3
+    groups: int = 2
+    width: int = 128
+    l2: float = 0.5
 
     def make_features(self, channels: int, samples: int) -> ConvEncoder:
         expect(self.regions <= 16, "regions <= 16", self.regions)

@@ -12,8 +12,9 @@ anew where the traces have grown by half, and fits the heads from where they wer
 import copy
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import combinations, pairwise
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -274,10 +275,12 @@ class Tower(NamedTuple):
         return (self.axes.double() @ w.T).float(), (bias + w @ self.centre.double()).float()
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class FeatureReducer(Reducer):
     """Trace -> point, by features, their principal components and cross-fitted logistic heads.
 
-    A kind has parameters `n_components` (d, 1 or 2), `folds` (K), `l2`, `max_iter` and `random_state` at least.
+    n_components, folds, l2, max_iter, random_state : as in `ConvReducer`.
+
     `n_iter_` : steps of the last fit.  `holdout_losses_` (K,) : the heads' leave-one-out log losses, each on rows outside
     its fold.  `note_` : what the fit has to tell.
     """
@@ -286,16 +289,16 @@ class FeatureReducer(Reducer):
     scores = True
     own_unit = True  # a radius of 0.07 is seven in a hundred, never rescaled
     width = 128  # W
-    variances: tuple[float, ...] = (150.0,)  # of each tower's components together: what a head's ridge is weighed against
+    # Of each tower's components together: what a head's ridge is weighed against.
+    variances: ClassVar[tuple[float, ...]] = (150.0,)
     leading = 0  # components of the first tower whose products are a tower of their own; 0: none
-    sizes: tuple[str, ...] = ()  # parameters of a kind that are whole numbers
-    n_components: int
-    folds: int
-    l2: float
-    max_iter: int
-    random_state: Any
-    net_: FeatureEmbedding
-    towers_: list[Tower]
+    sizes: ClassVar[tuple[str, ...]] = ()  # parameters of a kind that are whole numbers
+
+    n_components: int = 2
+    folds: int = 5
+    l2: float = 1.0
+    max_iter: int = 20
+    random_state: Any = 0
 
     @property
     def n_spaces(self) -> int:
@@ -305,12 +308,10 @@ class FeatureReducer(Reducer):
         """The features of traces (C, T)."""
         raise NotImplementedError
 
-    def fit(
-        self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None, stop: StopRule | None = None
-    ) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit afresh.
 
-        folds : (n,) permanent folds; None: by content.  stop : asked before each step; None: until done.
+        folds : (n,) permanent folds; None: by content.
         Raises SettingError where a setting is out of range, or a head would see one class alone.
         """
         traces = self.check_traces(X, reset=True)
@@ -319,7 +320,7 @@ class FeatureReducer(Reducer):
         within = folds.shape == labels.shape and folds.min() >= 0 and folds.max() < self.folds
         expect(within, f"{len(labels)} folds from 0 to {self.folds - 1}", folds)
         self._start(traces)
-        self._fit_heads(self.raw_features(traces), labels, folds, stop)
+        self._fit_heads(self.raw_features(traces), labels, folds)
         return self
 
     def train(self, X: Floats, y: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None) -> Floats:
@@ -359,12 +360,12 @@ class FeatureReducer(Reducer):
         leading = min(self.leading, self.width, features.towers[0].stop)
         self.net_ = FeatureEmbedding(features, self.folds, self.n_components, leading).eval()
         self.n_fits_ = self.n_seen_ = 0
-        self.towers_ = []
+        self.towers_: list[Tower] = []
         self._numbers = np.zeros(0, dtype=np.int64)  # of the labels that were seen last
         self._raw = torch.empty(0, len(features.gain))
 
     def _fit_heads(
-        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None, numbers: Ints | None = None
+        self, raw: Tensor, labels: Ints, folds: Ints, stop: StopRule | None = None, numbers: Ints | None = None
     ) -> None:
         """Train head k on rows outside fold k of the features (n, P), from the present weights."""
         with torch.no_grad():

@@ -1,6 +1,7 @@
 """PCA: the plainest label-free reducer, closed-form, exportable."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,15 +15,15 @@ from ..errors import SettingError
 from .base import Floats, Reducer, as_rows
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class PcaReducer(Reducer):
     """The first `n_components` principal components of the samples, by scikit-learn's randomised solver.
 
     Source: Halko, Martinsson and Tropp (2011), SIAM Review 53(2).
     """
 
-    def __init__(self, *, n_components: int = 2, random_state: Any = 0) -> None:
-        self.n_components = n_components
-        self.random_state = random_state
+    n_components: int = 2
+    random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for no more traces than dimensions."""

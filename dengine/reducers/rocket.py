@@ -8,7 +8,7 @@ computed once a trace, and a retrain is the heads' convex fit. The strongest che
 Source: Dempster, Schmidt and Webb (2021), MiniRocket, KDD; arXiv:2012.08791. Here with one bias a kernel and dilation.
 """
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -55,6 +55,7 @@ class RocketFeatures(Features):
             self.bias[i] = own.sort(1).values.gather(1, order[:, None])
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class RocketReducer(FeatureReducer):
     """Trace -> point, by MiniRocket's features and cross-fitted logistic heads.
 
@@ -62,22 +63,7 @@ class RocketReducer(FeatureReducer):
     n_components, folds, l2, max_iter, random_state : as in `ConvReducer`.
     """
 
-    def __init__(
-        self,
-        *,
-        n_components: int = 2,
-        folds: int = 5,
-        dilations: int = 3,
-        l2: float = 1.0,
-        max_iter: int = 20,
-        random_state: Any = 0,
-    ) -> None:
-        self.n_components = n_components
-        self.folds = folds
-        self.dilations = dilations
-        self.l2 = l2
-        self.max_iter = max_iter
-        self.random_state = random_state
+    dilations: int = 3
 
     def make_features(self, channels: int, samples: int) -> Features:
         return RocketFeatures(channels, samples, self.dilations)

@@ -1,8 +1,9 @@
 """UMAP, the paper's reducer: label-free, so one space serves every fold."""
 
-from __future__ import annotations
-
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..errors import SettingError
 from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class UmapReducer(Reducer):
     """umap-learn's UMAP, fitted on one thread where a random_state is given, so that a run repeats exactly.
 
@@ -24,20 +26,11 @@ class UmapReducer(Reducer):
 
     single_tolerance = 0.3
 
-    def __init__(
-        self,
-        *,
-        n_components: int = 2,
-        n_neighbors: int = 15,
-        min_dist: float = 0.1,
-        n_epochs: int | None = None,
-        random_state: Any = 0,
-    ) -> None:
-        self.n_components = n_components
-        self.n_neighbors = n_neighbors
-        self.min_dist = min_dist
-        self.n_epochs = n_epochs
-        self.random_state = random_state
+    n_components: int = 2
+    n_neighbors: int = 15
+    min_dist: float = 0.1
+    n_epochs: int | None = None
+    random_state: Any = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit on traces (n, T) or (n, C, T); labels are ignored. SettingError for fewer than n_neighbors + 1 traces."""
@@ -48,7 +41,7 @@ class UmapReducer(Reducer):
             )
         from umap import UMAP
 
-        with _Contained():
+        with _contained():
             self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
@@ -59,23 +52,21 @@ class UmapReducer(Reducer):
     def transform(self, X: ArrayLike) -> Floats:
         check_is_fitted(self, "umap_")
         traces = self.check_traces(X)
-        with _Contained():
+        with _contained():
             return np.asarray(self.umap_.transform(as_rows(traces)), dtype=np.float32)
 
 
-class _Contained(warnings.catch_warnings):
+@contextmanager
+def _contained() -> Iterator[None]:
     """Keep umap-learn's warnings and its number of threads out of the process.
 
     Its first kernel makes numba set OpenMP's threads for the whole process, torch's too: forty times as slow for others.
     """
-
-    def __enter__(self) -> None:
-        super().__enter__()
-        self.threads = torch.get_num_threads()
-        warnings.filterwarnings("ignore", module=r"umap\..*")
-        warnings.filterwarnings("ignore", module=r"sklearn\.manifold\..*")
-
-    def __exit__(self, *raised: Any) -> None:
-        super().__exit__(*raised)
-        if torch.get_num_threads() != self.threads:
-            torch.set_num_threads(self.threads)
+    threads = torch.get_num_threads()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"(umap|sklearn\.manifold)\..*")
+        try:
+            yield
+        finally:
+            if torch.get_num_threads() != threads:
+                torch.set_num_threads(threads)

@@ -3,8 +3,6 @@
 A deleted file, a fork, and a row that the database refuses are each met here.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os
@@ -243,7 +241,6 @@ class Database:
             del self._asked.wanted
 
     def holds_entry(self, number: int, digest: str) -> bool:
-        """Whether the ledger has that entry."""
         mine = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
         return [row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(mine))] == [digest]
 
@@ -346,7 +343,6 @@ class Database:
         return range(first, first + len(rows))
 
     def correct(self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add corrections."""
         newest = self.scope.next_number(connection, LABEL.c.seq) - 1
         self.insert(connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows])
 

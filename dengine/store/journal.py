@@ -6,8 +6,6 @@ records, and the newest entry of its ledger: a store that was cut off, or put ba
 small file beside it, its head, knows that entry too, for where the journal went with the store.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json
@@ -318,7 +316,6 @@ def sqlite_file(url: Any) -> Path:
 
 
 def head_path(journal: Path) -> Path:
-    """Where a journal's head lies."""
     return journal.with_name(f"{journal.name}.head")
 
 

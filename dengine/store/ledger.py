@@ -13,8 +13,6 @@ What a row's sum is must never change. So a column without a value is not in it,
 schema may add columns that are empty in earlier rows.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

@@ -1,7 +1,5 @@
 """The cells of a database, and the settings that cells of one product must agree on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Whose rows a query is about, a cell's own or those of all cells of its product, and what several queries are made of."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -62,7 +60,6 @@ class Scope:
 
 
 def cells_of(product: str) -> sa.Select[Any]:
-    """The cells of a product."""
     return sa.select(SETTING.c.cell_id).where(SETTING.c.key == PRODUCT_KEY, SETTING.c.value == product)
 
 
@@ -127,11 +124,6 @@ def how_looked() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     asked = sa.case((DECISION.c.action == Action.VERIFY.value, DECISION.c.propensity), else_=0.0)
     return sa.case(positions, value=DECISION.c.predicted).label("predicted"), asked.label("looked")
-
-
-def since(table: sa.Table, version: int) -> sa.ColumnElement[bool]:
-    """Rows by model versions from this one on."""
-    return sa.true() if version <= 0 else table.c.model_version >= int(version)
 
 
 SAID: sa.ColumnElement[int | None] = sa.func.nullif(counted(), FORGOTTEN)  # as it counts now; NULL: none, or forgotten

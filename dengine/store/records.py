@@ -1,7 +1,5 @@
 """What stores take and hand back: decisions, labels, traces, versions, events; and how a row holds each."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -12,7 +10,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from functools import lru_cache, partial
 from types import UnionType
-from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, Self, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,25 +171,23 @@ class News:
     correction: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """What became of decisions, in label order.
+class Evidence(NamedTuple):
+    """What became of a decision, as a rule is told of it.
 
-    lower, upper : (n,) the bound each was decided by.
-    success : (n,) its label.
-    novel : (n,) whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
-    silent : (n,) accepted parts of which nothing was heard between the previous label and this one.
-    predicted : (n,) position in `Action` of what the model alone would have done.  looked : (n,) as `Decision.looked`.
+    seq : number of its label, which is `success`.  lower, upper : the bound that it was decided by.
+    novel : whether it was decided as unlike all that was learned from, `Reason.NOVEL`.
+    silent : accepted parts of which nothing was heard between the previous label and this one.
+    predicted : position in `Action` of what the model alone would have done.  looked : as `Decision.looked`.
     """
 
-    seq: NDArray[np.int64]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    success: NDArray[np.bool_]
-    novel: NDArray[np.bool_]
-    silent: NDArray[np.int64]
-    predicted: NDArray[np.int64]
-    looked: NDArray[np.float64]
+    seq: int
+    lower: float
+    upper: float
+    success: bool
+    novel: bool
+    silent: int
+    predicted: int
+    looked: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,12 +340,10 @@ def _read(value: Any, kind: type) -> Any:
 
 
 def decision_row(item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `decision`."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
 def trace_row(item: StoredDecision) -> dict[str, Any]:
-    """The row of the table `trace`."""
     channels, samples = item.trace.shape
     return {"decision_id": item.decision.id, "channels": channels, "samples": samples, "data": pack(item.trace)}
 

@@ -1,7 +1,5 @@
 """The tables of a store in a database; their columns are the fields of the records that they hold."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Any
 

@@ -14,13 +14,14 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, shortened
+from ..errors import StoreError, listed, shortened
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
@@ -36,7 +37,6 @@ from .queries import (
     how_looked,
     n_decisions,
     past_query,
-    since,
     stretches_query,
     training_query,
 )
@@ -52,7 +52,6 @@ from .records import (
     ModelVersion,
     NewLabel,
     News,
-    Outcomes,
     StoredDecision,
     StoredVersion,
     VersionError,
@@ -74,16 +73,12 @@ from .records import (
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, RESERVED, SETTING, TRACE, VERSION, hold
 from .views import LABELS, HistoryFilter, Kind, PastLabel, Stretch, Tally
 
-if TYPE_CHECKING:
-    from .verification import HistoryReport
-
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"  # of the environment: other seconds for all stores that are given none
 MOST_TRAINED = 40  # versions that wait in memory, some half a megabyte each: a replay of 1,503 parts has fewer
-NAMED = 20  # decisions that an event names
 
 
-class SqlStore:
+class SqlStore(AbstractContextManager["SqlStore"]):
     """What an engine needs of its memory, in a database. Everything belongs to one cell.
 
     url : a file (SQLite), or a SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for replays and trials.
@@ -113,7 +108,6 @@ class SqlStore:
         wait: float | None = None,
         keep_versions: int | None = KEEP,
     ) -> None:
-        """Open or create the store."""
         if not cell_id:
             raise StoreError("Expected a cell_id that names the cell, got an empty one; use for example 'cell'.")
         self.cell_id = cell_id
@@ -283,27 +277,24 @@ class SqlStore:
     def _tell_of(self, damaged: Sequence[str], what: str) -> None:
         """Damage that was read is an event, once that transaction is over."""
         if damaged:
-            more = f" and {len(damaged) - NAMED} more" if len(damaged) > NAMED else ""
-            named = f"decision {', '.join(damaged[:NAMED])}{more}; see dengine verify"
+            named = f"decision {listed(damaged)}; see dengine verify"
             self._note("damaged", f"left out, since the {what} is not as it was stored: {named}")
 
     # What became of decisions
 
-    def evidence_since(self, seq: int, since_version: int = 0) -> Evidence:
-        """Of this cell alone.
+    def evidence_since(self, seq: int, since_version: int = 0) -> list[Evidence]:
+        """Return what a rule is told of the labels after number `seq`, in their order, of this cell alone.
 
         A level that other cells' streams certify says nothing certain of this one's, and a watch that counts them would
         notice too late that this cell has changed.
         """
         label = counted()
         novel = DECISION.c.reason == Reason.NOVEL.value
-        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label, novel, LABEL.c.silent, *how_looked())
+        of = (LABEL.c.seq, *DECISION.c["lower", "upper"], label == 1, novel, LABEL.c.silent, *how_looked())
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false()) & (LABEL.c.seq > int(seq))
         query = sa.select(*of).select_from(LABEL.join(DECISION, LABEL_OF_DECISION)).where(mine, label != FORGOTTEN)
-        columns = zip(*self._read(query.where(since(DECISION, since_version)).order_by(LABEL.c.seq)), strict=True)
-        kinds = (np.int64, np.float64, np.float64, np.bool_, np.bool_, np.int64, np.int64, np.float64)
-        arrays: list[Any] = [np.array(next(columns, ()), dtype=kind) for kind in kinds]
-        return Evidence(*arrays)
+        rows = self._read(query.where(DECISION.c.model_version >= since_version).order_by(LABEL.c.seq))
+        return [Evidence(*row) for row in rows]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
         """Return the ids of accepted decisions without a label, oldest first, without the quarantined ones."""
@@ -318,20 +309,13 @@ class SqlStore:
     def _unheard_of(self, action: Action, since_version: int, *columns: Any) -> sa.Select[Any]:
         query = sa.select(*columns).select_from(WITH_LABELS).where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
         query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false())
-        return query.where(since(DECISION, since_version)).order_by(DECISION.c.number)
+        return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on unheard of: `silent` over all labels but the quarantined ones."""
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
         mine = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(self._read(query.where(mine, since(LABEL, since_version)))[0][0])
-
-    def outcomes(self, since_version: int = 0, within: int | None = None) -> Outcomes:
-        """Count what became of what the model was certain of.
-
-        within : decisions after which an audit that was not reported is overdue; None: none is.
-        """
-        return self.tally(since_version=since_version, within=within).outcomes
+        return int(self._read(query.where(mine, LABEL.c.model_version >= since_version))[0][0])
 
     def status(self) -> dict[str, Any]:
         """Count decisions and labels, by what they are. Of retrains tells `versions`, of events `events`."""
@@ -576,7 +560,7 @@ class SqlStore:
         kind = (*columns, aged, SAID.label("success"), LABEL.c.source, sa.func.count().label("n"))
         times = sa.func.min(DECISION.c.time), sa.func.max(DECISION.c.time), sa.func.max(LABEL.c.time)
         query = sa.select(*kind, *times).select_from(WITH_LABELS).group_by(*columns, "aged", SAID, LABEL.c.source)
-        query = query.where(DECISION.c.cell_id == self.cell_id, since(DECISION, since_version))
+        query = query.where(DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = ([row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1))
         kinds = tuple(from_row(Kind, row._mapping) for row in rows)
@@ -590,12 +574,6 @@ class SqlStore:
         every = self._read(sa.select(sa.func.count()).where(DECISION.c.cell_id == self.cell_id))[0][0]
         rows = self._read(stretches_query(self.cell_id, max(1, -(-int(every) // n)), **by))
         return [Stretch(*row) for row in rows]
-
-    def verify(self, expect: str | None = None) -> HistoryReport:
-        """Check this cell's history against its ledger. See `verify_history`."""
-        from .verification import verify_history
-
-        return verify_history(self.database.url.render_as_string(hide_password=False), self.cell_id, expect)
 
     # The one engine that owns the cell
 
@@ -651,9 +629,6 @@ class SqlStore:
             self.database.close()
         if self._journal is not None:
             self._journal.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()

@@ -8,8 +8,6 @@ entries: those can be cut off without a trace in the store, which is what `expec
 somebody with the right to write has made anew from its beginning; a keyed ledger does, or a digest from elsewhere.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """What people look back on: past labels, and counts of decisions and of what became of them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

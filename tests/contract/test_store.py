@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 
 from dengine.errors import StoreError
 from dengine.records import Action, Decision, Reason, Source
-from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision
+from dengine.store import Event, NewLabel, Outcomes, SqlStore, StoredDecision, verify_history
 from tests.support.plans import plans
 from tests.support.stores import decision, execute, label, labelled, put_decision, put_label, put_labels, report, trace
 
@@ -99,7 +99,7 @@ def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> 
     found = store.labelled(limit)
     assert (found.seq.shape, found.traces.shape) == ((0,), (0, 0, 0))
     assert (store.last_version(), store.retrains()) == (None, [])
-    assert (store.unreported_accepts(), store.silent_total(), store.outcomes()) == ([], 0, Outcomes())
+    assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == ([], 0, Outcomes())
 
 
 def test_traces_of_two_shapes_are_an_error_that_names_both(store: SqlStore) -> None:
@@ -130,12 +130,10 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
         put_decision(store, replace(made, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined)
         put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None, silent=i)
     found = store.evidence_since(1)
-    assert (found.seq.tolist(), found.success.tolist()) == ([3, 4], [True, False])
-    assert (found.lower.tolist(), found.upper.tolist()) == ([0.2, 0.1 * 3], [0.4, 0.2 * 3])
-    assert (found.novel.tolist(), found.silent.tolist()) == ([False, True], [2, 3])
+    assert found == [(3, 0.2, 0.4, True, False, 2, 0, 1.0), (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0)]
+    assert [type(each) for each in found[0]] == [int, float, float, bool, bool, int, int, float]  # for compiled code
     assert store.silent_total() == 0 + 2 + 3
-    empty = store.evidence_since(4)
-    assert (empty.novel.dtype, empty.silent.dtype, empty.novel.shape) == (np.bool_, np.int64, (0,))
+    assert store.evidence_since(4) == []
 
 
 def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(store: SqlStore) -> None:
@@ -163,7 +161,7 @@ def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None
         put_decision(store, replace(decision(str(i), action), predicted=predicted, audit=audit), trace(), i, False)
         if success is not None:
             put_label(store, str(i), success, Source.AUDIT, 0, None)
-    assert store.outcomes() == Outcomes(
+    assert store.tally().outcomes == Outcomes(
         accepted=6,
         stops=2,
         confirmed=1,
@@ -270,7 +268,7 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         np.testing.assert_array_equal(store.last_version().state["w"], values)
         assert store.past_labels(0, 1)[0].point.tolist() == [0.5]
         assert store.get_decision("unreported") is not None
-        assert (store.unreported_accepts(), store.silent_total(), store.outcomes().accepted) == (["accepted"], 4, 1)
+        assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes.accepted) == (["accepted"], 4, 1)
         assert store.get_decision("accepted").decision.part == "SN-1"
         assert [event.text for event in store.events()] == ["for the first time"]
         store.put_event("started", "again")
@@ -292,7 +290,7 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         put_decision(ours, decision("c"), trace(), 1, False)
         put_label(ours, "c", True, Source.VERIFICATION, 0, None, silent=3)
         assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
-        assert other.outcomes().accepted == 0
+        assert other.tally().outcomes.accepted == 0
         other.put_event("note", "other's")
         assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
         assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
@@ -317,8 +315,8 @@ def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_
         assert sorted(seqs) == list(range(1, 31))
         assert one.labelled().seq.tolist() == list(range(1, 31))
         assert [event.number for event in two.events()] == list(range(1, 31))
-        assert one.verify().ok  # one chain
-        assert one.verify().cells[0].rows == 120
+        found = verify_history(*place)
+        assert (found.ok, found.cells[0].rows) == (True, 120)  # one chain
 
 
 def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:

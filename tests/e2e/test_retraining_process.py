@@ -1,7 +1,5 @@
 """The process in which a served engine retrains, and what goes there and back."""
 
-from __future__ import annotations
-
 import copy
 import os
 import signal
@@ -17,7 +15,7 @@ from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
 
-CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9))
+CONV = replace(Recipe.load("conv"), retrain_every=30, policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:

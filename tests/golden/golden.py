@@ -7,8 +7,6 @@ exports, so that the same lines run before and after. Only decisions are kept, n
 may change, what they answer may not.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import re

@@ -1,7 +1,5 @@
 """The bundled simulated data set is what its card says: counts, difficulty, and no shortcut."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The trained files in models/ are whole, load here, and say what they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The simulated cell keeps the cell protocol, its clock, and its physics."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from importlib.resources import files
 

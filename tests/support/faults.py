@@ -8,8 +8,6 @@ A fault is a text that occurs once in a file, and what stands there instead. It 
 tests are run: caught, where one of them fails. Exit code 0: all were caught; 1: some were not; 2: the list is wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import compileall
 import os

@@ -1,7 +1,5 @@
 """Servers for tests: a service, an application at a port of its own, `dengine serve` as it is typed, and a certificate."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import os

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import threading
 from functools import partial
 from typing import Any
@@ -22,8 +20,6 @@ from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
 from dengine.reducers.features import FIRST_STEPS, MANY, PAIRS, SHARES, fit_heads, masked_loss, products
 from dengine.reducers.rocket import RocketFeatures
 
-STEPS = StopRule(max_steps=20)
-
 
 def traces(n=160, channels=1, samples=152, seed=0):
     """Bumps at a random place; a late bump is a failure, with some noise in the labels."""
@@ -38,12 +34,12 @@ def traces(n=160, channels=1, samples=152, seed=0):
 
 def fitted(**params):
     X, y = traces()
-    return ConvReducer(**params).fit(X, y, stop=STEPS), X, y
+    return ConvReducer(**params).fit(X, y), X, y
 
 
-def train(reducer, X, y, stop=None):
+def train(reducer, X, y):
     """The engine's warm start; returns the reducer."""
-    reducer.train(X, y, content_fold(X, reducer.folds), stop)
+    reducer.train(X, y, content_fold(X, reducer.folds))
     return reducer
 
 
@@ -71,9 +67,9 @@ def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit():
     assert np.array_equal(again.embed(X), reducer.embed(X))
     np.testing.assert_array_equal(again.holdout_losses_, reducer.holdout_losses_)
     X2, y2 = np.concatenate([X, traces(seed=5)[0]]), np.concatenate([y, traces(seed=5)[1]])
-    cold = clone(reducer).fit(X2, y2, stop=STEPS).embed(X)
-    trained_on = train(again, X2, y2, STEPS).embed(X)
-    assert np.array_equal(trained_on, train(reducer, X2, y2, STEPS).embed(X))
+    cold = clone(reducer).fit(X2, y2).embed(X)
+    trained_on = train(again, X2, y2).embed(X)
+    assert np.array_equal(trained_on, train(reducer, X2, y2).embed(X))
     assert not np.array_equal(trained_on, cold)  # it went on from where it was
     assert all(isinstance(value, np.ndarray) for value in state.values())
 
@@ -101,7 +97,8 @@ def test_the_leave_one_out_loss_is_close_to_the_loss_on_new_traces_and_better_th
 def test_no_step_begins_after_the_deadline():
     X, y = traces()
     ticks = iter(range(1000))
-    reducer = ConvReducer().fit(X, y, stop=StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
+    reducer = ConvReducer()
+    reducer.train(X, y, content_fold(X, 5), StopRule(deadline=5.0, clock=lambda: float(next(ticks))))
     assert reducer.n_iter_ == 5
     before = reducer.embed(X)
     reducer.train(X, y, content_fold(X, 5), stop := StopRule(deadline=-1.0, clock=lambda: 0.0))
@@ -112,7 +109,8 @@ def test_no_step_begins_after_the_deadline():
 
 def test_a_first_model_that_comes_too_late_has_learned_something_all_the_same():
     X, y = traces()
-    late = ConvReducer().fit(X, y, stop=StopRule(deadline=-1.0, clock=lambda: 0.0))
+    late = ConvReducer()
+    late.train(X, y, content_fold(X, 5), StopRule(deadline=-1.0, clock=lambda: 0.0))
     assert late.n_iter_ == FIRST_STEPS
     apart = late.embed(X)[..., 0].mean(1)
     assert apart[y == 1].mean() > apart[y == 0].mean() + 0.5
@@ -122,7 +120,7 @@ def test_dead_channels_and_huge_scales_embed_finitely():
     X, y = traces(80, channels=2)
     X[:, 1] = 7.0
     X[:, 0] = X[:, 0] * 1e6 + 1e7
-    reducer = ConvReducer().fit(X, y, stop=STEPS)
+    reducer = ConvReducer().fit(X, y)
     Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
     assert np.isfinite(Z).all()
 

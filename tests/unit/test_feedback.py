@@ -49,8 +49,8 @@ def spoiled(stream: Dataset) -> Dataset:
 def beyond(engine: DataEngine) -> list[int]:
     """Members of LB's own level that the rule counts beyond those of which the store has labels, and the bad ones."""
     known, (n, bad) = engine.store.evidence_since(0), engine.model.rule.evidence.told[0, 0, 1].sum(0).tolist()
-    reached = known.lower >= 0.9
-    return [n - int(reached.sum()), bad - int((reached & ~known.success).sum())]
+    reached = [each.success for each in known if each.lower >= 0.9]
+    return [n - len(reached), bad - reached.count(False)]
 
 
 def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_part(stream: Dataset) -> None:
@@ -77,7 +77,7 @@ def test_silence_says_nothing_by_default(stream: Dataset) -> None:
     engine = make(LOCAL)
     play(engine, stream)
     assert engine.store.status()["sources"]["confirmed"] == 0
-    assert engine.store.outcomes().accepted > 100
+    assert engine.store.tally().outcomes.accepted > 100
     certificate = engine.certificate()
     assert (certificate.accepted.upper, "audit_rate" in certificate.sentence) == (1.0, True)
 
@@ -109,7 +109,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     held, labels = engine.store.get_decision(stopped.id), engine.model.index.held("labels")
     assert (held.success, engine.store.labelled().labels[held.label_seq - 1]) == (False, 0)
     assert labels[engine.model.index.held("numbers") == held.label_seq].tolist() == [0]
-    assert engine.certificate().accepted.n_bad == engine.store.outcomes().stops > 0
+    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.stops > 0
     engine.close()
 
 
@@ -121,9 +121,9 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
             owed[decision.id] = bool(y)
         elif decision.action is Action.VERIFY:
             engine.report(decision.id, bool(y))
-    overdue = engine.store.outcomes(0, within=20).overdue_audited_accepts
-    assert overdue > 3 > engine.store.outcomes().overdue_audited_accepts == 0
-    assert engine.certificate().accepted.n_bad == overdue + engine.store.outcomes().audited_accepts_bad
+    overdue = engine.store.tally(within=20).outcomes.overdue_audited_accepts
+    assert overdue > 3 > engine.store.tally().outcomes.overdue_audited_accepts == 0
+    assert engine.certificate().accepted.n_bad == overdue + engine.store.tally().outcomes.audited_accepts_bad
     assert beyond(engine) == [overdue, overdue]
     engine.close()
     shutil.copytree(tmp_path, tmp_path / "other")
@@ -134,7 +134,7 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     engine.flush()
     engine.decide(stream.X[0])  # what was told before is told anew once the labels are stored
     assert beyond(engine) == [0, 0]
-    assert engine.certificate().accepted.n_bad == engine.store.outcomes().audited_accepts_bad
+    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.audited_accepts_bad
     engine = DataEngine.open(tmp_path / "other" / "owed.db", replaying=True)
     engine.set_policy(replace(engine.policy, alpha=0.2))
     engine.report(*next(iter(owed.items())))  # the rule is told anew, of nothing that was owed under another policy
@@ -150,7 +150,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
         engine.decide(x + np.float32(0.02))
     engine.start_retrain()
     assert beyond(engine) == [0, 0]
-    assert engine.store.last_version().last_seq == engine.store.evidence_since(0).seq[-1]
+    assert engine.store.last_version().last_seq == engine.store.evidence_since(0)[-1].seq
 
 
 def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
@@ -162,7 +162,7 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     play(engine, spoiled(stream))
     assert engine.safe_mode
     status = engine.store.status()
-    outcomes = engine.store.outcomes()
+    outcomes = engine.store.tally().outcomes
     assert status["labels"] == status["actions"]["verify"] + outcomes.stops + outcomes.confirmed
 
 

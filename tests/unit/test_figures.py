@@ -11,16 +11,10 @@ from matplotlib.figure import Figure
 from sklearn.decomposition import PCA
 
 from dengine import ConvReducer, Policy, Recipe, RetrainReport
-from dengine.experiments.figures import (
-    curves,
-    embedding_map,
-    is_probability,
-    run_picture,
-    save,
-    window_curves,
-)
+from dengine.experiments.figures import curves, embedding_map, run_picture, save, window_curves
 from dengine.experiments.replay import Replay, gather
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_lines
+from dengine.reducers import has_own_unit
 from tests.support.replays import replay_of as by_hand
 
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
@@ -100,7 +94,7 @@ def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() ->
     assert "for the eye" in left.get_ylabel()
     assert [ball.get_radius() for ball in left.patches] == [0.05]
     asked = ("rocket", ConvReducer(), "dengine.reducers.conv:ConvReducer", PCA(2), "sklearn.decomposition:PCA")
-    assert [is_probability(Recipe(reducer)) for reducer in asked] == [True, True, True, False, False]
+    assert [has_own_unit(Recipe(reducer)) for reducer in asked] == [True, True, True, False, False]
 
 
 def log_of(clock_s: np.ndarray | None) -> Replay:

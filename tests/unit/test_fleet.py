@@ -15,6 +15,7 @@ from sklearn.decomposition import PCA
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
+from dengine.store import verify_history
 from dengine.store.peers import list_cells
 from dengine.store.records import address
 from tests.conftest import DATABASES, insertion_like, url_of
@@ -24,7 +25,7 @@ from tests.support.plans import plans
 
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
-CONV = Recipe.load("conv").with_settings(retrain_every=EVERY, max_steps=10)
+CONV = Recipe.load("conv").with_settings(retrain_every=EVERY)
 POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
 
 
@@ -211,7 +212,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet: Fl
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
     assert second.new_labels == first.new_labels
-    found = [engine.store.verify() for engine in (first, second)]
+    found = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in found] == [(), ()]
     assert found[0].cells[0].digest != found[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
@@ -228,10 +229,10 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(120))
     learn(second, parts, range(120, 160))
-    evidence = [len(engine.store.evidence_since(0).seq) for engine in (first, second)]
+    evidence = [len(engine.store.evidence_since(0)) for engine in (first, second)]
     assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
-    assert first.store.outcomes() != second.store.outcomes()
+    assert first.store.tally().outcomes != second.store.tally().outcomes
     assert rule(second)["evidence.told"] != rule(fleet.engine("c", recipe=POOLED))["evidence.told"]
     assert second.store.get_decision("nobody") is None
 

@@ -1,7 +1,5 @@
 """A version that was trained beside the cell comes in by steps: none of them waits for the store or for many labels."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dengine import load_dataset
 from dengine.decision.novelty import NoveltyGate, fit_novelty
 from dengine.decision.rule import script
+from tests.slow.proof.garbage import KINDS
 
 Traces = NDArray[np.float32]
 LEARNED = 800
@@ -23,7 +24,6 @@ def shuffled() -> Traces:
 TRACES = shuffled()
 KNOWN, HELD_OUT = TRACES[:LEARNED], TRACES[LEARNED:]
 MEAN, SD = float(KNOWN.mean()), float(KNOWN.std())
-SECONDS = np.arange(KNOWN.shape[2]) / 500.0
 
 
 @pytest.fixture(scope="module")
@@ -35,24 +35,18 @@ def share(gate: NoveltyGate, traces: Traces) -> float:
     return float(np.mean([gate(torch.from_numpy(np.array(x, dtype=np.float32))) for x in traces]))
 
 
-def noise(x: Traces, rng: np.random.Generator) -> Traces:
-    return (MEAN + SD * rng.normal(size=x.shape)).astype(np.float32)
-
-
 def spike(x: Traces, rng: np.random.Generator) -> Traces:
     spiked = x.copy()
     spiked[np.arange(len(x)), 0, rng.integers(0, x.shape[2], len(x))] += 4 * SD
     return spiked
 
 
-def hum(x: Traces, rng: np.random.Generator) -> Traces:
-    return (x + 10.0 * np.sin(2 * np.pi * 50 * SECONDS + rng.uniform(0, 6.28, (len(x), 1, 1)))).astype(np.float32)
+def proofs(name: str) -> Callable[[Traces, np.random.Generator], Traces]:
+    """A kind of the proof's."""
+    return lambda x, rng: KINDS[name](x[:, 0], x[:, 0], rng)[:, None].astype(np.float32)
 
 
-def sine(x: Traces, rng: np.random.Generator) -> Traces:
-    return (MEAN + SD * np.sin(2 * np.pi * 5 * SECONDS + rng.uniform(0, 6.28, (len(x), 1, 1)))).astype(np.float32)
-
-
+noise, sine, hum = (proofs(name) for name in ("white noise", "sine", "hum on good parts"))
 GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "noise": noise,
     "sine": sine,

@@ -1,7 +1,5 @@
 """Recordings as people have them: every form gives the same traces, and what cannot be read is named and alone is lost."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path

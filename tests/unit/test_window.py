@@ -1,7 +1,5 @@
 """The window of the newest labelled traces: what was handed out stays as it was, whatever comes in afterwards."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -6,8 +6,6 @@
 Nothing waits: the cell's clock counts the seconds that production would have taken.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np

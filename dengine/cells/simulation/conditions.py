@@ -1,7 +1,5 @@
 """What varies from one simulated insertion to the next: settings with their units, one cycle's draw, and scenarios."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 

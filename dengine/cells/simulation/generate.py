@@ -3,8 +3,6 @@
 As in `save_insertions("traces.npz", simulate(100, seed=0), seed=0)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from io import BytesIO

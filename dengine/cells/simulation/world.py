@@ -7,8 +7,6 @@ boxes, because MuJoCo turns colliding meshes into their convex hulls and would c
 Source: Todorov, Erez and Tassa (2012), MuJoCo: A physics engine for model-based control, IROS.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

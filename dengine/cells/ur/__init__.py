@@ -6,8 +6,6 @@ getters answer with the last values for ever. Ours keeps every package, goes by 
 again, and writes orders over the connection that answers them.
 """
 
-from __future__ import annotations
-
 from .cell import UrCell
 from .controller import FakeController, RobotProgram, Trouble
 from .recorder import InsertionRecord, RtdeRecorder

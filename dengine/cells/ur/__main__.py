@@ -3,8 +3,6 @@
 python -m dengine.cells.ur --port 30004 --speed 10
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 

@@ -10,8 +10,6 @@ once, and an old answer is known as old. While the robot inserts, `output_int_re
 trigger. A program that starts answers an old order with VOID. `training/ur_cell.script` is one.
 """
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from enum import IntEnum

@@ -7,8 +7,6 @@ It keeps to the published protocol as far as a client can see it, steps 500 time
 do what real ones do on bad days: `Trouble`.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 import struct

@@ -5,8 +5,6 @@ is a list of fields that the controller has given types to: a data package is th
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

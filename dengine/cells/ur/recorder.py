@@ -6,8 +6,6 @@ with RtdeRecorder("192.168.1.10", trigger="bit=0") as recorder:
         decision = engine.decide(insertion.trace)
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager

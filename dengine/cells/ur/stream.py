@@ -1,7 +1,5 @@
 """All that a controller sends, in order, by a thread that reads and connects again where the connection is lost."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

@@ -5,8 +5,6 @@ Cells that take long run again with fewer replays and parts; those that are exac
 After a change: `jupyter execute --inplace notebooks/NAME.ipynb`, and look at every picture.
 """
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from typing import Any

@@ -11,8 +11,6 @@ of the engine before. Exit code 1 if anything was lost, decided otherwise, or ra
 --mutations breaks dengine in each of `MUTATIONS`' ways in a copy of the tree, where the row that it names must fail.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -1,7 +1,5 @@
 """A small cell under test: it notes what was acknowledged and how long it waited, and is looked at afterwards."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

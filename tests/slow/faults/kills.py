@@ -5,8 +5,6 @@ Then, too, what a killed cell leaves is damaged: its write-ahead log is cut, or 
 The children come from a server of forks that has imported everything, so that a kill costs what it kills and no start.
 """
 
-from __future__ import annotations
-
 import http.client
 import json
 import multiprocessing

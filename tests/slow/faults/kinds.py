@@ -1,7 +1,5 @@
 """Faults of a running cell's store, disk, server, clock and processes; and what is found changed when it is opened."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

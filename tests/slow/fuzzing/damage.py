@@ -3,8 +3,6 @@
 DENGINE_FUZZ=20000 python -m pytest tests/slow/fuzzing --hypothesis-seed=1
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from typing import Any

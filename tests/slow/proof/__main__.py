@@ -6,8 +6,6 @@
 Writes proof.csv (a row a configuration) and proof.md (the tables) into the folder that `--docs` names.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import itertools
