@@ -34,6 +34,7 @@ LARGEST = 2**20  # bytes of a recipe's file
 WHOLE = {  # the least and the most; beyond the latter no machine goes, and an error now is better than one at each retrain
     "folds": (2, 1000),
     "retrain_every": (1, 10**9),
+    "max_steps": (0, 10**9),
     "window": (10, 10**8),
 }
 OBJECT = "object "  # before the class of a reducer that TOML cannot say
@@ -49,7 +50,8 @@ class Recipe:
     radius : of the ball whose labels count, in units of the scaled embedding.
     folds : K of honest counting, for a reducer that uses labels.
     retrain_every : new labels between two retrains.
-    budget : seconds of wall time that a retrain may take in a live engine; a replay stops on the reducer's own steps.
+    budget : seconds of wall time that a retrain may take in a live engine.
+    max_steps : optimiser steps of a retrain at most; None: the reducer's own. A replay stops on steps alone.
     window : labelled traces that train and are counted, the newest ones; chosen blind to labels.
     novelty : a trace is novel where its squared distance to the nearest learned one, in level or in texture, is more than
         so many times that which 99.5 % of these have from one another; 0: nothing is novel.
@@ -62,13 +64,15 @@ class Recipe:
     folds: int = 5
     retrain_every: int = 50
     budget: float = 0.45
+    max_steps: int | None = None
     window: int = 10_000
     novelty: float = NOVELTY
 
     def __post_init__(self) -> None:
         for name, (least, most) in WHOLE.items():
             value = getattr(self, name)
-            expect(is_whole(value, least, most), f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
+            held = is_whole(value, least, most) or (name == "max_steps" and value is None)
+            expect(held, f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
         expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
         novelty = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
         expect(novelty, "a finite novelty of 0 or more", self.novelty, "0 turns it off")

@@ -25,7 +25,7 @@ from .decision.rule import script
 from .engine.engine import DataEngine
 from .folds import content_fold
 from .recipe import Recipe
-from .reducers.base import Floats, Ints, Reducer, as_reducer, uses_labels
+from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer, uses_labels
 
 N, SAMPLES, FOLDS = 100, 120, 2
 SHAPES = ((1, 152), (1, 800), (3, 90))  # channels, samples
@@ -201,7 +201,7 @@ def _trained(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reduce
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)
     for _ in range(times):
-        trained.train(X, y if labels is None else labels, content_fold(X, trained.n_spaces))
+        trained.train(X, y if labels is None else labels, content_fold(X, trained.n_spaces), StopRule(max_steps=8))
     return trained
 
 

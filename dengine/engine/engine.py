@@ -64,7 +64,7 @@ from .settings import (
     peers_trace,
     refuse_idle,
 )
-from .trainer import Clock, Retrainer, Window
+from .trainer import Clock, Limits, Retrainer, Window
 from .versions import ModelVersions
 
 if TYPE_CHECKING:
@@ -215,8 +215,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         reading: bool = False,
     ) -> None:
         torch.set_num_threads(1)
-        budget = None if replaying else settings.recipe.budget
-        retrainer = Retrainer(Window(settings.recipe.window), budget, executor, clock)
+        limits = Limits(None if replaying else settings.recipe.budget, settings.recipe.max_steps)
+        retrainer = Retrainer(Window(settings.recipe.window), limits, executor, clock)
         self._outbox = Outbox(store, settings.recipe.window, not reading, replaying)
         weakref.finalize(self, _close, self._outbox)  # of a program that forgot to
         self._alone = Alone()

@@ -26,7 +26,7 @@ log = logging.getLogger("dengine")
 
 SEEDS = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # What counts for any model.
-LOOP = ("seed", "trace", "retrain_every", "budget", "window", "audit_rate", "stops", "windows")
+LOOP = ("seed", "trace", "retrain_every", "budget", "max_steps", "window", "audit_rate", "stops", "windows")
 MARKS = ("policy_since", "told_since", "began_in")  # of what a change of policy set, as the store has them
 
 

@@ -109,6 +109,14 @@ class TrainedOn:
 
 
 @dataclass(frozen=True)
+class Limits:
+    """What a retrain may use: seconds of wall time, and optimiser steps; None: no limit."""
+
+    budget: float | None = None
+    max_steps: int | None = None
+
+
+@dataclass(frozen=True)
 class Trained:
     """The outcome of a training.
 
@@ -128,19 +136,18 @@ class Trained:
 class Retrainer:
     """Trains candidates on a window, in line or beside the cell.
 
-    budget : seconds of wall time that a retrain may take; None: no limit.
     clock : in seconds; it must pickle for a process executor.
     """
 
-    def __init__(self, window: Window, budget: float | None, executor: Executor | None, clock: Clock) -> None:
-        self.window, self.budget, self.executor, self.clock = window, budget, executor, clock
+    def __init__(self, window: Window, limits: Limits, executor: Executor | None, clock: Clock = time.perf_counter) -> None:
+        self.window, self.limits, self.executor, self.clock = window, limits, executor, clock
         self.future: Future[Trained] | None = None
         self._began = 0.0  # monotonic seconds
         self._seq = np.zeros(0, dtype=np.int64)  # labels that it was given
 
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model, in line; begin : when work on it began."""
-        return replace(train_candidate(current.successor(), self.window.snapshot(), self.budget, self.clock), begin=begin)
+        return replace(train_candidate(current.successor(), self.window.snapshot(), self.limits, self.clock), begin=begin)
 
     def start(self, current: EngineModel) -> bool:
         """Train a successor of the current model beside the cell; False without an executor that takes work."""
@@ -148,7 +155,7 @@ class Retrainer:
             return False
         data = self.window.snapshot()
         try:
-            self.future = self.executor.submit(train_candidate, current.successor(), data, self.budget, self.clock)
+            self.future = self.executor.submit(train_candidate, current.successor(), data, self.limits, self.clock)
         except RuntimeError as error:  # it is broken or shut down, and the caller's: it cannot be made anew here
             log.error("the executor takes no more work, retrains are in line from now on: %s", error)
             self.executor = None
@@ -181,14 +188,15 @@ class Retrainer:
         return f"dropped: RuntimeError: {what} Retrains are in line from now on."
 
 
-def train_candidate(successor: EngineModel, data: Labelled, budget: float | None, clock: Clock) -> Trained:
+def train_candidate(successor: EngineModel, data: Labelled, limits: Limits, clock: Clock) -> Trained:
     """Train a successor on the data; a plain function, so that any executor can run it.
 
     The gate reads no label: one on held-out loss would let fold k's labels choose encoder k.
     """
     torch.set_num_threads(1)  # per thread, and first thing in each
     begin = clock()
-    stop = StopRule(None if budget is None else begin + STEPS * budget, clock)
+    deadline = None if limits.budget is None else begin + STEPS * limits.budget
+    stop = StopRule(deadline, limits.max_steps, clock)
     n_steps, reason = 0, ""
     try:
         if not len(data.seq):

@@ -45,11 +45,14 @@ class StopRule:
     """
 
     deadline: float | None = None
+    max_steps: int | None = None
     clock: Callable[[], float] = time.perf_counter
     late: bool = False
 
     def exhausted(self, step: int, least: int = 0) -> bool:
         """Whether step number `step`, from 0, may no longer begin; the first `least` may, after the deadline too."""
+        if self.max_steps is not None and step >= self.max_steps:
+            return True
         self.late = self.deadline is not None and self.clock() >= self.deadline and step >= least
         return self.late
 

@@ -15,7 +15,7 @@ from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
 
-CONV = replace(Recipe.load("conv"), retrain_every=30, policy=Policy(alpha=0.1, lower_bound=0.9))
+CONV = replace(Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9))
 
 
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:

@@ -110,7 +110,7 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
 
 @pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
 def test_a_server_that_is_killed_leaves_no_retraining_process_behind(tmp_path: Path, parts: Dataset, at_work: bool) -> None:
-    recipe = Recipe("conv", retrain_every=20, budget=300.0)
+    recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
     with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0", wait=at_work) as process:
         if at_work:

@@ -23,7 +23,7 @@ RECIPES = {
     "watched": Recipe.load("pca").with_settings(policy=replace(LOCAL, stops="all"), retrain_every=40),
     "pooled": Recipe.load("pca").with_settings(policy=POOLED, retrain_every=40),
     "full block": replace(Recipe.load("pca").with_policy(alpha=0.2, lower_bound=0.8), window=60, retrain_every=25),
-    "folds": replace(Recipe.load("conv").with_policy(alpha=0.2, lower_bound=0.8), retrain_every=60, folds=2),
+    "folds": replace(Recipe.load("conv").with_policy(alpha=0.2, lower_bound=0.8), retrain_every=60, folds=2, max_steps=8),
 }
 
 

@@ -25,7 +25,7 @@ from tests.support.plans import plans
 
 EVERY = 20
 RECIPE = Recipe("pca", {"n_components": 2}, radius=0.4, retrain_every=EVERY).with_policy(alpha=0.2, lower_bound=0.8)
-CONV = Recipe.load("conv").with_settings(retrain_every=EVERY)
+CONV = Recipe.load("conv").with_settings(retrain_every=EVERY, max_steps=10)
 POOLED = RECIPE.with_policy(guarantee="pooled", stops="all", lower_bound=0.7)
 
 

@@ -31,6 +31,7 @@ def recipes(draw) -> Recipe:
         folds=draw(st.integers(2, 10)),
         retrain_every=draw(st.integers(1, 10_000)),
         budget=draw(st.floats(1e-3, 1e3)),
+        max_steps=draw(st.integers(0, 10_000)),
         window=draw(st.integers(10, 10**7)),
     )
 

@@ -212,7 +212,7 @@ def test_an_object_without_a_name_runs_and_is_handed_in_again(data: Dataset, tmp
 
 def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(data: Dataset) -> None:
     for steps in (1, 3):
-        engine = DataEngine(recipe=replace(RECIPES["conv"], params={"max_iter": steps}), replaying=True)
+        engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
         drive(engine, data, 0, 60)
         assert [r.n_steps for r in engine.store.retrains()] == [steps]
     ticks = count()
