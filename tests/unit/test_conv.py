@@ -20,8 +20,6 @@ from dengine.reducers.conv import ConvEncoder, ConvReducer, averaging
 from dengine.reducers.features import FIRST_STEPS, MANY, PAIRS, SHARES, fit_heads, masked_loss, products
 from dengine.reducers.rocket import RocketFeatures
 
-STEPS = StopRule(max_steps=20)
-
 
 def traces(n=160, channels=1, samples=152, seed=0):
     """Bumps at a random place; a late bump is a failure, with some noise in the labels."""
@@ -36,12 +34,12 @@ def traces(n=160, channels=1, samples=152, seed=0):
 
 def fitted(**params):
     X, y = traces()
-    return ConvReducer(**params).fit(X, y, stop=STEPS), X, y
+    return ConvReducer(**params).fit(X, y), X, y
 
 
-def train(reducer, X, y, stop=None):
+def train(reducer, X, y):
     """The engine's warm start; returns the reducer."""
-    reducer.train(X, y, content_fold(X, reducer.folds), stop)
+    reducer.train(X, y, content_fold(X, reducer.folds))
     return reducer
 
 
@@ -69,9 +67,9 @@ def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit():
     assert np.array_equal(again.embed(X), reducer.embed(X))
     np.testing.assert_array_equal(again.holdout_losses_, reducer.holdout_losses_)
     X2, y2 = np.concatenate([X, traces(seed=5)[0]]), np.concatenate([y, traces(seed=5)[1]])
-    cold = clone(reducer).fit(X2, y2, stop=STEPS).embed(X)
-    trained_on = train(again, X2, y2, STEPS).embed(X)
-    assert np.array_equal(trained_on, train(reducer, X2, y2, STEPS).embed(X))
+    cold = clone(reducer).fit(X2, y2).embed(X)
+    trained_on = train(again, X2, y2).embed(X)
+    assert np.array_equal(trained_on, train(reducer, X2, y2).embed(X))
     assert not np.array_equal(trained_on, cold)  # it went on from where it was
     assert all(isinstance(value, np.ndarray) for value in state.values())
 
@@ -122,7 +120,7 @@ def test_dead_channels_and_huge_scales_embed_finitely():
     X, y = traces(80, channels=2)
     X[:, 1] = 7.0
     X[:, 0] = X[:, 0] * 1e6 + 1e7
-    reducer = ConvReducer().fit(X, y, stop=STEPS)
+    reducer = ConvReducer().fit(X, y)
     Z = reducer.embed(np.concatenate([X, X * 100, X * 0]))
     assert np.isfinite(Z).all()
 
