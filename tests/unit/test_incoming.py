@@ -35,19 +35,20 @@ class Held(ThreadPoolExecutor):
         super().submit(self.go.wait, 30)
 
 
-def trained_beside(engine: DataEngine, pool: Held, data: Dataset) -> None:
-    """Forty labels set a retrain off, sixteen come in meanwhile, and it ends; nobody has looked yet."""
+@pytest.fixture
+def engine(data: Dataset) -> DataEngine:
+    """Forty labels set a retrain off beside it, sixteen came in meanwhile, and it has ended; nobody has looked yet."""
+    pool = Held()
+    engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
     learn(engine, data, range(56))
     assert engine.retraining
     assert not engine.swapping
     pool.go.set()
     pool.shutdown(wait=True)
+    return engine
 
 
-def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(data: Dataset) -> None:
-    pool = Held()
-    engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
-    trained_beside(engine, pool, data)
+def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(engine: DataEngine, data: Dataset) -> None:
     before = Slow.now
     decisions = [engine.decide(x) for x in data.X[100:109]]
     assert [d.model_version for d in decisions] == [0] * 8 + [1]  # it is taken; then sixteen labels, two a step
@@ -56,10 +57,7 @@ def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(data: Datase
     assert not engine.swapping
 
 
-def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(data: Dataset) -> None:
-    pool = Held()
-    engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
-    trained_beside(engine, pool, data)
+def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine: DataEngine) -> None:
     assert engine.settle(brief=True) is None
     assert engine.swapping
     report = engine.settle()

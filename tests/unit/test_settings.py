@@ -30,7 +30,7 @@ from dengine.recipe import RECIPES
 from dengine.reducers.features import FIRST_STEPS
 from dengine.store.records import address
 from tests.support.command_line import dengine
-from tests.support.driving import Counting, drive
+from tests.support.driving import Counting, drive, learn
 
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
@@ -217,9 +217,7 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
         assert [r.n_steps for r in engine.store.retrains()] == [steps]
     ticks = count()
     engine = DataEngine("conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks)))  # a second a look
-    ids = [engine.decide(x).id for x in data.X[:80]]
-    for name, y in zip(ids, data.y[:80], strict=True):
-        engine.report(name, bool(y))
+    learn(engine, data, range(80))
     before = next(ticks)
     report = engine.retrain()
     assert report.n_steps == FIRST_STEPS  # its budget is over before the first step; a first model takes these all the same
