@@ -212,12 +212,13 @@ class Collected:
     read: list[Recorded] = field(default_factory=list)
     encodings: Counter[str] = field(default_factory=Counter)  # of files that are not UTF-8
     unknown: Counter[str] = field(default_factory=Counter)  # words for labels
+    beside: str | os.PathLike[str] = "labels.csv"  # a file that may list labels, as an error advises
 
     def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
         """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
         try:
             self.read.append(read())
-        except (OSError, TraceError, UnreadableError) as error:
+        except (OSError, TraceError, DataError) as error:
             if isinstance(error, UnknownWordError):
                 self.unknown[error.word] += 1
             self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))

@@ -154,6 +154,23 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words:
     return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
 
 
+def in_order(path: str | os.PathLike[str]) -> list[str]:
+    """The words of a file of labels, one for each trace of an array, in order; rows that are numbered are so one by one."""
+    try:
+        table, faults = read_table(Path(path))
+    except (OSError, UnreadableError) as error:
+        raise DataError(f"Cannot read the labels in {path}: {error}.") from error
+    if faults:
+        raise DataError(f"Cannot read the labels in {path}: {faults[0]}.")
+    header = list(table.columns)
+    of_file, of_label = _columns(header, path) if len(header) > 1 else (0, 0)
+    numbers = table.iloc[:, of_file].tolist()
+    if of_file != of_label and all(number.isdecimal() for number in numbers):
+        one_by_one = [int(number) - int(numbers[0]) for number in numbers] == list(range(len(numbers)))
+        must(one_by_one, f"rows of {path} numbered one by one in column {header[of_file]}", numbers[:3])
+    return [str(word) for word in table.iloc[:, of_label]]
+
+
 def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
     try:
         table, faults = read_table(Path(path))

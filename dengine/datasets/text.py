@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files import read_archive, reading
 from ..traces import is_time
 from .dataset import Fault, UnreadableError
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 LARGEST = 128 * 2**20  # bytes of one text file
 NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
 DECIMAL = re.compile(r"(?<![^\s;\"])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;\"])")  # a whole cell
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan", re.IGNORECASE)
+UNIT = re.compile(r"\[.*\]|\(.*\)|[kmµu]?[sNVAgm]|ns|Nm|N[·*.]m|bar|Hz|rad|°C?|%|-")  # a cell of a row of units
 DAY_FIRST = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})")  # a German day
 GAP = 5.0  # median steps: a pause that a late message does not explain
 SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
@@ -31,18 +34,39 @@ UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 def cells_of(text: str) -> dict[int, list[str]]:
     """Line number -> cells, of the lines that are not blank; UnreadableError for a line of megabytes.
 
-    The delimiter is the one of , ; and tab that the first line has most of. Where it is not the comma, a comma is a
-    decimal's, as a German Excel writes numbers.
+    The delimiter is the tab or ; of which most lines have as many, or else the one of , ; and tab that the first line has
+    most of. Where it is not the comma, a comma is a decimal's, as a German Excel writes numbers.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
     delimiter = max(",;\t", key=next(iter(lines.values()), "").count)
+    for each in "\t;":
+        n, times = next(iter(Counter(line.count(each) for line in lines.values()).most_common(1)), (0, 0))
+        delimiter = each if n and 2 * times > len(lines) else delimiter
     if delimiter != ",":
         lines = {i: DECIMAL.sub(r"\1.\2", line) for i, line in lines.items()}
     try:
         rows = {i: next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    return {i: [word.strip() for word in row] for i, row in rows.items()}
+    return _from_header(list(rows), [[word.strip() for word in row] for row in rows.values()])
+
+
+def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]]:
+    """Line number -> cells from the header on, without what a recorder writes above it, and without a row of units.
+
+    A row of data has numbers where most of the last rows have them. A first line that may be the header is one, unless
+    two others that are none of data follow it: a single one is damaged data.
+    """
+    tail = rows[1:][-20:]
+    times = Counter(i for row in tail for i, word in enumerate(row) if NUMBER.fullmatch(word))
+    places = [i for i, n in times.items() if 2 * n > len(tail)]
+    told = (k for k, row in enumerate(rows) if 2 * sum(bool(NUMBER.fullmatch(row[i])) for i in places if i < len(row)) > len(places))
+    data = next(told, 0)
+    units = data > 1 and all(UNIT.fullmatch(word) for word in rows[data - 1])
+    header = max(data - 1 - units, 0)
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not all(UNIT.fullmatch(word) for word in rows[0]):
+        header = data = 0
+    return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, header)}
 
 
 def decoded(raw: bytes) -> tuple[str, str]:
@@ -85,6 +109,21 @@ def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.Da
     return pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object), faults
 
 
+def table_of(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.DataFrame, list[Fault]]:
+    """The columns of a CSV or Parquet file, or an .npz's arrays of one dimension; as `read_table`, rows from 1."""
+    import pandas as pd
+
+    if path.suffix.lower() == ".csv":
+        return read_table(path, encodings)
+    if path.suffix.lower() == ".npz":
+        with reading(path, "arrays of one length"):
+            frame = pd.DataFrame({name: x for name, x in read_archive(path)[0].items() if x.ndim == 1})
+    else:
+        with reading(path, "a Parquet file", "pyarrow", "files"):
+            frame = pd.read_parquet(path)
+    return frame.set_axis(range(1, len(frame) + 1)).set_axis(list(map(str, frame.columns)), axis=1), []
+
+
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
     """(n,) numbers, NaN where a cell says nothing; and under which index a cell holds what is no number."""
     import pandas as pd
@@ -119,7 +158,7 @@ def read_recording(
 
     An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
     """
-    frame, faults = read_table(path, encodings)
+    frame, faults = table_of(path, encodings)
     picked = frame.iloc[:, [place_of(name, list(frame.columns)) for name in channels]]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
