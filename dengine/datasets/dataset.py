@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NEAR = 0.03  # of the others' rate
+MOST_WORDS = 12  # that somebody says the meaning of
 must = partial(expect, error=DataError)
 
 
@@ -53,10 +54,10 @@ class UnreadableError(DataError):
 
 
 class UnknownWordError(UnreadableError):
-    """A label in a word that nobody said the meaning of."""
+    """A label in a word that nobody said the meaning of. what : where it is no label by its place alone."""
 
-    def __init__(self, word: str) -> None:
-        super().__init__(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
+    def __init__(self, word: str, what: str = "") -> None:
+        super().__init__(what or f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
         self.word = word
 
 
@@ -224,16 +225,21 @@ class Collected:
             self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))
 
     def must_mean_something(self) -> None:
-        """DataError where most labels are words that nobody said the meaning of."""
-        if sum(self.unknown.values()) <= len(self.read):
+        """DataError where most labels are words that nobody said the meaning of, or a tenth beside labels of one kind."""
+        kinds, n = {each.label for each in self.read}, sum(self.unknown.values())
+        if n <= (len(self.read) / 9 if len(kinds) == 1 else len(self.read)):
             return
-        words = self.unknown.most_common()
-        got = ", ".join(f"{word[:20]!r} {n} times" for word, n in words[:4])
+        words = [word for word, _ in self.unknown.most_common()]
         # The one with a syllable before it is more often the bad one; a person has to say so.
-        bad = {word for word, _ in words[:4] if any(word != other and word.endswith(other) for other, _ in words)}
-        said = [f"{word}={'bad' if word in bad or (i and not bad) else 'good'}" for i, (word, _) in enumerate(words[:4])]
-        do = f"say what they mean, label_map={','.join(said)!r} or the other way round"
-        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}; {do}.")
+        bad = {word for word in words if any(word != other and word.endswith(other) for other in words)} or {*words[1:]}
+        bad = bad if len(kinds) != 1 else {*words} if 1 in kinds else set()
+        said = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
+        do = f"say what they mean, label_map={said!r}{'' if len(kinds) == 1 else ' or the other way round'}"
+        if len(words) > MOST_WORDS:
+            do = "so many are no labels: say where they are, label='...', or list them in a file, labels='labels.csv'"
+        got = ", ".join(f"{word[:20]!r} {times} times" for word, times in self.unknown.most_common(4))
+        beside = f" beside {len(self.read)} {'good' if 1 in kinds else 'bad'} ones" if len(kinds) == 1 else ""
+        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}{beside}; {do}.")
 
     def leave_out(self, why: Mapping[int, str]) -> None:
         """Make faults of those at these places; DataError where nothing is left."""

@@ -106,7 +106,10 @@ def _usual(path: PurePosixPath, words: Words) -> int:
     if by_folder is not None and (found is None or found[2].isdecimal()):
         return by_folder
     if by_name is None:
-        raise UnreadableError("Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none")
+        what = "Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none"
+        said = (COPY.sub("", path.stem), *reversed(path.parent.parts))
+        word = next((last for name in said if not re.search(r"\d", last := re.split(r"[_\- ]", name)[-1])), "")
+        raise UnknownWordError(word, what) if word else UnreadableError(what)
     if by_folder not in (None, by_name):
         raise UnreadableError(f"Expected one label, its name and its folder {folder} contradict each other")
     return by_name

@@ -157,12 +157,12 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
     arrays each. Where only another axis is as long as the labels, it is the one of the parts.
     """
     label = asked.label or "y"
-    found, have = _archives(named, (*USED, asked.part, label, *asked.channels))
+    found, have = _archives(named, asked)
     if asked.labels is not None:
         found[label] = np.array(in_order(asked.labels))
     own = () if "X" in found else asked.channels
     if not {label, *(own or ("X",))} <= set(found):
-        raise DataError(f"Expected {_wanted_arrays(named)}")
+        raise DataError(f"Expected {_wanted_arrays(named, asked)}")
     if asked.part != "part" and asked.part not in found:
         raise DataError(f"Expected an array {asked.part} in {', '.join(named)}, found {listed(have)}.")
     with reading(name, "an .npz file of plain arrays"):
@@ -178,14 +178,15 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
         return refit(make_dataset(X, _labels(found[label], asked), name=name, **about), asked)
 
 
-def _archives(named: Files, wanted: Sequence[str] | None = None) -> tuple[dict[str, NDArray[Any]], list[str]]:
+def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The arrays of archives, and the names of all: of one form, one after the other, or as one, where none is in two."""
+    wanted = None if every else (*USED, asked.part, *filter(None, (asked.label,)), *asked.channels)
     try:
         first, *others = [read_archive(path, wanted) for path in named.values()]
     except DataError as error:
         if "Object arrays" not in str(error):
             raise
-        raise DataError(f"{error} {_of_objects(named, wanted or ())}") from error
+        raise DataError(f"{str(error).partition(':')[0]}: {_of_objects(next(iter(named.values())), asked)}") from error
     found, have = first
     for source, (arrays, names) in zip(list(named)[1:], others, strict=True):
         if not set(have) & set(names):
@@ -203,9 +204,15 @@ def _archives(named: Files, wanted: Sequence[str] | None = None) -> tuple[dict[s
     return found, have
 
 
-def _of_objects(named: Files, wanted: Sequence[str]) -> str:
-    """How to write arrays of Python objects as a table, traces of any length too: who reads them runs what they say."""
-    return ""
+def _of_objects(path: Path, asked: Asked) -> str:
+    """How a file of Python objects, as traces of several lengths, becomes a table; who reads objects runs what they say."""
+    _, have = read_archive(path, ())
+    X = next((name for name in (*asked.channels, "X") if name in have), have[0])
+    y = next((name for name in (asked.label, "y") if name in have), have[-1])
+    table = str(path.with_suffix(".csv"))
+    do = f"d = np.load({str(path)!r}, allow_pickle=True); frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))"
+    do = f'python -c "import numpy as np, pandas as pd; {do}; frame.to_csv({table!r}, index=False)"'
+    return f"Python objects, which can run code when they are read. If you trust it, make a table, {table}, of it: {do}."
 
 
 def _by_part(x: NDArray[Any], told: NDArray[Any]) -> NDArray[Any]:
@@ -215,9 +222,9 @@ def _by_part(x: NDArray[Any], told: NDArray[Any]) -> NDArray[Any]:
     return x.swapaxes(1, 2) if x.ndim == 3 and x.shape[1] > x.shape[2] else x
 
 
-def _wanted_arrays(named: Files) -> str:
+def _wanted_arrays(named: Files, asked: Asked) -> str:
     """What is missing in archives, and which of their arrays could be it: of two dimensions, and of one as long as one."""
-    found, have = _archives(named)
+    found, have = _archives(named, asked, every=True)
     traces = [name for name, x in found.items() if x.ndim in (2, 3) and len(x)]
     single = [name for name, x in found.items() if x.ndim == 1 and traces and len(x) in found[traces[0]].shape]
     told = min(single, key=lambda name: len(set(found[name].tolist())), default="")

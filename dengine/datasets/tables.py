@@ -89,6 +89,7 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
     try:
         labels.collect(named, read, told, found)
+        found.must_mean_something()
     except DataError as error:
         if asked.label or asked.labels or (listing := _listing(folder, named)) is None:
             raise
