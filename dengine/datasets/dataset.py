@@ -213,7 +213,7 @@ class Collected:
     read: list[Recorded] = field(default_factory=list)
     encodings: Counter[str] = field(default_factory=Counter)  # of files that are not UTF-8
     unknown: Counter[str] = field(default_factory=Counter)  # words for labels
-    beside: str | os.PathLike[str] = "labels.csv"  # a file that may list labels, as an error advises
+    beside: str = "labels.csv"  # a file that may list labels, as an error advises
 
     def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
         """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
@@ -308,12 +308,8 @@ def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) ->
     if fit == "strict" and low != high:
         choose = "choose fit='pad', 'cut' or 'resample'"
         raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
-    must(
-        fit != "strict" or samples in (None, low),
-        f"{low} samples, as recorded, with fit='strict'",
-        samples,
-        "choose fit='cut'",
-    )
+    as_recorded = fit != "strict" or samples in (None, low)
+    must(as_recorded, f"{low} samples, as recorded, with fit='strict'", samples, "choose fit='cut'")
     if samples is None:
         samples = int(lengths[2 * lengths >= median].min()) if fit == "cut" else median
     return fit, samples

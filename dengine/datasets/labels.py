@@ -24,11 +24,12 @@ from .text import read_table
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
 COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
+SUFFIX = re.compile(r"\.(csv|parquet|pq|npz)$", re.IGNORECASE)
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
-GERMAN = ("ergebnis", "bewertung")
-LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome", *GERMAN)
+LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
+LABEL_COLUMNS += ("ergebnis", "bewertung")
 FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion", "datei", "dateiname")
 
 Words = Mapping[str, bool]
@@ -157,21 +158,13 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words:
     return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
 
 
-def in_order(path: str | os.PathLike[str]) -> list[str]:
-    """The words of a file of labels, one for each trace of an array, in order; rows that are numbered are so one by one."""
-    try:
-        table, faults = read_table(Path(path))
-    except (OSError, UnreadableError) as error:
-        raise DataError(f"Cannot read the labels in {path}: {error}.") from error
-    if faults:
-        raise DataError(f"Cannot read the labels in {path}: {faults[0]}.")
-    header = list(table.columns)
-    of_file, of_label = _columns(header, path) if len(header) > 1 else (0, 0)
-    numbers = table.iloc[:, of_file].tolist()
-    if of_file != of_label and all(number.isdecimal() for number in numbers):
-        one_by_one = [int(number) - int(numbers[0]) for number in numbers] == list(range(len(numbers)))
-        must(one_by_one, f"rows of {path} numbered one by one in column {header[of_file]}", numbers[:3])
-    return [str(word) for word in table.iloc[:, of_label]]
+def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
+    """The words of a file of labels, of an array's traces in turn; DataError where its rows are numbered otherwise."""
+    rows, faults = _rows(path, part)
+    numbers = [int(row.file) for row in rows if row.file.isdecimal()]
+    if faults or (numbers and numbers != list(range(numbers[0], numbers[0] + len(rows)))):
+        raise DataError(f"Expected a label of each trace in {path}, in their order, got {faults[0] if faults else numbers[:9]}.")
+    return [row.label for row in rows]
 
 
 def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
@@ -197,7 +190,7 @@ def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fau
 def _words(path: str) -> tuple[str, ...]:
     """A path's file and folders, from its end, in lower case, without suffix, as Windows or another system writes it."""
     words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
-    return words.pop().removesuffix(".csv"), *reversed(words)
+    return SUFFIX.sub("", words.pop()), *reversed(words)
 
 
 def _alike(one: Sequence[str], other: Sequence[str]) -> bool:

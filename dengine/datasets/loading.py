@@ -159,7 +159,7 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
     label = asked.label or "y"
     found, have = _archives(named, asked)
     if asked.labels is not None:
-        found[label] = np.array(in_order(asked.labels))
+        found[label] = np.array(in_order(asked.labels, asked.part))
     own = () if "X" in found else asked.channels
     if not {label, *(own or ("X",))} <= set(found):
         raise DataError(f"Expected {_wanted_arrays(named, asked)}")
@@ -189,18 +189,17 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
         raise DataError(f"{str(error).partition(':')[0]}: {_of_objects(next(iter(named.values())), asked)}") from error
     found, have = first
     for source, (arrays, names) in zip(list(named)[1:], others, strict=True):
-        if not set(have) & set(names):
+        if set(have).isdisjoint(names):
             found, have = found | arrays, have + names
             continue
         for key in sorted({*found, *arrays}):
-            forms = [key in each and (each[key].dtype.kind in "US", each[key].shape[1:]) for each in (found, arrays)]
-            if forms[0] != forms[1]:
-                shapes = " and ".join(str(each[key].shape) if key in each else "none" for each in (found, arrays))
-                raise DataError(f"Expected arrays {key} of one form in {next(iter(named))} and {source}, got {shapes}.")
-            if key not in ("scale", "rate_hz", "unit", "channels"):
-                found[key] = np.concatenate([found[key], arrays[key]])
-            elif not np.array_equal(found[key], arrays[key]):
-                raise DataError(f"Expected one {key} in {next(iter(named))} and {source}, got {found[key]} and {arrays[key]}.")
+            one, other = found.get(key), arrays.get(key)
+            alike = one is not None and other is not None and one.shape[1:] == other.shape[1:]
+            if alike and one.ndim and key != "channels":
+                found[key] = np.concatenate([one, other])
+            elif not alike or not np.array_equal(one, other):
+                form = [getattr(x, "shape", None) or x for x in (one, other)]
+                raise DataError(f"Expected {key} alike in {next(iter(named))} and {source}, got {form[0]} and {form[1]}.")
     return found, have
 
 

@@ -24,7 +24,7 @@ from ..files import read_archive
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NUMBER, cells_of, decoded, floats, numbers, rate_of, read_recording, table_of
+from .text import NUMBER, cells_of, decoded, floats, numbers, read_recording, recording_of, table_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,7 +73,7 @@ def _holds_many(path: Path, asked: Asked, told: bool) -> bool:
         header = _top(path)[0]
         wide = sum(len(names) for names in _numbered(header).values() if len(names) >= MANY)
         known = path.suffix.lower() != ".csv" or asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS)
-        return wide > FEWEST * len(header) or bool(known and not told and _long_columns(table_of(path)[0], asked))
+        return wide > FEWEST * len(header) or bool(known and not told and _long_columns(table_of(path)[0], asked, ""))
     return False
 
 
@@ -85,7 +85,7 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
         told = labels.named(asked.label, asked.words)
     else:
         told = labels.listed(asked.labels, asked.part, list(named), asked.words)
-    found = Collected(name, asked.channels or _usual_channel(named.values(), folder))
+    found = Collected(name, asked.channels or _usual_channel(named.values(), asked))
     read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
     try:
         labels.collect(named, read, told, found)
@@ -98,13 +98,13 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     return as_dataset(found, asked)
 
 
-def _top(path: Path, lines: int = 100) -> list[list[str]]:
-    """A file's columns, and the cells of a CSV file's first lines; none where it cannot be read, which is said later."""
+def _top(path: Path) -> list[list[str]]:
+    """A file's columns, and cells of a CSV file's rows; none where it cannot be read, which is said when the whole file is."""
     with suppress(DataError, OSError):
         if path.suffix.lower() != ".csv":
             return [list(table_of(path)[0].columns)]
         with path.open("rb") as file:
-            text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:lines]))
+            text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
         return list(cells_of(text).values()) or [[]]
     return [[]]
 
@@ -112,11 +112,8 @@ def _top(path: Path, lines: int = 100) -> list[list[str]]:
 def _listing(folder: Path, named: Mapping[str, Path]) -> Path | None:
     """The file whose second line names another one, as a file of labels does."""
     stems = {path.stem.lower() for path in named.values()}
-    for path in folder.rglob("*.csv"):
-        words = {re.sub(r"\.(csv|parquet|pq|npz)$", "", word.lower()) for row in _top(path)[1:2] for word in row}
-        if words & (stems - {path.stem.lower()}):
-            return path
-    return None
+    words = {path: {labels.SUFFIX.sub("", word.lower()) for word in _top(path)[-1]} for path in folder.rglob("*.csv")}
+    return next((path for path, said in words.items() if said & (stems - {path.stem.lower()})), None)
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -125,16 +122,12 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
 
-def _usual_channel(paths: Iterable[Path], folder: Path) -> tuple[str, ...]:
+def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
     headers = [tuple(name for name in _top(path)[0] if name and not is_time(name)) for path in paths]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
-    usual = Counter(headers).most_common(1)[0][0]
-    if len(usual) != 1:
-        have = f"the columns of {folder} are {listed(usual) or 'none'}"
-        raise DataError(f"Expected the channel to be named, as in channel={next(iter(usual), FORCE)!r}; {have}.")
-    return usual
+    return _chosen(Counter(headers).most_common(1)[0][0], asked)
 
 
 def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
@@ -146,14 +139,14 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
             frame, faults = table_of(path, found.encodings)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
-        words = [word for word in frame.columns if not word.isdecimal()]
-        if path.suffix.lower() == ".csv" and 2 * sum(NUMBER.fullmatch(word) is not None for word in words) > len(frame.columns) > 2:
+        odd = [word for word in frame.columns if NUMBER.fullmatch(word) and not word.isdecimal()]
+        if path.suffix.lower() == ".csv" and 2 * len(odd) > len(frame.columns) > 2:
             raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
         if frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         found.faults += [replace(fault, source=source) for fault in faults]
         tables[source] = frame
-        found.beside = next((p for p in sorted(path.parent.glob("*.csv")) if p not in named.values()), found.beside)
+        found.beside = next((str(p) for p in path.parent.glob("*.csv") if p not in named.values()), found.beside)
     return _from_tables(tables, asked, found)
 
 
@@ -165,15 +158,13 @@ def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
 
 def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected) -> Dataset:
     """Tables of one form, by the names of their files, whose lines are their index."""
-    forms = {source: _form(frame.columns) for source, frame in tables.items()}
-    first = next(iter(tables))
+    first, *_ = tables
     for source, frame in tables.items():
         twice = frame.columns[frame.columns.duplicated()]
         if len(twice):
             raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
-        if apart := forms[source] ^ forms[first]:
-            have = f"{listed(sorted(apart & forms[first])) or 'none'} and {listed(sorted(apart & forms[source])) or 'none'}"
-            raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {have}.")
+        if apart := listed(sorted(_form(frame) ^ _form(tables[first]))):
+            raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
     if asked.time is not None or asked.labels is not None:
         return _from_long(_one_long(tables, asked), asked, found, first)
     for source, frame in tables.items():
@@ -181,10 +172,10 @@ def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collec
     return as_dataset(found, asked)
 
 
-def _form(columns: Iterable[str]) -> set[str]:
+def _form(frame: pd.DataFrame) -> set[str]:
     """The columns of a table, without regard to how many samples it has of a channel."""
-    several = {name: channel for channel, names in _numbered(columns).items() if len(names) > 1 for _, name in names}
-    return {several.get(name, name) for name in columns}
+    several = {name: channel for channel, names in _numbered(frame.columns).items() if len(names) > 1 for _, name in names}
+    return {several.get(name, name) for name in frame.columns}
 
 
 def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> None:
@@ -225,17 +216,14 @@ def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
     frame = pd.concat(tables.values())
     if len(tables) == 1 or asked.part not in frame:
         return frame
-    at: dict[str, str] = {}
-    homes, last = list[str](), ""
+    at, last, homes = dict[str, str](), "", list[str]()
     for source, table in tables.items():
-        numbers = table[asked.part].astype(str)
-        goes_on = {last} & {numbers.iloc[0]}
-        at = {number: at[number] if number in goes_on else source for number in numbers.unique()}
-        homes += numbers.map(at).tolist()
-        last = numbers.iloc[-1]
-    home, number = pd.Series(homes, frame.index), frame[asked.part].astype(str).where(frame[asked.part].notna())
+        part = table[asked.part].astype(str).tolist()
+        at = {number: at[last] if number == last == part[0] else source for number in part}
+        homes, last = homes + [f"{at[number]}/{number}" for number in part], part[-1]
+    number, home = frame[asked.part].astype(str).where(frame[asked.part].notna()), pd.Series(homes, frame.index)
     twice = home.groupby(number.to_numpy()).transform("nunique") > 1
-    return frame.assign(**{asked.part: number.where(~twice, home + "/" + number)})
+    return frame.assign(**{asked.part: number.where(~twice, home)})
 
 
 def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> Dataset:
@@ -244,7 +232,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     for name in (asked.part, time):
         if name not in frame:
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
-            advice = f"; name {names}" if (names := _long_columns(frame, asked, found)) else ""
+            advice = f"; name {names}" if (names := _long_columns(frame, asked, found.beside)) else ""
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
     label = None if asked.labels is not None else _label_column(frame, asked, found)
     frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
@@ -254,11 +242,10 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     frame = frame.assign(**{time: frame[time] if odd else times})
     parts = {str(part): rows for part, rows in frame.groupby(asked.part, sort=False)}
 
+    places = [frame.columns.get_loc(name) for name in found.channels]
+
     def read(rows: pd.DataFrame) -> tuple[NDArray[np.float32], float | None]:
-        values, wrong = numbers((rows := rows.sort_values(time, kind="stable"))[list(found.channels)])
-        if wrong:
-            raise UnreadableError(wrong[min(wrong)], min(wrong))
-        return np.ascontiguousarray(values.T), None if asked.rate_hz else rate_of(rows, time)
+        return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
 
     def find(part: str) -> labels.Known:
         words = parts[part][label].dropna().unique().tolist()
@@ -290,9 +277,8 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
     return wide.reset_index().set_axis(range(1, len(wide) + 1))
 
 
-def _long_columns(frame: pd.DataFrame, asked: Asked, found: Collected | None = None) -> str:
+def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
-    beside = "labels.csv" if found is None else found.beside
     time = next((name for name in frame.columns if is_time(name)), None)
     if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
@@ -302,7 +288,7 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, found: Collected | None = N
     if not few:
         return ""
     part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
-    told = f"label={label!r}" if label != part else f"labels={str(beside)!r}, a file of parts and labels"
+    told = f"label={label!r}" if label != part else f"labels={beside!r}, a file of parts and labels"
     told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
     return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"
 
@@ -329,7 +315,7 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
         if asked.label not in frame:
             raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
-    if asked.time is None and (advice := _long_columns(frame, asked, found)):
+    if asked.time is None and (advice := _long_columns(frame, asked, found.beside)):
         raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
     known = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
     if known is not None:

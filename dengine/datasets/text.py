@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,19 +54,18 @@ def cells_of(text: str) -> dict[int, list[str]]:
 def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]]:
     """Line number -> cells from the header on, without what a recorder writes above it, and without a row of units.
 
-    A row of data has numbers where most of the last rows have them. A first line that may be the header is one, unless
-    two others that are none of data follow it: a single one is damaged data.
+    A row of data has numbers in most columns that have them in the last rows. A first line that may be the header is one,
+    if only one other line is above the data: that is damaged data.
     """
-    tail = rows[1:][-20:]
-    times = Counter(i for row in tail for i, word in enumerate(row) if NUMBER.fullmatch(word))
-    places = [i for i, n in times.items() if 2 * n > len(tail)]
-    told = (k for k, row in enumerate(rows) if 2 * sum(bool(NUMBER.fullmatch(row[i])) for i in places if i < len(row)) > len(places))
-    data = next(told, 0)
-    units = data > 1 and all(UNIT.fullmatch(word) for word in rows[data - 1])
-    header = max(data - 1 - units, 0)
-    if header == 1 and len(rows[0]) >= len(rows[data]) and not all(UNIT.fullmatch(word) for word in rows[0]):
+    numbers: Callable[[list[str]], frozenset[int]]
+    numbers = lambda row: frozenset(i for i, word in enumerate(row) if NUMBER.fullmatch(word))  # noqa: E731
+    usual = Counter(map(numbers, rows[1:][-20:])).most_common(1)
+    data = next((k for k, row in enumerate(rows) for some, _ in usual if 2 * len(numbers(row) & some) > len(some)), 0)
+    units = [all(map(UNIT.fullmatch, row)) for row in rows[:data]]
+    header = max(data - 1 - (data > 1 and units[-1]), 0)
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not units[0]:
         header = data = 0
-    return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, header)}
+    return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, 1)}
 
 
 def decoded(raw: bytes) -> tuple[str, str]:
@@ -154,20 +153,27 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
 def read_recording(
     path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]
 ) -> tuple[NDArray[np.float32], float | None]:
-    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault.
-
-    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
-    """
+    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault."""
     frame, faults = table_of(path, encodings)
-    picked = frame.iloc[:, [place_of(name, list(frame.columns)) for name in channels]]
+    places = [place_of(name, list(frame.columns)) for name in channels]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
     if frame.empty:
         raise UnreadableError("Expected samples below the header, found none", 1)
-    values, wrong = numbers(picked)
+    return recording_of(frame, places, timed)
+
+
+def recording_of(
+    rows: pd.DataFrame, places: Sequence[int], timed: bool, time: str | None = None
+) -> tuple[NDArray[np.float32], float | None]:
+    """Rows, a sample each, as (C, T), and their rate, if timed, as `rate_of`. places : of the channels' columns.
+
+    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
+    """
+    values, wrong = numbers(rows.iloc[:, places])
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
-    return np.ascontiguousarray(values.T), rate_of(frame) if timed else None
+    return np.ascontiguousarray(values.T), rate_of(rows, time) if timed else None
 
 
 def place_of(name: str, header: Sequence[str]) -> int:
