@@ -180,19 +180,21 @@ def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
 
 def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The arrays of archives, and the names of all: of one form, one after the other, or as one, where none is in two."""
-    wanted = None if every else (*USED, asked.part, *filter(None, (asked.label,)), *asked.channels)
+    label = asked.label or "y"
+    wanted = None if every else (*USED, asked.part, label, *asked.channels)
     try:
-        first, *others = [read_archive(path, wanted) for path in named.values()]
+        read = [read_archive(path, wanted) for path in named.values()]
     except DataError as error:
         if "Object arrays" not in str(error):
             raise
         raise DataError(f"{str(error).partition(':')[0]}: {_of_objects(next(iter(named.values())), asked)}") from error
-    found, have = first
-    for source, (arrays, names) in zip(list(named)[1:], others, strict=True):
+    first, *others = [{key: _by_part(x, arrays.get(label)) for key, x in arrays.items()} for arrays, _ in read]
+    found, have = first, read[0][1]
+    for source, arrays, (_, names) in zip(list(named)[1:], others, read[1:], strict=True):
         if set(have).isdisjoint(names):
             found, have = found | arrays, have + names
             continue
-        for key in sorted({*found, *arrays}):
+        for key in () if every else sorted({*found, *arrays}):
             one, other = found.get(key), arrays.get(key)
             alike = one is not None and other is not None and one.shape[1:] == other.shape[1:]
             if alike and one.ndim and key != "channels":
@@ -214,9 +216,11 @@ def _of_objects(path: Path, asked: Asked) -> str:
     return f"Python objects, which can run code when they are read. If you trust it, make a table, {table}, of it: {do}."
 
 
-def _by_part(x: NDArray[Any], told: NDArray[Any]) -> NDArray[Any]:
+def _by_part(x: NDArray[Any], told: NDArray[Any] | None) -> NDArray[Any]:
     """(n, ...), by the only axis that is as long as n labels; of (n, T, C), which are more samples than channels, (n, C, T)."""
-    if told.ndim == 1 and len(x) != len(told) and x.shape.count(len(told)) == 1:
+    if told is None or told.ndim != 1 or x.ndim < 2:
+        return x
+    if len(x) != len(told) and x.shape.count(len(told)) == 1:
         x = np.moveaxis(x, x.shape.index(len(told)), 0)
     return x.swapaxes(1, 2) if x.ndim == 3 and x.shape[1] > x.shape[2] else x
 
