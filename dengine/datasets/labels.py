@@ -24,6 +24,7 @@ from .text import read_table
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
 COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
+LAST = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # words without a number, at the end of a name
 SUFFIX = re.compile(r"\.(csv|parquet|pq|npz)$", re.IGNORECASE)
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
@@ -108,9 +109,9 @@ def _usual(path: PurePosixPath, words: Words) -> int:
         return by_folder
     if by_name is None:
         what = "Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none"
-        said = (COPY.sub("", path.stem), *reversed(path.parent.parts))
-        word = next((last for name in said if not re.search(r"\d", last := re.split(r"[_\- ]", name)[-1])), "")
-        raise UnknownWordError(word, what) if word else UnreadableError(what)
+        said = map(LAST.search, (COPY.sub("", path.stem), *reversed(path.parent.parts)))
+        word = next(filter(None, said), None)
+        raise UnreadableError(what) if word is None else UnknownWordError(word[1], what)
     if by_folder not in (None, by_name):
         raise UnreadableError(f"Expected one label, its name and its folder {folder} contradict each other")
     return by_name
