@@ -29,8 +29,8 @@ SUFFIX = re.compile(r"\.(csv|parquet|pq|npz)$", re.IGNORECASE)
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
-LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome")
-LABEL_COLUMNS += ("ergebnis", "bewertung")
+GERMAN = ("ergebnis", "bewertung")
+LABEL_COLUMNS = ("y", "label", "labels", "success", "result", "verdict", "class", "status", "ok", "outcome", *GERMAN)
 FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "source", "insertion", "datei", "dateiname")
 
 Words = Mapping[str, bool]
@@ -110,8 +110,8 @@ def _usual(path: PurePosixPath, words: Words) -> int:
     if by_name is None:
         what = "Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none"
         said = map(LAST.search, (COPY.sub("", path.stem), *reversed(path.parent.parts)))
-        word = next(filter(None, said), None)
-        raise UnreadableError(what) if word is None else UnknownWordError(word[1], what)
+        last = next(filter(None, said), None)
+        raise UnreadableError(what) if last is None else UnknownWordError(last[1], what)
     if by_folder not in (None, by_name):
         raise UnreadableError(f"Expected one label, its name and its folder {folder} contradict each other")
     return by_name
@@ -164,7 +164,9 @@ def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
     rows, faults = _rows(path, part)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     if faults or (numbers and numbers != list(range(numbers[0], numbers[0] + len(rows)))):
-        raise DataError(f"Expected a label of each trace in {path}, in their order, got {faults[0] if faults else numbers[:9]}.")
+        raise DataError(
+            f"Expected a label of each trace in {path}, in their order, got {faults[0] if faults else numbers[:9]}."
+        )
     return [row.label for row in rows]
 
 

@@ -29,6 +29,7 @@ from .triggers import Trigger
 BUNDLED = {"insertion": "insertion.npz"}
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # arrays, beside that of the parts' numbers
 Files = Mapping[str, Path]
+NONE = np.array("none")  # in the place of an array that is not there
 TABLES = (".csv", ".parquet", ".pq")
 FORMS = ".npz, .csv, .parquet or .mcap"
 
@@ -51,8 +52,8 @@ def load_dataset(
 ) -> Dataset:
     """A data set from recordings as people have them.
 
-    source : the name of a bundled set; a folder of CSV files, one an insertion; a wide table, a row an insertion, or a long
-        one, a row a sample, as .csv, .parquet or a DataFrame; one long recording as .mcap, or a rosbag2 folder of them; an
+    source : the name of a bundled set; a folder of CSV files, one an insertion, or of tables or archives of one form, which
+        are one set; a wide table, a row an insertion, or a long one, a row a sample, as .csv, .parquet or a DataFrame; one long recording as .mcap, or a rosbag2 folder of them; an
         .npz file with X (n, T) or (n, C, T), times the number `scale` where one is stored, and y (n,), or with arrays that
         `channel` and `label` name; the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y),
         where X may be a list of traces of any length.
@@ -63,7 +64,8 @@ def load_dataset(
     label : for a folder, a regular expression with one group that finds the label in a file's path; not given: True/False,
         OK/NOK, pass/fail, good/bad, success/failure or 1/0 at the end of its name, or as its folder's. For a table, the
         name of the column; for an .npz file of the array.
-    labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts.
+    labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts; for an .npz
+        file a row a trace.
     label_map : what other words mean, "i.O.=good,n.i.O.=bad", or a dict.  time : the column of times of a long table.
     fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
         are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
@@ -124,7 +126,9 @@ def _reader_of_files(path: Path, asked: Asked) -> tuple[Sequence[str], Callable[
         return (), partial(_read_store, path, name, asked)
     kinds = {each.suffix.lower() in TABLES: each for each in named.values()}
     if len(kinds) > 1:
-        raise DataError(f"Expected tables or .npz files in {path}, got both, as {kinds[True].name} and {kinds[False].name}.")
+        raise DataError(
+            f"Expected tables or .npz files in {path}, got both, as {kinds[True].name} and {kinds[False].name}."
+        )
     if True in kinds:
         return ("label", "labels", "time"), partial(read_tables, named, name, asked)
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
@@ -195,12 +199,11 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
             found, have = found | arrays, have + names
             continue
         for key in () if every else sorted({*found, *arrays}):
-            one, other = found.get(key), arrays.get(key)
-            alike = one is not None and other is not None and one.shape[1:] == other.shape[1:]
-            if alike and one.ndim and key != "channels":
+            one, other = found.get(key, NONE), arrays.get(key, NONE)
+            if one.ndim == other.ndim > 0 and one.shape[1:] == other.shape[1:] and key != "channels":
                 found[key] = np.concatenate([one, other])
-            elif not alike or not np.array_equal(one, other):
-                form = [getattr(x, "shape", None) or x for x in (one, other)]
+            elif not np.array_equal(one, other):
+                form = [x.shape or x for x in (one, other)]
                 raise DataError(f"Expected {key} alike in {next(iter(named))} and {source}, got {form[0]} and {form[1]}.")
     return found, have
 
@@ -217,7 +220,7 @@ def _of_objects(path: Path, asked: Asked) -> str:
 
 
 def _by_part(x: NDArray[Any], told: NDArray[Any] | None) -> NDArray[Any]:
-    """(n, ...), by the only axis that is as long as n labels; of (n, T, C), which are more samples than channels, (n, C, T)."""
+    """(n, ...), by the only axis that is as long as n labels; of (n, T, C), more samples than channels, (n, C, T)."""
     if told is None or told.ndim != 1 or x.ndim < 2:
         return x
     if len(x) != len(told) and x.shape.count(len(told)) == 1:

@@ -59,7 +59,9 @@ def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
     told = asked.labels is not None and all(path.suffix.lower() == ".csv" for path in first.values())
     with suppress(DataError):
         told = bool([labels.named(asked.label, asked.words).find(name) for name in first])
-    return 2 * sum(_holds_many(path, asked, told) for path in first.values()) >= len(first) or (len(named) == 1 and not told)
+    return 2 * sum(_holds_many(path, asked, told) for path in first.values()) >= len(first) or (
+        len(named) == 1 and not told
+    )
 
 
 def _holds_many(path: Path, asked: Asked, told: bool) -> bool:
@@ -99,7 +101,7 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
 
 
 def _top(path: Path) -> list[list[str]]:
-    """A file's columns, and cells of a CSV file's rows; none where it cannot be read, which is said when the whole file is."""
+    """A file's columns, and cells of a CSV file's first rows; none where it cannot be read, which is said later."""
     with suppress(DataError, OSError):
         if path.suffix.lower() != ".csv":
             return [list(table_of(path)[0].columns)]
@@ -330,7 +332,7 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
 
 
 def _numbered(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:
-    """Channel -> the numbers that its columns have, and these columns, by the pattern that makes most of them one channel."""
+    """Channel -> the numbers that its columns have, and these columns, by the pattern that most of one channel have."""
     found: list[dict[str, list[tuple[int, str]]]] = [{}, {}]
     for groups, pattern in zip(found, (NUMBERED, FIRST), strict=True):
         for match in filter(None, map(pattern.fullmatch, names)):

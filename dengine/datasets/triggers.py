@@ -78,11 +78,12 @@ def as_trigger(asked: Any) -> Trigger:
 class Placed(NamedTuple):
     """A window of a stream.
 
-    trace : (C, T) float32, NaN where no sample came.  missing : (m,) the places of these.
+    trace : (C, T) float32, NaN where no sample came.  missing : (m,) the places of these.  repeated : samples.
     """
 
     trace: NDArray[np.float32]
     missing: NDArray[np.int64]
+    repeated: int
 
 
 class Start(NamedTuple):
@@ -129,4 +130,4 @@ def place(times: Sequence[float], values: NDArray[np.float64], start: float, sam
     places, first = np.unique(at[inside], return_index=True)
     with np.errstate(over="ignore"):  # beyond float32 becomes an infinity, which is found and reported as one
         trace[:, places] = values[inside][first].T
-    return Placed(trace, np.setdiff1d(np.arange(samples), places))
+    return Placed(trace, np.setdiff1d(np.arange(samples), places), int(inside.sum()) - len(places))

@@ -161,7 +161,9 @@ class Told:
         return Path.touch, (Path("run"),)
 
 
-def test_python_objects_are_never_read_unasked_and_the_error_says_what_to_type(make_data, tmp_path: Path, monkeypatch) -> None:
+def test_python_objects_are_not_read_unasked_and_the_error_says_what_to_type(
+    make_data, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     np.savez("evil.npz", X=np.array([Told()]), y=[1])
     assert "can run code" in dengine("data", "evil.npz").stderr
@@ -176,7 +178,7 @@ def test_python_objects_are_never_read_unasked_and_the_error_says_what_to_type(m
 
 
 @pytest.mark.parametrize(("good", "bad"), [("OK", "Ausschuss"), ("in Ordnung", "Riss"), ("Gutteil", "kein Gutteil")])
-def test_a_set_of_words_is_told_apart_by_the_map_that_the_error_says(good: str, bad: str, make_data, tmp_path: Path) -> None:
+def test_words_are_told_apart_by_the_map_that_the_error_says(good: str, bad: str, make_data, tmp_path: Path) -> None:
     data = make_data(41, samples=40)
     wide(data.X, np.array([bad, good])[data.y]).to_csv(tmp_path / "table.csv", index=False)
     for i, x in enumerate(data.X):

@@ -81,9 +81,10 @@ def test_every_sample_is_in_its_place_and_every_gap_is_said(lost: set[int], befo
     np.testing.assert_array_equal(placed.trace[0], np.array(expected, dtype=np.float32))
     np.testing.assert_array_equal(placed.trace[1], -np.array(expected, dtype=np.float32))
     assert placed.missing.tolist() == np.flatnonzero(np.isnan(expected)).tolist()
+    assert placed.repeated == 0
 
 
 def test_of_a_sample_that_comes_twice_the_first_counts() -> None:
     placed = place([0.0, STEP, STEP, 2 * STEP], np.array([[1.0], [2.0], [9.0], [3.0]]), 0.0, 3, STEP)
     assert placed.trace.tolist() == [[1.0, 2.0, 3.0]]
-    assert len(placed.missing) == 0
+    assert (placed.repeated, len(placed.missing)) == (1, 0)
