@@ -219,7 +219,7 @@ class Collected:
         """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
         try:
             self.read.append(read())
-        except (OSError, TraceError, DataError) as error:
+        except (OSError, TraceError, UnreadableError) as error:
             if isinstance(error, UnknownWordError):
                 self.unknown[error.word] += 1
             self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))

@@ -25,7 +25,6 @@ GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", 
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
 COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
 LAST = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # words without a number, at the end of a name
-SUFFIX = re.compile(r"\.(csv|parquet|pq|npz)$", re.IGNORECASE)
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
@@ -193,7 +192,7 @@ def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fau
 def _words(path: str) -> tuple[str, ...]:
     """A path's file and folders, from its end, in lower case, without suffix, as Windows or another system writes it."""
     words = [word for word in path.lower().replace("\\", "/").split("/") if word not in ("", ".")] or [""]
-    return SUFFIX.sub("", words.pop()), *reversed(words)
+    return words.pop().removesuffix(".csv"), *reversed(words)
 
 
 def _alike(one: Sequence[str], other: Sequence[str]) -> bool:

@@ -53,7 +53,8 @@ def load_dataset(
     """A data set from recordings as people have them.
 
     source : the name of a bundled set; a folder of CSV files, one an insertion, or of tables or archives of one form, which
-        are one set; a wide table, a row an insertion, or a long one, a row a sample, as .csv, .parquet or a DataFrame; one long recording as .mcap, or a rosbag2 folder of them; an
+        are one set; a wide table, a row an insertion, or a long one, a row a sample, as .csv, .parquet or a DataFrame; one
+        long recording as .mcap, or a rosbag2 folder of them; an
         .npz file with X (n, T) or (n, C, T), times the number `scale` where one is stored, and y (n,), or with arrays that
         `channel` and `label` name; the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y),
         where X may be a list of traces of any length.
@@ -211,12 +212,12 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
 def _of_objects(path: Path, asked: Asked) -> str:
     """How a file of Python objects, as traces of several lengths, becomes a table; who reads objects runs what they say."""
     _, have = read_archive(path, ())
-    X = next((name for name in (*asked.channels, "X") if name in have), have[0])
-    y = next((name for name in (asked.label, "y") if name in have), have[-1])
-    table = str(path.with_suffix(".csv"))
+    X, y = (
+        next((name for name in names if name in have), have[0]) for names in ((*asked.channels, "X"), (asked.label, "y"))
+    )
     do = f"d = np.load({str(path)!r}, allow_pickle=True); frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))"
-    do = f'python -c "import numpy as np, pandas as pd; {do}; frame.to_csv({table!r}, index=False)"'
-    return f"Python objects, which can run code when they are read. If you trust it, make a table, {table}, of it: {do}."
+    do = f"import numpy as np, pandas as pd; {do}; frame.to_csv({str(path.with_suffix('.csv'))!r}, index=False)"
+    return f'Python objects, which can run code when they are read. If you trust it, make a table of it: python -c "{do}".'
 
 
 def _by_part(x: NDArray[Any], told: NDArray[Any] | None) -> NDArray[Any]:

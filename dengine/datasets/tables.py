@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, listed
-from ..files import read_archive
+from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NUMBER, cells_of, decoded, floats, numbers, read_recording, recording_of, table_of
+from .text import NUMBER, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
 NUMBERED = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
 FIRST = re.compile(r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)")  # s000_fz
-MANY, LOOKED_AT = 8, 3  # numbered columns of a channel, which a single recording has none of; files of a folder
+MANY = 8  # numbered columns of a channel, which a single recording has none of
 FEWEST = 0.75  # of a wide table's columns that are numbered
 SUFFIXES = (".csv", ".parquet", ".pq", ".npz")
 
@@ -52,31 +51,17 @@ def recordings_in(folder: Path, asked: Asked) -> dict[str, Path]:
 
 
 def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
-    """Whether a folder's files hold many insertions each, as the first few of them do; else they are one each."""
-    if asked.time is not None:
+    """Whether a folder's files hold many insertions each, as tables and archives do; CSV files may be one each."""
+    path = next(iter(named.values()))
+    if asked.time is not None or path.suffix.lower() != ".csv":
         return True
-    first = dict(islice(named.items(), LOOKED_AT))
-    told = asked.labels is not None and all(path.suffix.lower() == ".csv" for path in first.values())
+    header = _top(path)[0]
+    if sum(len(names) for names in _numbered(header).values() if len(names) >= MANY) > FEWEST * len(header):
+        return True
     with suppress(DataError):
-        told = bool([labels.named(asked.label, asked.words).find(name) for name in first])
-    return 2 * sum(_holds_many(path, asked, told) for path in first.values()) >= len(first) or (
-        len(named) == 1 and not told
-    )
-
-
-def _holds_many(path: Path, asked: Asked, told: bool) -> bool:
-    """Whether it is a wide table, an archive of arrays that are not all of one dimension, or a long table.
-
-    told : by its name or a file of labels, what a recording's label is.
-    """
-    with suppress(DataError, OSError):
-        if path.suffix.lower() == ".npz":
-            return any(x.ndim > 1 for x in read_archive(path)[0].values())
-        header = _top(path)[0]
-        wide = sum(len(names) for names in _numbered(header).values() if len(names) >= MANY)
-        known = path.suffix.lower() != ".csv" or asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS)
-        return wide > FEWEST * len(header) or bool(known and not told and _long_columns(table_of(path)[0], asked, ""))
-    return False
+        return asked.labels is None and not [labels.named(asked.label, asked.words).find(name) for name in named]
+    known = asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS) is not None
+    return len(named) == 1 or (known and bool(_long_columns(read_table(path)[0], asked, "")))
 
 
 def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
@@ -101,12 +86,9 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
 
 
 def _top(path: Path) -> list[list[str]]:
-    """A file's columns, and cells of a CSV file's first rows; none where it cannot be read, which is said later."""
-    with suppress(DataError, OSError):
-        if path.suffix.lower() != ".csv":
-            return [list(table_of(path)[0].columns)]
-        with path.open("rb") as file:
-            text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
+    """The cells of a CSV file's first lines; none where they cannot be read, which is said when the whole file is."""
+    with suppress(UnreadableError, OSError), path.open("rb") as file:
+        text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
         return list(cells_of(text).values()) or [[]]
     return [[]]
 
@@ -114,7 +96,7 @@ def _top(path: Path) -> list[list[str]]:
 def _listing(folder: Path, named: Mapping[str, Path]) -> Path | None:
     """The file whose second line names another one, as a file of labels does."""
     stems = {path.stem.lower() for path in named.values()}
-    words = {path: {labels.SUFFIX.sub("", word.lower()) for word in _top(path)[-1]} for path in folder.rglob("*.csv")}
+    words = {path: {word.lower().removesuffix(".csv") for word in _top(path)[-1]} for path in folder.rglob("*.csv")}
     return next((path for path, said in words.items() if said & (stems - {path.stem.lower()})), None)
 
 
@@ -138,7 +120,7 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
     tables: dict[str, pd.DataFrame] = {}
     for source, path in named.items():
         try:
-            frame, faults = table_of(path, found.encodings)
+            frame, faults = read_table(path, found.encodings) if path.suffix.lower() == ".csv" else _parquet(path)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
         odd = [word for word in frame.columns if NUMBER.fullmatch(word) and not word.isdecimal()]
@@ -152,10 +134,21 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
     return _from_tables(tables, asked, found)
 
 
+def _parquet(path: Path) -> tuple[pd.DataFrame, list[Fault]]:
+    import pandas as pd
+
+    with reading(path, "a Parquet file", "pyarrow", "files"):
+        return _counted(pd.read_parquet(path)), []
+
+
+def _counted(frame: pd.DataFrame) -> pd.DataFrame:
+    """With names that are texts, and rows from 1."""
+    return frame.set_axis(list(map(str, frame.columns)), axis=1).set_axis(range(1, len(frame) + 1))
+
+
 def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
     """A table in memory, whose rows count from 1."""
-    frame = frame.set_axis([str(name) for name in frame.columns], axis=1).set_axis(range(1, len(frame) + 1))
-    return _from_tables({"row": frame}, asked, Collected("data", ()))
+    return _from_tables({"row": _counted(frame)}, asked, Collected("data", ()))
 
 
 def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected) -> Dataset:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..files import read_archive, reading
 from ..traces import is_time
 from .dataset import Fault, UnreadableError
 
@@ -108,21 +107,6 @@ def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.Da
     return pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object), faults
 
 
-def table_of(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.DataFrame, list[Fault]]:
-    """The columns of a CSV or Parquet file, or an .npz's arrays of one dimension; as `read_table`, rows from 1."""
-    import pandas as pd
-
-    if path.suffix.lower() == ".csv":
-        return read_table(path, encodings)
-    if path.suffix.lower() == ".npz":
-        with reading(path, "arrays of one length"):
-            frame = pd.DataFrame({name: x for name, x in read_archive(path)[0].items() if x.ndim == 1})
-    else:
-        with reading(path, "a Parquet file", "pyarrow", "files"):
-            frame = pd.read_parquet(path)
-    return frame.set_axis(range(1, len(frame) + 1)).set_axis(list(map(str, frame.columns)), axis=1), []
-
-
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:
     """(n,) numbers, NaN where a cell says nothing; and under which index a cell holds what is no number."""
     import pandas as pd
@@ -154,7 +138,7 @@ def read_recording(
     path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]
 ) -> tuple[NDArray[np.float32], float | None]:
     """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault."""
-    frame, faults = table_of(path, encodings)
+    frame, faults = read_table(path, encodings)
     places = [place_of(name, list(frame.columns)) for name in channels]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
