@@ -19,6 +19,7 @@ from ..files import must_fit, reading
 from . import labels
 from .dataset import Asked, Collected, Dataset, UnreadableError, as_dataset, must
 from .tables import natural
+from .text import Timed
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
 if TYPE_CHECKING:
@@ -160,14 +161,12 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
 
-    def read(cut: Insertion) -> tuple[NDArray[np.float32], float | None]:
+    def read(cut: Insertion) -> Timed:
         if cut.fault:
             raise UnreadableError(cut.fault)
         return cut.trace, None if asked.rate_hz else rate
 
-    found = Collected(name, channels)
-    labels.collect(insertions, read, told, found)
-    return as_dataset(found, asked)
+    return as_dataset(labels.collect(insertions, read, told, Collected(name, channels)), asked)
 
 
 def _told(asked: Asked, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:

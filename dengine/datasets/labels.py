@@ -14,12 +14,9 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import DataError
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
-from .text import read_table
+from .text import Timed, read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
@@ -35,7 +32,7 @@ FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "s
 Words = Mapping[str, bool]
 NONE: Words = {}
 Known = tuple[int, str | None]  # a recording's label, and its part's number
-Read = Callable[[Any], tuple[NDArray[np.float32], float | None]]
+Read = Callable[[Any], Timed]
 
 
 class Labels(NamedTuple):
@@ -163,9 +160,8 @@ def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
     rows, faults = _rows(path, part)
     numbers = [int(row.file) for row in rows if row.file.isdecimal()]
     if faults or (numbers and numbers != list(range(numbers[0], numbers[0] + len(rows)))):
-        raise DataError(
-            f"Expected a label of each trace in {path}, in their order, got {faults[0] if faults else numbers[:9]}."
-        )
+        got = faults[0] if faults else numbers[:9]
+        raise DataError(f"Expected a label of each trace in {path}, in their order, got {got}.")
     return [row.label for row in rows]
 
 
@@ -217,7 +213,7 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
     return of_file, of_label
 
 
-def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collected) -> None:
+def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collected) -> Collected:
     """Add recordings by name, with their labels. read : what is at a place: (C, T), and a rate where it has timestamps."""
     unlabelled: list[str] = []
     found.faults.extend(labels.faults)
@@ -236,3 +232,4 @@ def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collec
     if len(unlabelled) > len(places) / 2:
         none = f"{len(unlabelled)} of {len(places)} have none, {unlabelled[-1]} for one"
         raise DataError(f"Expected a label for each recording, {none}; {labels.advice}.")
+    return found

@@ -127,9 +127,7 @@ def _reader_of_files(path: Path, asked: Asked) -> tuple[Sequence[str], Callable[
         return (), partial(_read_store, path, name, asked)
     kinds = {each.suffix.lower() in TABLES: each for each in named.values()}
     if len(kinds) > 1:
-        raise DataError(
-            f"Expected tables or .npz files in {path}, got both, as {kinds[True].name} and {kinds[False].name}."
-        )
+        raise DataError(f"Expected tables or .npz files in {path}, got {kinds[True].name} and {kinds[False].name}.")
     if True in kinds:
         return ("label", "labels", "time"), partial(read_tables, named, name, asked)
     if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
@@ -193,9 +191,9 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
         if "Object arrays" not in str(error):
             raise
         raise DataError(f"{str(error).partition(':')[0]}: {_of_objects(next(iter(named.values())), asked)}") from error
-    first, *others = [{key: _by_part(x, arrays.get(label)) for key, x in arrays.items()} for arrays, _ in read]
-    found, have = first, read[0][1]
-    for source, arrays, (_, names) in zip(list(named)[1:], others, read[1:], strict=True):
+    found, have = dict[str, NDArray[Any]](), list[str]()
+    for source, (stored, names) in zip(named, read, strict=True):
+        arrays = {key: _by_part(x, stored.get(label)) for key, x in stored.items()}
         if set(have).isdisjoint(names):
             found, have = found | arrays, have + names
             continue
@@ -212,9 +210,8 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
 def _of_objects(path: Path, asked: Asked) -> str:
     """How a file of Python objects, as traces of several lengths, becomes a table; who reads objects runs what they say."""
     _, have = read_archive(path, ())
-    X, y = (
-        next((name for name in names if name in have), have[0]) for names in ((*asked.channels, "X"), (asked.label, "y"))
-    )
+    X = next((name for name in (*asked.channels, "X") if name in have), have[0])
+    y = next((name for name in (asked.label, "y") if name in have), have[-1])
     do = f"d = np.load({str(path)!r}, allow_pickle=True); frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))"
     do = f"import numpy as np, pandas as pd; {do}; frame.to_csv({str(path.with_suffix('.csv'))!r}, index=False)"
     return f'Python objects, which can run code when they are read. If you trust it, make a table of it: python -c "{do}".'

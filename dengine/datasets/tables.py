@@ -23,7 +23,7 @@ from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NUMBER, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
+from .text import NUMBER, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,8 +75,7 @@ def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked
     found = Collected(name, asked.channels or _usual_channel(named.values(), asked))
     read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
     try:
-        labels.collect(named, read, told, found)
-        found.must_mean_something()
+        labels.collect(named, read, told, found).must_mean_something()
     except DataError as error:
         if asked.label or asked.labels or (listing := _listing(folder, named)) is None:
             raise
@@ -239,7 +238,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
 
     places = [frame.columns.get_loc(name) for name in found.channels]
 
-    def read(rows: pd.DataFrame) -> tuple[NDArray[np.float32], float | None]:
+    def read(rows: pd.DataFrame) -> Timed:
         return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
 
     def find(part: str) -> labels.Known:
@@ -252,8 +251,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         told = labels.Labels(find, "name the column of labels (label)")
     else:
         told = labels.listed(asked.labels, "part", list(parts), asked.words)
-    labels.collect(parts, read, told, found)
-    return as_dataset(found, asked)
+    return as_dataset(labels.collect(parts, read, told, found), asked)
 
 
 def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.DataFrame:

@@ -19,6 +19,7 @@ from .dataset import Fault, UnreadableError
 if TYPE_CHECKING:
     import pandas as pd
 
+Timed = tuple[NDArray[np.float32], float | None]  # (C, T), and hertz where there are timestamps
 LARGEST = 128 * 2**20  # bytes of one text file
 NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
 DECIMAL = re.compile(r"(?<![^\s;\"])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;\"])")  # a whole cell
@@ -134,9 +135,7 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
         return block.astype(np.float32), wrong
 
 
-def read_recording(
-    path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]
-) -> tuple[NDArray[np.float32], float | None]:
+def read_recording(path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]) -> Timed:
     """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault."""
     frame, faults = read_table(path, encodings)
     places = [place_of(name, list(frame.columns)) for name in channels]
@@ -147,9 +146,7 @@ def read_recording(
     return recording_of(frame, places, timed)
 
 
-def recording_of(
-    rows: pd.DataFrame, places: Sequence[int], timed: bool, time: str | None = None
-) -> tuple[NDArray[np.float32], float | None]:
+def recording_of(rows: pd.DataFrame, places: Sequence[int], timed: bool, time: str | None = None) -> Timed:
     """Rows, a sample each, as (C, T), and their rate, if timed, as `rate_of`. places : of the channels' columns.
 
     An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
