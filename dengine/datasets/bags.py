@@ -153,11 +153,10 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
-    names = list(insertions)
     if asked.labels is not None:
-        told = labels.listed(asked.labels, asked.part, names, asked.words)
+        told = labels.listed(asked.labels, asked.part, list(insertions), asked.words)
     elif asked.label is not None:
-        told = _told(asked, messages, cuts, names)
+        told = _told(asked, messages, cuts, list(insertions))
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
 

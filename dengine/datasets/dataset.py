@@ -269,8 +269,7 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
     rates = np.array([each.rate_hz or np.nan for each in found.read])
     rate = asked.rate_hz or (float(np.nanmedian(rates)) if len(known) else 500.0)
-    # A recording without a part's number is of a part of its own.
-    parts = [each.source if each.part is None else each.part for each in found.read]
+    parts = [each.part or each.source for each in found.read]  # without a number it is a part of its own
     return make_dataset(
         block[:, 0] if block.shape[1] == 1 else block,
         [each.label for each in found.read],

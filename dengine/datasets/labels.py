@@ -32,7 +32,6 @@ FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "s
 Words = Mapping[str, bool]
 NONE: Words = {}
 Known = tuple[int, str | None]  # a recording's label, and its part's number
-Read = Callable[[Any], Timed]
 
 
 class Labels(NamedTuple):
@@ -213,7 +212,7 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
     return of_file, of_label
 
 
-def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collected) -> Collected:
+def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Labels, found: Collected) -> Collected:
     """Add recordings by name, with their labels. read : what is at a place: (C, T), and a rate where it has timestamps."""
     unlabelled: list[str] = []
     found.faults.extend(labels.faults)

@@ -29,7 +29,6 @@ from .triggers import Trigger
 BUNDLED = {"insertion": "insertion.npz"}
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # arrays, beside that of the parts' numbers
 Files = Mapping[str, Path]
-NONE = np.array("none")  # in the place of an array that is not there
 TABLES = (".csv", ".parquet", ".pq")
 FORMS = ".npz, .csv, .parquet or .mcap"
 
@@ -198,12 +197,12 @@ def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str
             found, have = found | arrays, have + names
             continue
         for key in () if every else sorted({*found, *arrays}):
-            one, other = found.get(key, NONE), arrays.get(key, NONE)
+            one, other = (each.get(key, np.array("none")) for each in (found, arrays))
             if one.ndim == other.ndim > 0 and one.shape[1:] == other.shape[1:] and key != "channels":
                 found[key] = np.concatenate([one, other])
             elif not np.array_equal(one, other):
-                form = [x.shape or x for x in (one, other)]
-                raise DataError(f"Expected {key} alike in {next(iter(named))} and {source}, got {form[0]} and {form[1]}.")
+                forms = f"{one.shape or one} and {other.shape or other}"
+                raise DataError(f"Expected {key} alike in {next(iter(named))} and {source}, got {forms}.")
     return found, have
 
 

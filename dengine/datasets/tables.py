@@ -182,11 +182,7 @@ def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     if asked.part != "part" and asked.part not in frame:
         raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
     columns = _sample_columns([name for name in frame.columns if name not in (label, asked.part)], asked)
-    blocks, wrong = [], dict[int, str]()
-    for names in columns.values():
-        values, odd = numbers(frame[names])
-        blocks.append(values)
-        wrong = odd | wrong
+    values, wrong = numbers(frame[[name for names in columns.values() for name in names]])
     found.channels = tuple(filter(None, columns))
     parts = [""] * len(frame) if asked.part not in frame else frame[asked.part].astype(object).fillna("").tolist()
 
@@ -196,7 +192,7 @@ def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         number = str(part).removesuffix(".0").strip() or None
         return Recorded(_ended(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
 
-    for row in zip(frame.index, np.stack(blocks, axis=1), frame[label].tolist(), parts, strict=True):
+    for row in zip(frame.index, values.reshape(len(frame), len(columns), -1), frame[label].tolist(), parts, strict=True):
         found.take(source, partial(recorded, *row), row[0])
 
 
@@ -310,8 +306,7 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
         return asked.label
     if asked.time is None and (advice := _long_columns(frame, asked, found.beside)):
         raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
-    known = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
-    if known is not None:
+    if (known := labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)) is not None:
         return str(frame.columns[known])
     several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
     left = [name for name in frame.columns if name not in several]
