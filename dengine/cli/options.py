@@ -251,7 +251,7 @@ _LABEL = (
     "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column, of .npz its "
     "array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
-_LABELS = "A CSV file of labels: of a folder's files, or of a long table's parts."
+_LABELS = "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's traces in their order."
 _LABEL_MAP = "What other words mean, as in 'i.O.=good,n.i.O.=bad'."
 _TIME = "The column of times of a long table, a row a sample, whose --part tells the insertions."
 _HERTZ = "Samples a second.  [default: what timestamps tell, else 500]"
