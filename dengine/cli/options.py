@@ -253,11 +253,12 @@ _LABEL = (
     "In a folder a regular expression whose group is the label, as in '_(OK|NOK)_'; in a table its column, of .npz its "
     "array.  [default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
 )
-_LABELS = "A CSV file of labels: of a folder's files, or of a long table's parts."
+_LABELS = "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's traces in their order."
 _LABEL_MAP = "What other words mean, as in 'i.O.=good,n.i.O.=bad'."
 _TIME = "The column of times of a long table, a row a sample, whose --part tells the insertions."
 _HERTZ = "Samples a second.  [default: what timestamps tell, else 500]"
 _FIT = "What becomes of traces of another length.  [default: strict where all are alike, else pad; live: strict]"
+_NAMES = Listed(click.STRING)
 _RATE = click.FloatRange(0.0, min_open=True)
 _TRIGGER = (
     "When an insertion begins in an .mcap file, or on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
@@ -272,7 +273,7 @@ TRACE = {
     "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
     "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
     "unit": click.option("--unit", metavar="TEXT", help="Of the samples, for people.  [default: N]"),
-    "channel": click.option("--channels", "--channel", "channel", metavar="NAMES", help=_CHANNELS),
+    "channel": click.option("--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS),
     "fit": click.option("--fit", type=Known("fit"), help=_FIT),
 }
 DATA = TRACE | {
@@ -296,19 +297,16 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> C
 
 def recorded_as(how: Mapping[str, Any]) -> dict[str, Any]:
     """What a robot's recorder is told of TRACE, under its names."""
-    from ..datasets.dataset import names_of as taken_apart
-
-    told = {name: how[name] for name in ("samples", "rate_hz") if name in how}
-    return told | ({"channels": taken_apart(how["channel"])} if "channel" in how else {})
+    names = {"samples": "samples", "rate_hz": "rate_hz", "channel": "channels"}
+    return {name: how[option] for option, name in names.items() if option in how}
 
 
 def trace_of(how: Mapping[str, Any]) -> TraceSpec | None:
     """The contract of live traces by those of TRACE that were given; None: the first trace sets it."""
-    from ..datasets.dataset import names_of as taken_apart
     from ..records import TraceSpec
 
     asked = {name: how[name] for name in TRACE if name in how}
-    names = taken_apart(asked.pop("channel", None))
+    names = asked.pop("channel", ())
     n = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1
     if (asked or names) and "samples" not in asked:
         raise click.UsageError("--samples, too, is needed for a contract of traces; without it the first one sets it all.")

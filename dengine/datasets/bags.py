@@ -19,6 +19,7 @@ from ..files import must_fit, reading
 from . import labels
 from .dataset import Asked, Collected, Dataset, UnreadableError, as_dataset, must
 from .tables import natural
+from .text import Timed
 from .triggers import Active, StartFinder, Trigger, as_trigger, place
 
 if TYPE_CHECKING:
@@ -152,22 +153,19 @@ def _dataset(messages: Messages, trigger: Trigger, channels: tuple[str, ...], na
     if not cuts:
         raise DataError(f"Expected insertions in {name}, where {trigger} goes on; it never does.")
     insertions = {f"{name}/{i}": cut for i, cut in enumerate(cuts, start=1)}
-    names = list(insertions)
     if asked.labels is not None:
-        told = labels.listed(asked.labels, asked.part, names, asked.words)
+        told = labels.listed(asked.labels, asked.part, list(insertions), asked.words)
     elif asked.label is not None:
-        told = _told(asked, messages, cuts, names)
+        told = _told(asked, messages, cuts, list(insertions))
     else:
         raise DataError("Expected the labels' topic (label='/height_check/ok'), or a file of them (labels='labels.csv').")
 
-    def read(cut: Insertion) -> tuple[NDArray[np.float32], float | None]:
+    def read(cut: Insertion) -> Timed:
         if cut.fault:
             raise UnreadableError(cut.fault)
         return cut.trace, None if asked.rate_hz else rate
 
-    found = Collected(name, channels)
-    labels.collect(insertions, read, told, found)
-    return as_dataset(found, asked)
+    return as_dataset(labels.collect(insertions, read, told, Collected(name, channels)), asked)
 
 
 def _told(asked: Asked, messages: Messages, cuts: Sequence[Insertion], names: Sequence[str]) -> labels.Labels:

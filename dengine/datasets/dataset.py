@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NEAR = 0.03  # of the others' rate
+MOST_WORDS = 12  # that somebody says the meaning of
 must = partial(expect, error=DataError)
 
 
@@ -53,10 +54,10 @@ class UnreadableError(DataError):
 
 
 class UnknownWordError(UnreadableError):
-    """A label in a word that nobody said the meaning of."""
+    """A label in a word that nobody said the meaning of. what : where it is no label by its place alone."""
 
-    def __init__(self, word: str) -> None:
-        super().__init__(f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
+    def __init__(self, word: str, what: str = "") -> None:
+        super().__init__(what or f"Expected a label, as True/False, OK/NOK, pass/fail or 1/0, got {word[:20]!r}")
         self.word = word
 
 
@@ -212,6 +213,7 @@ class Collected:
     read: list[Recorded] = field(default_factory=list)
     encodings: Counter[str] = field(default_factory=Counter)  # of files that are not UTF-8
     unknown: Counter[str] = field(default_factory=Counter)  # words for labels
+    beside: str = "labels.csv"  # a file that may list labels, as an error advises
 
     def take(self, source: str, read: Callable[[], Recorded], line: int = 0) -> None:
         """Add what is read, or the fault for which it is left out. line : of the source, where it is known before."""
@@ -223,16 +225,21 @@ class Collected:
             self.faults.append(Fault(source, line or getattr(error, "line", 0), str(error).rstrip(".")))
 
     def must_mean_something(self) -> None:
-        """DataError where most labels are words that nobody said the meaning of."""
-        if sum(self.unknown.values()) <= len(self.read):
+        """DataError where most labels are words that nobody said the meaning of, or a tenth beside labels of one kind."""
+        kinds, n = {each.label for each in self.read}, sum(self.unknown.values())
+        if n <= (len(self.read) / 9 if len(kinds) == 1 else len(self.read)):
             return
-        words = self.unknown.most_common()
-        got = ", ".join(f"{word[:20]!r} {n} times" for word, n in words[:4])
+        words = [word for word, _ in self.unknown.most_common()]
         # The one with a syllable before it is more often the bad one; a person has to say so.
-        bad = {word for word, _ in words[:4] if any(word != other and word.endswith(other) for other, _ in words)}
-        said = [f"{word}={'bad' if word in bad or (i and not bad) else 'good'}" for i, (word, _) in enumerate(words[:4])]
-        do = f"say what they mean, label_map={','.join(said)!r} or the other way round"
-        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}; {do}.")
+        bad = {word for word in words if any(word != other and word.endswith(other) for other in words)} or {*words[1:]}
+        bad = bad if len(kinds) != 1 else {*words} if 1 in kinds else set()
+        said = ",".join(f"{word}={'bad' if word in bad else 'good'}" for word in words)
+        do = f"say what they mean, label_map={said!r}{'' if len(kinds) == 1 else ' or the other way round'}"
+        if len(words) > MOST_WORDS:
+            do = "so many are no labels: say where they are, label='...', or list them in a file, labels='labels.csv'"
+        got = ", ".join(f"{word[:20]!r} {times} times" for word, times in self.unknown.most_common(4))
+        beside = f" beside {len(self.read)} {'good' if 1 in kinds else 'bad'} ones" if len(kinds) == 1 else ""
+        raise DataError(f"Expected labels in {self.name} as True/False, OK/NOK, pass/fail or 1/0, got {got}{beside}; {do}.")
 
     def leave_out(self, why: Mapping[int, str]) -> None:
         """Make faults of those at these places; DataError where nothing is left."""
@@ -262,8 +269,7 @@ def as_dataset(found: Collected, asked: Asked) -> Dataset:
     block = np.stack([_fitted(each.trace, samples, fit) for each in found.read])
     rates = np.array([each.rate_hz or np.nan for each in found.read])
     rate = asked.rate_hz or (float(np.nanmedian(rates)) if len(known) else 500.0)
-    # A recording without a part's number is of a part of its own.
-    parts = [each.source if each.part is None else each.part for each in found.read]
+    parts = [each.part or each.source for each in found.read]  # without a number it is a part of its own
     return make_dataset(
         block[:, 0] if block.shape[1] == 1 else block,
         [each.label for each in found.read],
@@ -301,12 +307,8 @@ def form_of(lengths: NDArray[np.int64], fit: str | None, samples: int | None) ->
     if fit == "strict" and low != high:
         choose = "choose fit='pad', 'cut' or 'resample'"
         raise DataError(f"Expected recordings of one length, got {low} to {high} samples; {choose}.")
-    must(
-        fit != "strict" or samples in (None, low),
-        f"{low} samples, as recorded, with fit='strict'",
-        samples,
-        "choose fit='cut'",
-    )
+    as_recorded = fit != "strict" or samples in (None, low)
+    must(as_recorded, f"{low} samples, as recorded, with fit='strict'", samples, "choose fit='cut'")
     if samples is None:
         samples = int(lengths[2 * lengths >= median].min()) if fit == "cut" else median
     return fit, samples

@@ -14,16 +14,14 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ..errors import DataError
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
-from .text import read_table
+from .text import Timed, read_table
 
 GOOD = ("true", "ok", "pass", "passed", "good", "success", "successful", "yes", "io", "gut", "1")
 BAD = ("false", "nok", "ng", "fail", "failed", "bad", "failure", "no", "nio", "schlecht", "0")
 COPY = re.compile(r"([ _-]+(copy|kopie))?( ?\(\d+\))?$", re.IGNORECASE)  # what a file manager adds to a name
+LAST = re.compile(r"(?:^|[_\- ])([^\d_\- ]\D*)$")  # words without a number, at the end of a name
 NOT = r"((?:not|non|no|nicht)[_\-. ]*)?"
 WORD = re.compile(f"{NOT}({'|'.join(GOOD + BAD)})", re.IGNORECASE)
 IN_NAME = re.compile(rf"(?:^|[_\-. ]){WORD.pattern}$", re.IGNORECASE)
@@ -34,7 +32,6 @@ FILE_COLUMNS = ("file", "filename", "file_name", "name", "path", "recording", "s
 Words = Mapping[str, bool]
 NONE: Words = {}
 Known = tuple[int, str | None]  # a recording's label, and its part's number
-Read = Callable[[Any], tuple[NDArray[np.float32], float | None]]
 
 
 class Labels(NamedTuple):
@@ -106,7 +103,10 @@ def _usual(path: PurePosixPath, words: Words) -> int:
     if by_folder is not None and (found is None or found[2].isdecimal()):
         return by_folder
     if by_name is None:
-        raise UnreadableError("Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none")
+        what = "Expected a label at the end of the name, as in 0001_True.csv or 0001_NOK.csv, found none"
+        said = map(LAST.search, (COPY.sub("", path.stem), *reversed(path.parent.parts)))
+        last = next(filter(None, said), None)
+        raise UnreadableError(what) if last is None else UnknownWordError(last[1], what)
     if by_folder not in (None, by_name):
         raise UnreadableError(f"Expected one label, its name and its folder {folder} contradict each other")
     return by_name
@@ -152,6 +152,16 @@ def listed(path: str | os.PathLike[str], part: str, names: Sequence[str], words:
 
     few = ", ".join(row.file for row in rows[:3]) or "no files"
     return Labels(find, f"{source} names {few}: call its columns file and label, and the files as they are", faults)
+
+
+def in_order(path: str | os.PathLike[str], part: str) -> list[str]:
+    """The words of a file of labels, of an array's traces in turn; DataError where its rows are numbered otherwise."""
+    rows, faults = _rows(path, part)
+    numbers = [int(row.file) for row in rows if row.file.isdecimal()]
+    if faults or (numbers and numbers != list(range(numbers[0], numbers[0] + len(rows)))):
+        got = faults[0] if faults else numbers[:9]
+        raise DataError(f"Expected a label of each trace in {path}, in their order, got {got}.")
+    return [row.label for row in rows]
 
 
 def _rows(path: str | os.PathLike[str], part: str) -> tuple[list[_Row], list[Fault]]:
@@ -202,7 +212,7 @@ def _columns(header: Sequence[str], path: str | os.PathLike[str]) -> tuple[int, 
     return of_file, of_label
 
 
-def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collected) -> None:
+def collect(places: Mapping[str, Any], read: Callable[[Any], Timed], labels: Labels, found: Collected) -> Collected:
     """Add recordings by name, with their labels. read : what is at a place: (C, T), and a rate where it has timestamps."""
     unlabelled: list[str] = []
     found.faults.extend(labels.faults)
@@ -221,3 +231,4 @@ def collect(places: Mapping[str, Any], read: Read, labels: Labels, found: Collec
     if len(unlabelled) > len(places) / 2:
         none = f"{len(unlabelled)} of {len(places)} have none, {unlabelled[-1]} for one"
         raise DataError(f"Expected a label for each recording, {none}; {labels.advice}.")
+    return found

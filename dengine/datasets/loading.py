@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from importlib.resources import files
@@ -14,22 +13,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import DataError
+from ..errors import DataError, listed
 from ..files import is_database, read_archive, reading
 from ..records import trace_in
 from ..traces import as_trace, spec_of
 from .bags import is_stream, read_bag
 from .dataset import Asked, Collected, Dataset, Recorded, UnreadableError, as_dataset, make_dataset, must, names_of, refit
-from .labels import label_of, meanings, named
-from .tables import FORCE, from_frame, read_csv, read_folder, read_parquet
+from .labels import in_order, label_of, meanings
+from .tables import FORCE, from_frame, hold_many, read_folder, read_tables, recordings_in
 from .text import rate_of
 from .triggers import Trigger
 
 BUNDLED = {"insertion": "insertion.npz"}
 USED = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels")  # arrays, beside that of the parts' numbers
-Reader = Callable[[Path, str, Asked], Dataset]
-TABLES: dict[str, Reader] = {".csv": read_csv, ".parquet": read_parquet, ".pq": read_parquet}
+Files = Mapping[str, Path]
+TABLES = (".csv", ".parquet", ".pq")
 FORMS = ".npz, .csv, .parquet or .mcap"
 
 
@@ -51,8 +51,9 @@ def load_dataset(
 ) -> Dataset:
     """A data set from recordings as people have them.
 
-    source : the name of a bundled set; a folder of CSV files, one an insertion; a wide table, a row an insertion, or a long
-        one, a row a sample, as .csv, .parquet or a DataFrame; one long recording as .mcap, or a rosbag2 folder of them; an
+    source : the name of a bundled set; a folder of CSV files, one an insertion, or of tables or archives of one form, which
+        are one set; a wide table, a row an insertion, or a long one, a row a sample, as .csv, .parquet or a DataFrame; one
+        long recording as .mcap, or a rosbag2 folder of them; an
         .npz file with X (n, T) or (n, C, T), times the number `scale` where one is stored, and y (n,), or with arrays that
         `channel` and `label` name; the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y),
         where X may be a list of traces of any length.
@@ -63,7 +64,8 @@ def load_dataset(
     label : for a folder, a regular expression with one group that finds the label in a file's path; not given: True/False,
         OK/NOK, pass/fail, good/bad, success/failure or 1/0 at the end of its name, or as its folder's. For a table, the
         name of the column; for an .npz file of the array.
-    labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts.
+    labels : for a folder, a CSV file with a column of file names and one of labels; for a long table of parts; for an .npz
+        file a row a trace.
     label_map : what other words mean, "i.O.=good,n.i.O.=bad", or a dict.  time : the column of times of a long table.
     fit : what becomes of traces of another length, as in `TraceSpec`. Not given: recordings of one length stay as they
         are (strict); of several lengths, "pad" to their median; where all have the `samples` asked for, "cut".
@@ -101,40 +103,34 @@ def _reader(source: Any, asked: Asked) -> tuple[str, Sequence[str], Callable[[],
         raise DataError(f"Expected a name, a path, a Dataset, a DataFrame or a pair (X, y), got {got}.")
     if str(source) in BUNDLED:
         path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
-        return "a bundled set", (), partial(_read_npz, path, str(source), asked)
-    path = _alone(Path(source), asked)
-    takes, read = _reader_of_files(path)
-    return str(path), takes, partial(read, path, path.resolve().name if path.is_dir() else path.stem, asked)
+        return "a bundled set", (), partial(_read_npz, {path.name: path}, str(source), asked)
+    takes, read = _reader_of_files(Path(source), asked)
+    return str(source), takes, read
 
 
-def _alone(path: Path, asked: Asked) -> Path:
-    """The one table or archive of a folder; the path itself where there are more, or where that one is an insertion."""
-    if not path.is_dir() or is_stream(path):
-        return path
-    seen = [p for p in path.rglob("[!.]*") if p.suffix.lower() in (*TABLES, ".npz")]
-    apart = [p for p in seen if p.suffix.lower() != ".csv"] or seen  # a list of labels may lie beside it
-    if len(apart) != 1 or len(seen) > 2 or (apart == seen and asked.labels is not None):
-        return path
-    with suppress(DataError):
-        named(asked.label, asked.words).find(apart[0].name)
-        return path
-    return apart[0]
-
-
-def _reader_of_files(path: Path) -> tuple[Sequence[str], Reader]:
+def _reader_of_files(path: Path, asked: Asked) -> tuple[Sequence[str], Callable[[], Dataset]]:
+    """What reads a file, or a folder: a bag, recordings of an insertion each, or tables or archives of many."""
+    name = path.resolve().name if path.is_dir() else path.stem
     if is_stream(path):
-        return ("label", "labels", "trigger", "topic"), read_bag
-    if path.is_dir():
-        return ("label", "labels"), read_folder
-    if not path.is_file():
+        return ("label", "labels", "trigger", "topic"), partial(read_bag, path, name, asked)
+    named = {path.name: path}
+    if path.is_dir() and not hold_many(named := recordings_in(path, asked), asked):
+        return ("label", "labels"), partial(read_folder, path, named, name, asked)
+    if len(named) == 1:
+        path = next(iter(named.values()))
+        name, named = path.stem, {path.name: path}
+    if not path.exists() or not all(each.is_file() for each in named.values()):
         known = f"a data set among {', '.join(BUNDLED)}, a file {FORMS}, a store"
         raise DataError(f"Expected {known}, or a folder of CSV files, got {path}.")
-    if is_database(path):
-        return (), _read_store
-    if path.suffix.lower() in TABLES:
-        return ("label", "labels", "time"), TABLES[path.suffix.lower()]
-    if path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
-        return ("label",), _read_npz
+    if path.is_file() and is_database(path):
+        return (), partial(_read_store, path, name, asked)
+    kinds = {each.suffix.lower() in TABLES: each for each in named.values()}
+    if len(kinds) > 1:
+        raise DataError(f"Expected tables or .npz files in {path}, got {kinds[True].name} and {kinds[False].name}.")
+    if True in kinds:
+        return ("label", "labels", "time"), partial(read_tables, named, name, asked)
+    if path.is_dir() or path.suffix.lower() == ".npz" or zipfile.is_zipfile(path):
+        return ("label", "labels"), partial(_read_npz, named, name, asked)
     raise DataError(f"Expected a file {FORMS}, got {path}; save it as one of these.")
 
 
@@ -156,20 +152,24 @@ def _read_store(path: Path, name: str, asked: Asked) -> Dataset:
     return refit(make_dataset(X, held.labels, part=part, name=name, **about), asked)
 
 
-def _read_npz(path: Path, name: str, asked: Asked) -> Dataset:
+def _read_npz(named: Files, name: str, asked: Asked) -> Dataset:
     """`X`, `y`, and what is known beside them: `scale`, `rate_hz`, `unit`, `cause`, `channels`, and the parts' numbers.
 
-    Where there is no `X`, the channels are arrays (n, T) by their names.
+    Where there is no `X`, the channels are arrays (n, T) by their names. Several archives are of one form, or of other
+    arrays each. Where only another axis is as long as the labels, it is the one of the parts.
     """
     label = asked.label or "y"
-    found, have = read_archive(path, (*USED, asked.part, label, *asked.channels))
-    listed, own = ", ".join(have) or "none", () if "X" in found else asked.channels
+    found, have = _archives(named, asked)
+    if asked.labels is not None:
+        found[label] = np.array(in_order(asked.labels, asked.part))
+    own = () if "X" in found else asked.channels
     if not {label, *(own or ("X",))} <= set(found):
-        raise DataError(f"Expected {_wanted_arrays(path)}")
+        raise DataError(f"Expected {_wanted_arrays(named, asked)}")
     if asked.part != "part" and asked.part not in found:
-        raise DataError(f"Expected an array {asked.part} in {path}, found {listed}.")
-    with reading(path, "an .npz file of plain arrays"):
-        X = np.stack([found[each] for each in own], axis=1) if len(own) > 1 else found[own[0] if own else "X"]
+        raise DataError(f"Expected an array {asked.part} in {', '.join(named)}, found {listed(have)}.")
+    with reading(name, "an .npz file of plain arrays"):
+        arrays = [_by_part(found[each], found[label]) for each in own or ("X",)]
+        X = np.stack(arrays, axis=1) if len(own) > 1 else arrays[0]
         if "scale" in found:
             X = X.astype(np.float32) * found["scale"].astype(np.float32)
         about: dict[str, Any] = {"part": found.get(asked.part), "cause": found.get("cause")}
@@ -180,16 +180,62 @@ def _read_npz(path: Path, name: str, asked: Asked) -> Dataset:
         return refit(make_dataset(X, _labels(found[label], asked), name=name, **about), asked)
 
 
-def _wanted_arrays(path: Path) -> str:
-    """What is missing in an archive, and which of its arrays could be it: two-dimensional ones, and one of their length."""
-    found, have = read_archive(path)
+def _archives(named: Files, asked: Asked, every: bool = False) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """The arrays of archives, and the names of all: of one form, one after the other, or as one, where none is in two."""
+    label = asked.label or "y"
+    wanted = None if every else (*USED, asked.part, label, *asked.channels)
+    try:
+        read = [read_archive(path, wanted) for path in named.values()]
+    except DataError as error:
+        if "Object arrays" not in str(error):
+            raise
+        raise DataError(f"{str(error).partition(':')[0]}: {_of_objects(next(iter(named.values())), asked)}") from error
+    found, have = dict[str, NDArray[Any]](), list[str]()
+    for source, (stored, names) in zip(named, read, strict=True):
+        arrays = {key: _by_part(x, stored.get(label)) for key, x in stored.items()}
+        if set(have).isdisjoint(names):
+            found, have = found | arrays, have + names
+            continue
+        for key in () if every else sorted({*found, *arrays}):
+            one, other = (each.get(key, np.array("none")) for each in (found, arrays))
+            if one.ndim == other.ndim > 0 and one.shape[1:] == other.shape[1:] and key != "channels":
+                found[key] = np.concatenate([one, other])
+            elif not np.array_equal(one, other):
+                forms = f"{one.shape or one} and {other.shape or other}"
+                raise DataError(f"Expected {key} alike in {next(iter(named))} and {source}, got {forms}.")
+    return found, have
+
+
+def _of_objects(path: Path, asked: Asked) -> str:
+    """How a file of Python objects, as traces of several lengths, becomes a table; who reads objects runs what they say."""
+    _, have = read_archive(path, ())
+    X = next((name for name in (*asked.channels, "X") if name in have), have[0])
+    y = next((name for name in (asked.label, "y") if name in have), have[-1])
+    do = f"d = np.load({str(path)!r}, allow_pickle=True); frame = pd.DataFrame([*d[{X!r}]]).assign(y=d[{y!r}].astype(str))"
+    do = f"import numpy as np, pandas as pd; {do}; frame.to_csv({str(path.with_suffix('.csv'))!r}, index=False)"
+    return f'Python objects, which can run code when they are read. If you trust it, make a table of it: python -c "{do}".'
+
+
+def _by_part(x: NDArray[Any], told: NDArray[Any] | None) -> NDArray[Any]:
+    """(n, ...), by the only axis that is as long as n labels; of (n, T, C), more samples than channels, (n, C, T)."""
+    if told is None or told.ndim != 1 or x.ndim < 2:
+        return x
+    if len(x) != len(told) and x.shape.count(len(told)) == 1:
+        x = np.moveaxis(x, x.shape.index(len(told)), 0)
+    return x.swapaxes(1, 2) if x.ndim == 3 and x.shape[1] > x.shape[2] else x
+
+
+def _wanted_arrays(named: Files, asked: Asked) -> str:
+    """What is missing in archives, and which of their arrays could be it: of two dimensions, and of one as long as one."""
+    found, have = _archives(named, asked, every=True)
     traces = [name for name, x in found.items() if x.ndim in (2, 3) and len(x)]
-    single = [name for name, x in found.items() if x.ndim == 1 and traces and len(x) == len(found[traces[0]])]
+    single = [name for name, x in found.items() if x.ndim == 1 and traces and len(x) in found[traces[0]].shape]
     told = min(single, key=lambda name: len(set(found[name].tolist())), default="")
     shapes = ", ".join(f"{name} {found[name].shape}" for name in have) or "none"
     channel = "" if "X" in have else f"channel={traces[0]!r} and " if traces else ""
-    named = f", or their names, as in {channel}label={told!r}" if told else ""
-    return f"arrays X and y in {path}{named}; found {shapes}."
+    beside = sorted(next(iter(named.values())).parent.glob("*.csv"))
+    told = f"label={told!r}" if told else f"labels={str(beside[0])!r}, in the order of the traces" if beside else ""
+    return f"arrays X and y in {listed(named)}{f', or their names, as in {channel}{told}' if told else ''}; found {shapes}."
 
 
 def _from_pair(X: Any, y: Any, asked: Asked) -> Dataset:

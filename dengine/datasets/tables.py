@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,60 +23,80 @@ from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import cells_of, decoded, floats, numbers, rate_of, read_recording, read_table
+from .text import NUMBER, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FORCE = "FZ_Base"  # what a UR cell calls the force along the insertion
-NUMBERED = re.compile(r"(.*?)[_\-. \[]*(\d+)\]?")
+NUMBERED = re.compile(r"(?P<channel>.*?)[_\-. \[]*(?P<number>\d+)\]?")  # FZ_0
+FIRST = re.compile(r"[A-Za-z]{0,6}[_\-. ]?(?P<number>\d+)[_\-. ]+(?P<channel>\D.*)")  # s000_fz
+MANY = 8  # numbered columns of a channel, which a single recording has none of
+FEWEST = 0.75  # of a wide table's columns that are numbered
+SUFFIXES = (".csv", ".parquet", ".pq", ".npz")
 
 
-def read_folder(folder: Path, name: str, asked: Asked) -> Dataset:
-    """The recordings below a folder, `run_2.csv` before `run_10.csv`; DataError where none can be read."""
+def recordings_in(folder: Path, asked: Asked) -> dict[str, Path]:
+    """A folder's files by their path in it, `run_2.csv` before `run_10.csv`; of CSV files, where others are, none."""
     skipped = None if asked.labels is None else Path(asked.labels).resolve()
-    paths = [p for p in folder.rglob("*") if p.suffix.lower() == ".csv" and (p.is_file() or p.is_symlink())]
+    paths = [p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and (p.is_file() or p.is_symlink())]
     seen = {p.relative_to(folder): p for p in paths if p.resolve() != skipped}
     named = {p.as_posix(): path for p, path in seen.items() if not any(word.startswith(".") for word in p.parts)}
     if not named:
         have = listed(sorted(p.name for p in folder.iterdir()))
-        do = f" among {have}; put what they hold into one table" if have else ""
-        raise DataError(f"Expected CSV files, one an insertion, in the folder {folder}, found none{do}.")
+        wanted = f"CSV files, one an insertion, or tables ({', '.join(SUFFIXES)}), in the folder {folder}"
+        raise DataError(f"Expected {wanted}, found none{f' among {have}; save them as such' if have else ''}.")
+    others = [name for name, path in named.items() if path.suffix.lower() != ".csv"]  # beside a list of labels
+    return {name: named[name] for name in sorted(others or named, key=natural)}
+
+
+def hold_many(named: Mapping[str, Path], asked: Asked) -> bool:
+    """Whether a folder's files hold many insertions each, as tables and archives do; CSV files may be one each."""
+    path = next(iter(named.values()))
+    if asked.time is not None or path.suffix.lower() != ".csv":
+        return True
+    header = _top(path)[0]
+    if sum(len(names) for names in _numbered(header).values() if len(names) >= MANY) > FEWEST * len(header):
+        return True
+    with suppress(DataError):
+        return asked.labels is None and not [labels.named(asked.label, asked.words).find(name) for name in named]
+    known = asked.part in header or labels.column_among(header, labels.LABEL_COLUMNS) is not None
+    return len(named) == 1 or (known and bool(_long_columns(read_table(path)[0], asked, "")))
+
+
+def read_folder(folder: Path, named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
+    """The recordings of a folder, a file each, as `recordings_in` names them; DataError where none can be read."""
     if asked.labels is None and asked.part != "part":
         raise DataError(f"Expected a file of labels with a column {asked.part}: a folder's names tell no parts' numbers.")
     if asked.labels is None:
         told = labels.named(asked.label, asked.words)
     else:
         told = labels.listed(asked.labels, asked.part, list(named), asked.words)
-    found = Collected(name, asked.channels or _usual_channel(named.values(), folder))
-    ordered = {name: named[name] for name in sorted(named, key=natural)}
+    found = Collected(name, asked.channels or _usual_channel(named.values(), asked))
     read = partial(read_recording, channels=found.channels, timed=asked.rate_hz is None, encodings=found.encodings)
     try:
-        labels.collect(ordered, read, told, found)
+        labels.collect(named, read, told, found).must_mean_something()
     except DataError as error:
-        if asked.label or asked.labels or (listing := _listing(named)) is None:
+        if asked.label or asked.labels or (listing := _listing(folder, named)) is None:
             raise
         advice = f"{listing.name} names files; give it, labels={str(listing)!r}"
         raise DataError(f"Expected labels in {folder}: {advice}.") from error
     return as_dataset(found, asked)
 
 
-def _header(path: Path, lines: int = 1) -> list[list[str]]:
-    """The cells of a file's first lines; none where they cannot be read, which is said when the whole file is."""
-    with suppress(OSError, UnreadableError), path.open("rb") as file:
-        text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:lines]))
-        return list(cells_of(text).values())
-    return []
+def _top(path: Path) -> list[list[str]]:
+    """The cells of a CSV file's first lines; none where they cannot be read, which is said when the whole file is."""
+    with suppress(UnreadableError, OSError), path.open("rb") as file:
+        text, _ = decoded(b"\n".join(file.read(2**18).split(b"\n")[:100]))
+        return list(cells_of(text).values()) or [[]]
+    return [[]]
 
 
-def _listing(named: Mapping[str, Path]) -> Path | None:
+def _listing(folder: Path, named: Mapping[str, Path]) -> Path | None:
     """The file whose second line names another one, as a file of labels does."""
     stems = {path.stem.lower() for path in named.values()}
-    for path in named.values():
-        words = {word.lower().removesuffix(".csv") for row in _header(path, 2)[1:] for word in row}
-        if words & (stems - {path.stem.lower()}):
-            return path
-    return None
+    words = {path: {word.lower().removesuffix(".csv") for word in _top(path)[-1]} for path in folder.rglob("*.csv")}
+    return next((path for path, said in words.items() if said & (stems - {path.stem.lower()})), None)
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
@@ -84,80 +105,86 @@ def natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(word), "") if word.isdecimal() else (1, 0, word) for word in words if word]
 
 
-def _usual_channel(paths: Iterable[Path], folder: Path) -> tuple[str, ...]:
+def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
-    headers = [tuple(name for name in row if name and not is_time(name)) for path in paths for row in _header(path)]
+    headers = [tuple(name for name in _top(path)[0] if name and not is_time(name)) for path in paths]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
-    usual = Counter(headers).most_common(1)[0][0]
-    if len(usual) != 1:
-        have = ", ".join(usual) or "none"
-        first = usual[0] if usual else FORCE
-        raise DataError(f"Expected the channel to be named, as in channel={first!r}; the columns of {folder} are {have}.")
-    return usual
+    return _chosen(Counter(headers).most_common(1)[0][0], asked)
 
 
-def read_csv(path: Path, name: str, asked: Asked) -> Dataset:
-    """One CSV file with a header."""
-    import pandas as pd
+def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
+    """CSV and Parquet files of one form, one after the other. DataError where their columns are not the same."""
+    found = Collected(name, ())
+    tables: dict[str, pd.DataFrame] = {}
+    for source, path in named.items():
+        try:
+            frame, faults = read_table(path, found.encodings) if path.suffix.lower() == ".csv" else _parquet(path)
+        except UnreadableError as error:
+            raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
+        odd = [word for word in frame.columns if NUMBER.fullmatch(word) and not word.isdecimal()]
+        if path.suffix.lower() == ".csv" and 2 * len(odd) > len(frame.columns) > 2:
+            raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
+        if frame.empty:
+            raise DataError(f"Expected rows that can be read in {path}, found none.")
+        found.faults += [replace(fault, source=source) for fault in faults]
+        tables[source] = frame
+        found.beside = next((str(p) for p in path.parent.glob("*.csv") if p not in named.values()), found.beside)
+    return _from_tables(tables, asked, found)
 
-    encodings = Counter[str]()
-    try:
-        frame, faults = read_table(path, encodings)
-    except UnreadableError as error:
-        raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
-    told = pd.Series([word for word in frame.columns if not word.isdecimal()], dtype=object)
-    if 2 * (len(told) - len(floats(told)[1])) > len(frame.columns) > 2:
-        raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
-    if frame.empty:
-        raise DataError(f"Expected rows that can be read in {path}, found none.")
-    return from_frame(frame, asked, name, path.name, faults, encodings)
 
-
-def read_parquet(path: Path, name: str, asked: Asked) -> Dataset:
-    """One Parquet file, by pyarrow."""
+def _parquet(path: Path) -> tuple[pd.DataFrame, list[Fault]]:
     import pandas as pd
 
     with reading(path, "a Parquet file", "pyarrow", "files"):
-        frame = pd.read_parquet(path)
-    return from_frame(frame, asked, name, path.name)
+        return _counted(pd.read_parquet(path)), []
 
 
-def from_frame(
-    frame: pd.DataFrame,
-    asked: Asked,
-    name: str = "data",
-    source: str = "row",
-    faults: Sequence[Fault] | None = None,
-    encodings: Counter[str] | None = None,
-) -> Dataset:
-    """A table in memory. faults, encodings : of its file, whose lines are its index; None: rows count from 1.
+def _counted(frame: pd.DataFrame) -> pd.DataFrame:
+    """With names that are texts, and rows from 1."""
+    return frame.set_axis(list(map(str, frame.columns)), axis=1).set_axis(range(1, len(frame) + 1))
+
+
+def from_frame(frame: pd.DataFrame, asked: Asked) -> Dataset:
+    """A table in memory, whose rows count from 1."""
+    return _from_tables({"row": _counted(frame)}, asked, Collected("data", ()))
+
+
+def _from_tables(tables: Mapping[str, pd.DataFrame], asked: Asked, found: Collected) -> Dataset:
+    """Tables of one form, by the names of their files, whose lines are their index."""
+    first, *_ = tables
+    for source, frame in tables.items():
+        twice = frame.columns[frame.columns.duplicated()]
+        if len(twice):
+            raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
+        if apart := listed(sorted(_form(frame) ^ _form(tables[first]))):
+            raise DataError(f"Expected the same columns in {first} and in {source}, only one of them has {apart}.")
+    if asked.time is not None or asked.labels is not None:
+        return _from_long(_one_long(tables, asked), asked, found, first)
+    for source, frame in tables.items():
+        _take_rows(frame, asked, found, source)
+    return as_dataset(found, asked)
+
+
+def _form(frame: pd.DataFrame) -> set[str]:
+    """The columns of a table, without regard to how many samples it has of a channel."""
+    several = {name: channel for channel, names in _numbered(frame.columns).items() if len(names) > 1 for _, name in names}
+    return {several.get(name, name) for name in frame.columns}
+
+
+def _take_rows(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> None:
+    """A row an insertion.
 
     An empty cell before others is a NaN: the engine finds it, and the part is verified. A row whose last cells are empty is
     a shorter trace. A row with text in it, or no label, is a fault.
     """
-    import pandas as pd
-
-    frame = frame.set_axis([str(name) for name in frame.columns], axis=1)
-    frame = frame.set_axis(range(1, len(frame) + 1)) if faults is None else frame
-    twice = frame.columns[frame.columns.duplicated()]
-    if len(twice):
-        raise DataError(f"Expected each column once in {source}, {twice[0]} is there more often.")
-    found = Collected(name, (), list(faults or []), encodings=encodings or Counter())
-    if asked.time is not None or asked.labels is not None:
-        return _from_long(frame, asked, found, source)
-    label = _label_column(frame, asked)
+    label = _label_column(frame, asked, found)
     if asked.part != "part" and asked.part not in frame:
         raise DataError(f"Expected a column {asked.part} of parts' numbers, found {listed(frame.columns)}.")
     columns = _sample_columns([name for name in frame.columns if name not in (label, asked.part)], asked)
-    blocks, wrong = [], dict[int, str]()
-    for names in columns.values():
-        values, odd = numbers(frame[names])
-        blocks.append(values)
-        wrong = odd | wrong
+    values, wrong = numbers(frame[[name for names in columns.values() for name in names]])
     found.channels = tuple(filter(None, columns))
-    words = frame[label].tolist()
-    parts = frame.get(asked.part, pd.Series("", frame.index)).astype(object).fillna("")
+    parts = [""] * len(frame) if asked.part not in frame else frame[asked.part].astype(object).fillna("").tolist()
 
     def recorded(line: int, trace: NDArray[np.float32], word: Any, part: Any) -> Recorded:
         if line in wrong:
@@ -165,9 +192,28 @@ def from_frame(
         number = str(part).removesuffix(".0").strip() or None
         return Recorded(_ended(trace), labels.label_of(word, asked.words), f"{source}, line {line}", number)
 
-    for row in zip(frame.index, np.stack(blocks, axis=1), words, parts, strict=True):
+    for row in zip(frame.index, values.reshape(len(frame), len(columns), -1), frame[label].tolist(), parts, strict=True):
         found.take(source, partial(recorded, *row), row[0])
-    return as_dataset(found, asked)
+
+
+def _one_long(tables: Mapping[str, pd.DataFrame], asked: Asked) -> pd.DataFrame:
+    """Long tables as one. A number that comes again in another file is another part's, called by its file too.
+
+    Only the last of a file, if the next one begins with it, goes on there.
+    """
+    import pandas as pd
+
+    frame = pd.concat(tables.values())
+    if len(tables) == 1 or asked.part not in frame:
+        return frame
+    at, last, homes = dict[str, str](), "", list[str]()
+    for source, table in tables.items():
+        part = table[asked.part].astype(str).tolist()
+        at = {number: at[last] if number == last == part[0] else source for number in part}
+        homes, last = homes + [f"{at[number]}/{number}" for number in part], part[-1]
+    number, home = frame[asked.part].astype(str).where(frame[asked.part].notna()), pd.Series(homes, frame.index)
+    twice = home.groupby(number.to_numpy()).transform("nunique") > 1
+    return frame.assign(**{asked.part: number.where(~twice, home)})
 
 
 def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str) -> Dataset:
@@ -176,9 +222,9 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     for name in (asked.part, time):
         if name not in frame:
             wanted = f"a row a sample in {source}, with columns of parts (part) and times (time)"
-            advice = f"; name {names}" if (names := _long_columns(frame, asked)) else ""
+            advice = f"; name {names}" if (names := _long_columns(frame, asked, found.beside)) else ""
             raise DataError(f"Expected {wanted}, found {listed(frame.columns)}{advice}.")
-    label = None if asked.labels is not None else _label_column(frame, asked)
+    label = None if asked.labels is not None else _label_column(frame, asked, found)
     frame = _row_a_sample(frame, [asked.part, time, *([label] if label else [])], asked)
     left = [name for name in frame.columns if name not in (asked.part, time, label) and not floats(frame[name])[1]]
     found.channels = _chosen(left, asked)
@@ -186,11 +232,10 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
     frame = frame.assign(**{time: frame[time] if odd else times})
     parts = {str(part): rows for part, rows in frame.groupby(asked.part, sort=False)}
 
-    def read(rows: pd.DataFrame) -> tuple[NDArray[np.float32], float | None]:
-        values, wrong = numbers((rows := rows.sort_values(time, kind="stable"))[list(found.channels)])
-        if wrong:
-            raise UnreadableError(wrong[min(wrong)], min(wrong))
-        return np.ascontiguousarray(values.T), None if asked.rate_hz else rate_of(rows, time)
+    places = [frame.columns.get_loc(name) for name in found.channels]
+
+    def read(rows: pd.DataFrame) -> Timed:
+        return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
 
     def find(part: str) -> labels.Known:
         words = parts[part][label].dropna().unique().tolist()
@@ -202,8 +247,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         told = labels.Labels(find, "name the column of labels (label)")
     else:
         told = labels.listed(asked.labels, "part", list(parts), asked.words)
-    labels.collect(parts, read, told, found)
-    return as_dataset(found, asked)
+    return as_dataset(labels.collect(parts, read, told, found), asked)
 
 
 def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.DataFrame:
@@ -222,11 +266,10 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
     return wide.reset_index().set_axis(range(1, len(wide) + 1))
 
 
-def _long_columns(frame: pd.DataFrame, asked: Asked) -> str:
+def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     """How to say which column is what, where a table looks as if it had a row a sample; else nothing."""
-    numbered = Counter(found[1] for name in frame.columns if (found := NUMBERED.fullmatch(name)))
     time = next((name for name in frame.columns if is_time(name)), None)
-    if time is None or max(numbered.values(), default=0) > 2:
+    if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
     rows = frame.bfill()  # a label may stand in a part's last row alone
     changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in frame.columns if name != time}
@@ -234,7 +277,7 @@ def _long_columns(frame: pd.DataFrame, asked: Asked) -> str:
     if not few:
         return ""
     part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
-    told = f"label={label!r}" if label != part else "labels='labels.csv', a file of parts and labels"
+    told = f"label={label!r}" if label != part else f"labels={beside!r}, a file of parts and labels"
     told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
     return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"
 
@@ -256,32 +299,38 @@ def _ended(trace: NDArray[np.float32]) -> NDArray[np.float32]:
     return trace[:, : known[-1] + 1] if len(known) else trace
 
 
-def _label_column(frame: pd.DataFrame, asked: Asked) -> str:
+def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
     if asked.label is not None:
         if asked.label not in frame:
             raise DataError(f"Expected a column {asked.label} of labels, found {listed(frame.columns)}.")
         return asked.label
-    found = labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)
-    if asked.time is None and (advice := _long_columns(frame, asked)):
+    if asked.time is None and (advice := _long_columns(frame, asked, found.beside)):
         raise DataError(f"Expected a row an insertion, got a row a sample: {listed(frame.columns)}; name {advice}.")
-    if found is not None:
-        return str(frame.columns[found])
-    numbered = Counter(match[1] for name in frame.columns if (match := NUMBERED.fullmatch(name)))
-    left = [name for name in frame.columns if (match := NUMBERED.fullmatch(name)) is None or numbered[match[1]] == 1]
+    if (known := labels.column_among(list(frame.columns), labels.LABEL_COLUMNS)) is not None:
+        return str(frame.columns[known])
+    several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
+    left = [name for name in frame.columns if name not in several]
     if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
-        raise DataError(f"Expected a row an insertion, got {listed(left)}, as in one recording; give its folder.")
+        raise DataError(
+            f"Expected a row an insertion, got {listed(left)}, as in one recording; give a folder of such CSV files."
+        )
+    likely = min(left, key=lambda name: (frame[name].nunique() < 2, frame[name].nunique()), default="...")
     have = listed(left or frame.columns)
-    raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label='...'.")
+    raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label={likely!r}.")
+
+
+def _numbered(names: Iterable[str]) -> dict[str, list[tuple[int, str]]]:
+    """Channel -> the numbers that its columns have, and these columns, by the pattern that most of one channel have."""
+    found: list[dict[str, list[tuple[int, str]]]] = [{}, {}]
+    for groups, pattern in zip(found, (NUMBERED, FIRST), strict=True):
+        for match in filter(None, map(pattern.fullmatch, names)):
+            groups.setdefault(match["channel"], []).append((int(match["number"]), match[0]))
+    return max(found, key=lambda groups: max(map(len, groups.values()), default=0))
 
 
 def _sample_columns(names: list[str], asked: Asked) -> dict[str, list[str]]:
     """Channel -> its columns, in the order of their numbers: where one is missing, what comes after it would be shifted."""
-    groups: dict[str, list[tuple[int, str]]] = {}
-    for name in names:
-        found = NUMBERED.fullmatch(name)
-        if found:
-            groups.setdefault(found[1], []).append((int(found[2]), name))
-    several = {name: sorted(those) for name, those in groups.items() if len(those) > 1}
+    several = {name: sorted(those) for name, those in _numbered(names).items() if len(those) > 1}
     if not several:
         raise DataError(f"Expected samples in numbered columns, as FZ_0, FZ_1, ..., found {listed(names)}.")
     for those in several.values():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,9 +19,12 @@ from .dataset import Fault, UnreadableError
 if TYPE_CHECKING:
     import pandas as pd
 
+Timed = tuple[NDArray[np.float32], float | None]  # (C, T), and hertz where there are timestamps
 LARGEST = 128 * 2**20  # bytes of one text file
 NOTHING = ("", "nan", "na", "n/a", "null", "none", "-nan", "<na>")  # a cell without a number: kept as NaN
 DECIMAL = re.compile(r"(?<![^\s;\"])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;\"])")  # a whole cell
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan", re.IGNORECASE)
+UNIT = re.compile(r"\[.*\]|\(.*\)|[kmµu]?[sNVAgm]|ns|Nm|N[·*.]m|bar|Hz|rad|°C?|%|-")  # a cell of a row of units
 DAY_FIRST = re.compile(r"^(\d\d)\.(\d\d)\.(\d{4})")  # a German day
 GAP = 5.0  # median steps: a pause that a late message does not explain
 SLOW = 0.5  # seconds: no recorder of forces steps so slowly; a clock without a unit counts thousandths, or less
@@ -31,18 +34,38 @@ UNITS = {"ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 def cells_of(text: str) -> dict[int, list[str]]:
     """Line number -> cells, of the lines that are not blank; UnreadableError for a line of megabytes.
 
-    The delimiter is the one of , ; and tab that the first line has most of. Where it is not the comma, a comma is a
-    decimal's, as a German Excel writes numbers.
+    The delimiter is the tab or ; of which most lines have as many, or else the one of , ; and tab that the first line has
+    most of. Where it is not the comma, a comma is a decimal's, as a German Excel writes numbers.
     """
     lines = {i: line for i, line in enumerate(text.splitlines(), start=1) if line.strip()}
     delimiter = max(",;\t", key=next(iter(lines.values()), "").count)
+    for each in "\t;":
+        n, times = next(iter(Counter(line.count(each) for line in lines.values()).most_common(1)), (0, 0))
+        delimiter = each if n and 2 * times > len(lines) else delimiter
     if delimiter != ",":
         lines = {i: DECIMAL.sub(r"\1.\2", line) for i, line in lines.items()}
     try:
         rows = {i: next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) for i, line in lines.items()}
     except csv.Error as error:
         raise UnreadableError(f"Expected separated values, got others: {error}") from error
-    return {i: [word.strip() for word in row] for i, row in rows.items()}
+    return _from_header(list(rows), [[word.strip() for word in row] for row in rows.values()])
+
+
+def _from_header(lines: list[int], rows: list[list[str]]) -> dict[int, list[str]]:
+    """Line number -> cells from the header on, without what a recorder writes above it, and without a row of units.
+
+    A row of data has numbers in most columns that have them in the last rows. A first line that may be the header is one,
+    if only one other line is above the data: that is damaged data.
+    """
+    numbers: Callable[[list[str]], frozenset[int]]
+    numbers = lambda row: frozenset(i for i, word in enumerate(row) if NUMBER.fullmatch(word))  # noqa: E731
+    usual = Counter(map(numbers, rows[1:][-20:])).most_common(1)
+    data = next((k for k, row in enumerate(rows) for some, _ in usual if 2 * len(numbers(row) & some) > len(some)), 0)
+    units = [all(map(UNIT.fullmatch, row)) for row in rows[:data]]
+    header = max(data - 1 - (data > 1 and units[-1]), 0)
+    if header == 1 and len(rows[0]) >= len(rows[data]) and not units[0]:
+        header = data = 0
+    return {i: rows[k] for k, i in enumerate(lines) if k == header or k >= max(data, 1)}
 
 
 def decoded(raw: bytes) -> tuple[str, str]:
@@ -112,23 +135,26 @@ def numbers(frame: pd.DataFrame) -> tuple[NDArray[np.float32], dict[int, str]]:
         return block.astype(np.float32), wrong
 
 
-def read_recording(
-    path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]
-) -> tuple[NDArray[np.float32], float | None]:
-    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault.
-
-    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
-    """
+def read_recording(path: Path, channels: Sequence[str], timed: bool, encodings: Counter[str]) -> Timed:
+    """One file's channels (C, T), and its rate by its timestamps, if timed; UnreadableError names the line at fault."""
     frame, faults = read_table(path, encodings)
-    picked = frame.iloc[:, [place_of(name, list(frame.columns)) for name in channels]]
+    places = [place_of(name, list(frame.columns)) for name in channels]
     if faults:
         raise UnreadableError(faults[0].what, faults[0].line)
     if frame.empty:
         raise UnreadableError("Expected samples below the header, found none", 1)
-    values, wrong = numbers(picked)
+    return recording_of(frame, places, timed)
+
+
+def recording_of(rows: pd.DataFrame, places: Sequence[int], timed: bool, time: str | None = None) -> Timed:
+    """Rows, a sample each, as (C, T), and their rate, if timed, as `rate_of`. places : of the channels' columns.
+
+    An empty cell, or one that says nan, is a NaN: the engine finds it, and the part is verified.
+    """
+    values, wrong = numbers(rows.iloc[:, places])
     if wrong:
         raise UnreadableError(wrong[min(wrong)], min(wrong))
-    return np.ascontiguousarray(values.T), rate_of(frame) if timed else None
+    return np.ascontiguousarray(values.T), rate_of(rows, time) if timed else None
 
 
 def place_of(name: str, header: Sequence[str]) -> int:

@@ -19,8 +19,6 @@ from ..errors import SettingError, shortened
 Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
 Active = NDArray[np.bool_]
 NEAR = 1.5  # steps: to the next sample, when none is missing
-
-
 SIZE = r"(?=.*[1-9])\d+(\.\d+)?"  # a number above zero
 BITS, REGISTER = "actual_digital_output_bits", "output_int_register_25"
 # Pattern of the number; the number, signal and quiet_s of one that says nothing else; whether it is on, of signals (1, n).

@@ -2,13 +2,17 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from click.testing import Result
 
 from dengine import DataEngine, Dataset, load_dataset
 from dengine.experiments.figures import data_picture
@@ -68,14 +72,122 @@ def test_each_plants_recordings_are_replayed_by_one_command_or_as_the_errors_say
     good = int(load_dataset("insertion").y[np.random.default_rng(0).permutation(1503)[:60]].sum())
     assert (found["traces"], found["samples"], found["good"], found["faults"]) == (60, 200, good, [])
     assert found["rate_hz"] == (500.0 if "wide" in source or "lab" in source else 100.0)
-    asked = ["replay", "--data", source, "--reducer", "pca", "--repeats", "1", "--cycles", "60"]
-    while (done := dengine(*asked)).exit_code:
-        advice = re.findall(r"(--[a-z-]+) ('[^']*'|\S+?)(?=[.,;]?(?:\s|$))", done.stderr)
-        assert advice, done.stderr
-        asked += [shlex.split(word)[0] for pair in advice for word in pair]
-        assert len(asked) < 20
+    done, _ = as_advised("replay", "--data", source, "--reducer", "pca", "--repeats", "1", "--cycles", "60")
     assert "pca on" in done.stdout
     assert ("read as Windows-1252" in done.stderr) == (source == "latin")
+
+
+def as_advised(*asked: str) -> tuple[Result, dict[str, str]]:
+    """What a command comes to where one types what its errors say, one by one; and what that was."""
+    told = dict[str, str]()
+    while (done := dengine(*asked, *(word for pair in told.items() for word in pair))).exit_code:
+        advice = re.findall(r"(--[a-z-]+) ('[^']*'|\S+?)(?=[.,;]?(?:\s|$))", done.stderr)
+        assert set(dict(advice)) - set(told), done.stderr
+        told |= {name: shlex.split(value)[0] for name, value in advice}
+    return done, {name.strip("-").replace("-", "_"): value for name, value in told.items()}
+
+
+def long(X: np.ndarray, good: np.ndarray) -> pd.DataFrame:
+    """A row a sample; the numbers of parts begin anew in each file."""
+    rows = {"time": (np.arange(len(X))[:, None] + np.arange(40) / 100).ravel(), "serial": np.repeat(np.arange(len(X)), 40)}
+    return pd.DataFrame(rows | {"force": X.ravel().astype(float), "verdict": np.repeat(np.where(good, "OK", "NOK"), 40)})
+
+
+def wide(X: np.ndarray, good: np.ndarray, name: str = "s{:03d}_fz") -> pd.DataFrame:
+    return pd.DataFrame(X.astype(float), columns=[name.format(i) for i in range(40)]).assign(day=1, Urteil=good)
+
+
+FORMS: dict[str, Callable[..., Any]] = {  # what writes a day's file
+    "long.parquet": lambda X, good, path: long(X, good).to_parquet(path),
+    "long.csv": lambda X, good, path: long(X, good).to_csv(path, index=False),
+    "wide.parquet": lambda X, good, path: wide(X, good).to_parquet(path),
+    "wide.csv": lambda X, good, path: wide(X, good, "FZ [{}]").to_csv(path, index=False),
+    "plain.npz": lambda X, good, path: np.savez(path, X=X, y=good, rate_hz=100.0),
+    "named.npz": lambda X, good, path: np.savez(path, force=X, torque=-X, accepted=good),
+    "turned.npz": lambda X, good, path: np.savez(path, force=X.T, accepted=good),
+}
+DAYS = {"day_2": slice(0, 7), "day_10": slice(7, 21), "day_11": slice(21, 30)}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_folder_of_several_files_of_one_form_is_one_set(form: str, make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    for day, rows in DAYS.items():
+        FORMS[form](data.X[rows], data.y[rows] == 1, tmp_path / f"{day}{Path(form).suffix}")
+    found = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
+    np.testing.assert_array_equal(found.X, data.X)
+    assert (found.y.tolist(), found.faults) == (data.y.tolist(), ())
+
+
+@pytest.mark.parametrize("form", ["wide.csv", "plain.npz"])
+def test_files_of_other_forms_in_a_folder_are_both_named(form: str, make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    good, suffix = data.y == 1, Path(form).suffix
+    FORMS[form](data.X, good, tmp_path / f"one{suffix}")
+    if suffix == ".npz":
+        np.savez(tmp_path / "two.npz", X=data.X[:, :30], y=good)
+    else:
+        wide(data.X, good, "FX [{}]").to_csv(tmp_path / "two.csv", index=False)
+    assert re.search(rf"Expected .* in one\{suffix} and (in )?two\{suffix}", dengine("data", tmp_path).stderr)
+
+
+@pytest.mark.parametrize("above", ["{}", "Presse 3\nTeil;7\n\n{}", "[s];[N]\n{}", "{}\ns;N", "a;b\nTeil;7\n{}\n[s];[N]"])
+def test_what_a_recorder_writes_around_the_header_is_no_data(above: str, make_data, tmp_path: Path) -> None:
+    data = make_data(12, samples=40)
+    for i, (x, ok) in enumerate(zip(data.X, data.y, strict=True)):
+        rows = [f"{t / 100};{value}" for t, value in enumerate(x.tolist())]
+        text = "\n".join([above.format("Zeit;Kraft"), *rows]).replace(".", ",")
+        (tmp_path / f"{i:02d}_{'OK' if ok else 'NOK'}.csv").write_text(text)
+    found = load_dataset(tmp_path)
+    np.testing.assert_array_equal(found.X, data.X)
+    assert (found.rate_hz, found.channels, found.faults) == (100.0, ("Kraft",), ())
+
+
+def test_labels_apart_are_advised_and_given_to_arrays_in_their_order(make_data, tmp_path: Path) -> None:
+    data = make_data(30, samples=40)
+    np.savez(tmp_path / "force.npz", force=data.X.T)
+    table = pd.DataFrame({"row": range(30), "verdict": np.where(data.y == 1, "heil", "Riss")})
+    table.to_csv(tmp_path / "checks.csv", index=False)
+    found = load_dataset(tmp_path, **as_advised("data", str(tmp_path))[1])
+    np.testing.assert_array_equal(found.X, data.X)
+    assert abs(found.y.mean() - 0.5) == abs(data.y.mean() - 0.5)  # which word is the good one, a person has to say
+    table.iloc[::-1].to_csv(tmp_path / "checks.csv", index=False)
+    refused = dengine("data", tmp_path, "--channel", "force", "--labels", tmp_path / "checks.csv")
+    assert "in their order, got [29, 28" in refused.stderr
+
+
+class Told:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (Path("run"),)
+
+
+def test_python_objects_are_not_read_unasked_and_the_error_says_what_to_type(
+    make_data, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savez("evil.npz", X=np.array([Told()]), y=[1])
+    assert "can run code" in dengine("data", "evil.npz").stderr
+    assert not Path("run").exists()
+    data, X = make_data(30, samples=40), np.empty(30, object)
+    X[:] = [x[: 30 + i % 10] for i, x in enumerate(data.X)]
+    np.savez("runs.npz", X=X, y=np.where(data.y == 1, "OK", "NOK").astype(object))
+    command = shlex.split(re.findall(r"python -c \".*\"", dengine("data", "runs.npz").stderr)[0])
+    subprocess.run([sys.executable, *command[1:]], check=True)
+    found = load_dataset("runs.csv")
+    assert (found.y.tolist(), found.lengths.tolist()) == (data.y.tolist(), [30 + i % 10 for i in range(30)])
+
+
+@pytest.mark.parametrize(("good", "bad"), [("OK", "Ausschuss"), ("in Ordnung", "Riss"), ("Gutteil", "kein Gutteil")])
+def test_words_are_told_apart_by_the_map_that_the_error_says(good: str, bad: str, make_data, tmp_path: Path) -> None:
+    data = make_data(41, samples=40)
+    wide(data.X, np.array([bad, good])[data.y]).to_csv(tmp_path / "table.csv", index=False)
+    for i, x in enumerate(data.X):
+        (folder := tmp_path / "files" / (good if data.y[i] else bad)).mkdir(parents=True, exist_ok=True)
+        pd.DataFrame({"FZ": x}).to_csv(folder / f"p{i}.csv", index=False)
+    for source in (tmp_path / "files", tmp_path / "table.csv"):
+        found = load_dataset(source, **as_advised("data", str(source))[1])
+        assert {int(found.y.sum()), 41 - int(found.y.sum())} == {int(data.y.sum()), 41 - int(data.y.sum())}
+        assert found.faults == ()
 
 
 def test_a_row_a_signal_and_an_array_of_channels_are_the_traces_that_they_were(make_data, tmp_path: Path) -> None:

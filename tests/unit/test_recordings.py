@@ -366,7 +366,10 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
         lambda data, tmp: written(tmp / "bare.csv", lambda path: wide(data).to_csv(path, index=False, header=False)),
         "its first line is of numbers",
     ),
-    "one recording": (lambda data, tmp: write_csv(tmp / "one_True.csv", data.X[0]), "as in one recording; give its folder"),
+    "one recording": (
+        lambda data, tmp: write_csv(tmp / "one_True.csv", data.X[0]),
+        "as in one recording; give a folder of such CSV files",
+    ),
     "no labels": (lambda data, tmp: wide(data).drop(columns="label"), "a column of labels, y or label, found FZ_0"),
     "no samples": (lambda data, tmp: pd.DataFrame({"FZ": [1.0], "label": [1]}), "Expected samples in numbered columns"),
     "transposed": (lambda data, tmp: (np.zeros((5, 100, 2)), [1] * 5), r"looks transposed; pass X\.transpose"),
