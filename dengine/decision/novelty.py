@@ -1,4 +1,4 @@
-"""Is this trace like those learned from? Its distance to the nearest reference, in level and in texture, against limits.
+"""Is this trace like those learned from? Its distance to the nearest reference, in level, texture and distortion, against limits.
 
     >>> gate = fit_novelty(traces, margin=1.5)
     >>> gate(torch.from_numpy(traces[0]))
@@ -32,7 +32,6 @@ TAIL_TRACES = 200  # one of so many lies beyond the quantile
 LIKE = 3  # strangers that make a kind
 DISTORTIONS = 14  # D, of `_distorted`
 DISTORTED = 125  # references that are distorted: the mean of many more is the same
-CLOSER = 0.8  # of the margin, for distortions: their distances have the shorter tail
 
 
 class NoveltyGate(nn.Module):
@@ -124,13 +123,13 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
         points = standard[:, group]
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
-        scale = margin if i < 2 else CLOSER * margin
-        limit = scale * max(1.0, TAIL_TRACES / distinct) * limit
+        enough = TAIL_TRACES if i < 2 else REFERENCES  # the discriminants of few fit these few too well
+        limit = margin * max(1.0, enough / distinct) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()
         gate.norms[i] = float("inf")  # of no reference: never the nearest
-        gate.norms[i, : len(points)] = points.square().sum(1) / limit - (scale * reach / limit - 1.0).clamp(min=0.0)
+        gate.norms[i, : len(points)] = points.square().sum(1) / limit - (margin * reach / limit - 1.0).clamp(min=0.0)
     gate.asleep = False
     return gate
 
@@ -139,7 +138,7 @@ def _distorted(x: Tensor) -> list[Tensor]:
     """What a sensor or a clock would make of traces (n, C, T): gain, offset, drift, speed, delay, fading gain, a step."""
     samples = x.size(2)
     t = torch.linspace(0.0, 1.0, samples)
-    size = x.std((0, 2), unbiased=False)[:, None]
+    size = x.std(2, unbiased=False).median(0).values[:, None]  # (C, 1)
     moved = [size * 0.4, size * 0.5 * t, size * 0.5 * (t >= 0.5)]
     # Of a later clock or a shorter trace the ends are mirrored: what stands still would give it away.
     at = torch.arange(samples, dtype=x.dtype)

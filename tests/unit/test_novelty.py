@@ -87,7 +87,7 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
     for kind in ("noise", "sine", "silent"):
         some = GARBAGE[kind](HELD_OUT[:100], rng)
         gate = fit_novelty(np.concatenate([KNOWN, some[:50]]), 1.5)
-        assert share(gate, some[50:]) <= 0.1
+        assert share(gate, some[50:]) <= 0.15
         others = {other: share(gate, make(HELD_OUT[100:150], rng)) for other, make in GARBAGE.items() if other != kind}
         assert np.mean(list(others.values())) >= 0.75, (kind, others)
 
@@ -142,7 +142,7 @@ def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int
         traces = np.random.default_rng(n).normal(size=(n, channels, samples)).astype(np.float32)
         gate = fit_novelty(traces, 1.5)
         assert {name: t.shape for name, t in gate.state_dict().items()} == fresh
-        assert gate.scores(torch.from_numpy(traces[0])).shape == (2,)
+        assert gate.scores(torch.from_numpy(traces[0])).shape == (3,)
 
 
 @pytest.mark.parametrize("n", [4, 8, 40])
