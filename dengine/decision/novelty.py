@@ -1,4 +1,4 @@
-"""Is this trace like those learned from? Its distance to the nearest reference, in level, texture and distortion, against limits.
+"""Is this trace like those learned from? Distances to the nearest reference, in level, texture, distortion, and limits.
 
     >>> gate = fit_novelty(traces, margin=1.5)
     >>> gate(torch.from_numpy(traces[0]))
@@ -11,11 +11,11 @@
 
 Hotelling's T^2 (1947), taken from the nearest reference and not from the mean: parts that seat, jam and miss lie in clouds
 apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Each statistic has a limit of its own, and any alone tells: hum
-leaves the level where it was (Jackson and Mudholkar, 1979, Technometrics 21). Parts scatter widely, yet a gain, a drift or a
-delay moves all features together as parts do not: a distortion is Fisher's discriminant (1936, Annals of Eugenics 7)
-between the references and what a sensor or a clock would make of them. Segments: Nomikos and MacGregor (1994, AIChE
-Journal 40). Limits from the references themselves: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is
-read here, and nothing is clipped.
+leaves the level where it was (Jackson and Mudholkar, 1979, Technometrics 21). Parts scatter widely, yet a gain, a drift or
+a delay moves all features together as parts do not: a distortion is Fisher's discriminant (1936, Annals of Eugenics 7)
+between the references and what a sensor or a clock would make of them. Segments: Nomikos and MacGregor (1994, AIChE Journal
+40). Limits from the references themselves: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is read
+here, and nothing is clipped.
 """
 
 import numpy as np
@@ -53,8 +53,7 @@ class NoveltyGate(nn.Module):
         segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
         self.stride = samples // segments
         self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
-        n_plain = 4 * channels * segments  # P
-        n_features = n_plain + DISTORTIONS
+        n_plain, n_features = 4 * channels * segments, 4 * channels * segments + DISTORTIONS  # P, P + D
         self.register_buffer("quiet", torch.ones(channels, segments))
         self.register_buffer("distortions", torch.zeros(n_plain, DISTORTIONS))
         # A row for the level, one for the texture and one for distortions, zero in the others' features.
@@ -72,7 +71,7 @@ class NoveltyGate(nn.Module):
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """(C, T) -> (3,) float32: squared distance to the nearest reference over its limit, in level, texture, distortion."""
+        """(C, T) -> (3,) float32: squared distances over their limits, in level, texture, distortion."""
         plain = self.plain(x)
         z = torch.addcmul(self.offset, torch.cat([plain, plain @ self.distortions]), self.gain)  # (3, P + D)
         nearest = torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1)
@@ -85,9 +84,9 @@ class NoveltyGate(nn.Module):
         bends = steps[..., 1:] - steps[..., :-1]
         rough = torch.linalg.vector_norm(steps.unfold(-1, self.length - 1, self.stride), dim=-1)
         rougher = torch.linalg.vector_norm(bends.unfold(-1, max(0, self.length - 2), self.stride), dim=-1)
-        rough, rougher = rough.add_(self.quiet).log_(), rougher.add_(self.quiet).log_()
         # One after the other: aminmax takes half as long again as both.
-        return torch.cat([pieces.amin(-1), pieces.amax(-1), rough, rougher], -1).flatten(-2)
+        own = [pieces.amin(-1), pieces.amax(-1), rough.add_(self.quiet).log_(), rougher.add_(self.quiet).log_()]
+        return torch.cat(own, -1).flatten(-2)
 
 
 def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None) -> NoveltyGate:
@@ -117,8 +116,8 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
-    of = torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels)  # (P,): which of the four it is
-    of = torch.cat([of, torch.full((DISTORTIONS,), 4)])
+    own = torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels)  # (P,): which of the four it is
+    of = torch.cat([own, torch.full((DISTORTIONS,), 4)])
     for i, group in enumerate((of < 2, of == 2, of == 4)):
         points = standard[:, group]
         limit, reach = _limits(points, same)
@@ -139,18 +138,13 @@ def _distorted(x: Tensor) -> list[Tensor]:
     samples = x.size(2)
     t = torch.linspace(0.0, 1.0, samples)
     size = x.std(2, unbiased=False).median(0).values[:, None]  # (C, 1)
-    moved = [size * 0.4, size * 0.5 * t, size * 0.5 * (t >= 0.5)]
-    # Of a later clock or a shorter trace the ends are mirrored: what stands still would give it away.
-    at = torch.arange(samples, dtype=x.dtype)
-    places = [at / 1.08, at * 1.08, at - samples / 30, at + samples / 30]
-    last = max(1, samples - 1)
-    places = [last - (last - place.abs()).abs() for place in places]
-    low = [place.long().clamp(max=max(0, samples - 2)) for place in places]
-    timed = [
-        torch.lerp(x[..., i], x[..., (i + 1).clamp(max=samples - 1)], place - i) for i, place in zip(low, places, strict=True)
-    ]
     scaled = [factor * x for factor in (0.6, 1.6, 1.0 - 0.4 * t, 1.0 + 0.4 * t)]
-    return scaled + timed + [x + sign * each for each in moved for sign in (1.0, -1.0)]
+    moved = [x + sign * each for each in (0.4 * size, 0.5 * size * t, 0.5 * size * (t >= 0.5)) for sign in (1.0, -1.0)]
+    # Beyond the ends of a trace is its mirror image: what stands still would give it away.
+    at, last = torch.arange(samples), samples - 1
+    places = [last - (last - p.abs()).abs() for p in (at / 1.08, at * 1.08, at - samples / 30, at + samples / 30)]
+    timed = [torch.lerp(x[..., p.floor().long()], x[..., p.ceil().long()], p.frac()) for p in places]
+    return scaled + moved + timed
 
 
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor) -> Tensor:

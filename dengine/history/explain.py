@@ -229,8 +229,7 @@ class Novelty:
     distortion: float
 
     def __str__(self) -> str:
-        said = f"in level {self.level:.2f} times the limit, in texture {self.texture:.2f} times the limit"
-        return f"{said}, in distortion {self.distortion:.2f} times the limit"
+        return f"in level {self.level:.2f} times the limit, texture {self.texture:.2f}, distortion {self.distortion:.2f}"
 
 
 @dataclass(frozen=True, slots=True)
