@@ -6,8 +6,7 @@
 
     x (C, T) -> S segments: minimum, maximum, logarithms of the roughness of samples and of steps  (P,) = (4*C*S,)
              -> level (the first two), texture (the third), distortions (products of all)         (P + D,)
-             -> standardised
-             -> squared distance to the nearest reference over its limit, of each of these three  (3,)
+             -> standardised, squared distance to the nearest reference over its limit, of each of these three  (3,)
 
 Hotelling's T^2 (1947), taken from the nearest reference and not from the mean: parts that seat, jam and miss lie in clouds
 apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Each statistic has a limit of its own, and any alone tells: hum
@@ -116,14 +115,13 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
-    own = torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels)  # (P,): which of the four it is
-    of = torch.cat([own, torch.full((DISTORTIONS,), 4)])
+    of = torch.cat([torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels), torch.full((DISTORTIONS,), 4)])
     for i, group in enumerate((of < 2, of == 2, of == 4)):
         points = standard[:, group]
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
-        enough = TAIL_TRACES if i < 2 else REFERENCES  # the discriminants of few fit these few too well
-        limit = margin * max(1.0, enough / distinct) * limit
+        # And of fewer than REFERENCES the discriminants fit these too well.
+        limit = margin * max(1.0, (TAIL_TRACES if i < 2 else REFERENCES) / distinct) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()

@@ -59,6 +59,7 @@ GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "hum": hum,
     "spike": spike,
     "offset": lambda x, _: x + np.float32(SD),
+    "drift": lambda x, _: x - np.linspace(0, SD, x.shape[2], dtype=np.float32),
     "late": lambda x, _: np.concatenate([np.repeat(x[..., :1], 270, 2), x[..., :-270]], 2),
     "reversed": lambda x, _: x[..., ::-1],
     "silent": lambda x, _: np.zeros_like(x),
