@@ -147,12 +147,11 @@ def _distorted(x: Tensor) -> list[Tensor]:
 
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor) -> Tensor:
     """(P, D): Fisher's discriminants between traces x (n, C, T), of features plain (n, P) float64, and these distorted."""
-    n, n_plain = plain.shape
     offset, gain = _standardising(plain)
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
     # Of few traces the covariance is not known: it is drawn to one.
-    known = torch.cov(z.T) + (n_plain / n) ** 2 * torch.eye(n_plain, dtype=z.dtype)
-    some = slice(None, None, max(1, n // DISTORTED))
+    known = torch.cov(z.T) + (plain.size(1) / len(plain)) ** 2 * torch.eye(plain.size(1), dtype=z.dtype)
+    some = slice(None, None, max(1, len(plain) // DISTORTED))
     directions = []
     for traces in _distorted(x[some]):
         other = torch.addcmul(offset, gate.plain(traces).double().nan_to_num(), gain).clamp(-6.0, 6.0)
