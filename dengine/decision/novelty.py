@@ -1,18 +1,20 @@
-"""Is this trace like those learned from? Its distance to the nearest reference, in level and in texture, against limits.
+"""Is this trace like those learned from? Distances to the nearest reference, in level, texture, distortion, and limits.
 
     >>> gate = fit_novelty(traces, margin=1.5)
     >>> gate(torch.from_numpy(traces[0]))
     False
 
-    x (C, T) -> S segments: minimum and maximum (the level), logarithm of the roughness (the texture)   (3*C*S,)
-             -> standardised
-             -> squared distance to the nearest reference over its limit, of the level, of the texture  (2,)
+    x (C, T) -> S segments: minimum, maximum, logarithms of the roughness of samples and of steps  (P,) = (4*C*S,)
+             -> level (the first two), texture (the third), distortions (products of all)         (P + D,)
+             -> standardised, squared distance to the nearest reference over its limit, of each of these three  (3,)
 
 Hotelling's T^2 (1947), taken from the nearest reference and not from the mean: parts that seat, jam and miss lie in clouds
-apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Two statistics have a limit each, and either alone tells: hum
-leaves the level where it was (Jackson and Mudholkar, 1979, Technometrics 21). Segments: Nomikos and MacGregor (1994, AIChE
-Journal 40). Limits from the references themselves: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is
-read here, and nothing is clipped.
+apart (He and Wang, 2007, IEEE Trans. Semicond. Manuf. 20). Each statistic has a limit of its own, and any alone tells: hum
+leaves the level where it was (Jackson and Mudholkar, 1979, Technometrics 21). Parts scatter widely, yet a gain, a drift or
+a delay moves all features together as parts do not: a distortion is Fisher's discriminant (1936, Annals of Eugenics 7)
+between the references and what a sensor or a clock would make of them. Segments: Nomikos and MacGregor (1994, AIChE Journal
+40). Limits from the references themselves: MacGregor and Kourti (1995, Control Engineering Practice 3). No label is read
+here, and nothing is clipped.
 """
 
 import numpy as np
@@ -27,6 +29,8 @@ FEWEST = 20  # traces: fewer cannot say what is usual
 QUANTILE = 0.995
 TAIL_TRACES = 200  # one of so many lies beyond the quantile
 LIKE = 3  # strangers that make a kind
+DISTORTIONS = 14  # D, of `_distorted`
+DISTORTED = 125  # references that are distorted: the mean of many more is the same
 
 
 class NoveltyGate(nn.Module):
@@ -40,6 +44,7 @@ class NoveltyGate(nn.Module):
     gain: Tensor
     points: Tensor
     norms: Tensor
+    distortions: Tensor
 
     def __init__(self, channels: int, samples: int) -> None:
         super().__init__()
@@ -47,37 +52,40 @@ class NoveltyGate(nn.Module):
         segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
         self.stride = samples // segments
         self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
-        n_features = 3 * channels * segments  # P
+        n_plain, n_features = 4 * channels * segments, 4 * channels * segments + DISTORTIONS  # P, P + D
         self.register_buffer("quiet", torch.ones(channels, segments))
-        # A row for the level and one for the texture, zero in the other one's features.
-        self.register_buffer("offset", torch.zeros(2, n_features))
-        self.register_buffer("gain", torch.zeros(2, n_features))
+        self.register_buffer("distortions", torch.zeros(n_plain, DISTORTIONS))
+        # A row for the level, one for the texture and one for distortions, zero in the others' features.
+        self.register_buffer("offset", torch.zeros(3, n_features))
+        self.register_buffer("gain", torch.zeros(3, n_features))
         self.register_buffer("points", torch.zeros(n_features, REFERENCES))
-        self.register_buffer("norms", torch.zeros(2, REFERENCES))
+        self.register_buffer("norms", torch.zeros(3, REFERENCES))
 
     def forward(self, x: Tensor) -> bool:
         """(C, T) float32, one trace, in the references' unit -> whether it is unlike all of them."""
         if self.asleep:
             return False
         far: list[float] = self.scores(x).tolist()
-        return not (far[0] <= 1.0 and far[1] <= 1.0)  # what overflowed to NaN is novel
+        return not (far[0] <= 1.0 and far[1] <= 1.0 and far[2] <= 1.0)  # what overflowed to NaN is novel
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """(C, T) -> (2,) float32: squared distance to the nearest reference over its limit, in level and in texture."""
-        z = torch.addcmul(self.offset, self.features(x), self.gain)  # (2, P)
+        """(C, T) -> (3,) float32: squared distances over their limits, in level, texture, distortion."""
+        plain = self.plain(x)
+        z = torch.addcmul(self.offset, torch.cat([plain, plain @ self.distortions]), self.gain)  # (3, P + D)
         nearest = torch.addmm(self.norms, z, self.points, alpha=-2.0).amin(1)
         return nearest + (z * z).sum(1)
 
-    def features(self, x: Tensor) -> Tensor:
-        """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of roughness."""
+    def plain(self, x: Tensor) -> Tensor:
+        """(..., C, T) -> (..., P): of each channel its segments' minima, maxima, logarithms of both roughnesses."""
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
-        steps = (x[..., 1:] - x[..., :-1]).unfold(
-            -1, self.length - 1, self.stride
-        )  # from sample to sample, (..., C, S, L - 1)
-        rough = torch.linalg.vector_norm(steps, dim=-1)
+        steps = x[..., 1:] - x[..., :-1]  # from sample to sample
+        bends = steps[..., 1:] - steps[..., :-1]
+        rough = torch.linalg.vector_norm(steps.unfold(-1, self.length - 1, self.stride), dim=-1)
+        rougher = torch.linalg.vector_norm(bends.unfold(-1, max(0, self.length - 2), self.stride), dim=-1)
         # One after the other: aminmax takes half as long again as both.
-        return torch.cat([pieces.amin(-1), pieces.amax(-1), rough.add_(self.quiet).log_()], -1).flatten(-2)
+        own = [pieces.amin(-1), pieces.amax(-1), rough.add_(self.quiet).log_(), rougher.add_(self.quiet).log_()]
+        return torch.cat(own, -1).flatten(-2)
 
 
 def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None) -> NoveltyGate:
@@ -99,18 +107,21 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
     # Of each trace the middle one, (C,). A channel that never moved is silent at the least number: any sound is far away.
     steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values if samples > 1 else torch.zeros(channels)
     gate.quiet.copy_((0.05 * (gate.length / samples) ** 0.5 * steps).clamp(min=1e-12)[:, None])
-    features = gate.features(x).double()
+    plain = gate.plain(x).double().nan_to_num()
+    gate.distortions.copy_(_discriminants(gate, x, plain))
+    features = torch.cat([plain, plain @ gate.distortions.double()], 1).nan_to_num()
     offset, gain = _standardising(features)
     standard = torch.addcmul(offset, features, gain).float()
     sound = standard.abs().amax(1) < 1e15  # the square of a larger distance would overflow
     if not sound.all():
         standard, same = standard[sound], same[sound][:, sound]
-    texture = torch.arange(3 * gate.quiet.size(1)).ge(2 * gate.quiet.size(1)).repeat(channels)  # (P,)
-    for i, group in enumerate((~texture, texture)):
+    of = torch.cat([torch.arange(4).repeat_interleave(gate.quiet.size(1)).repeat(channels), torch.full((DISTORTIONS,), 4)])
+    for i, group in enumerate((of < 2, of == 2, of == 4)):
         points = standard[:, group]
         limit, reach = _limits(points, same)
         # Of fewer than TAIL_TRACES the farthest stands for the quantile: the tail beyond it is taken as 1 / d^2.
-        limit = margin * max(1.0, TAIL_TRACES / distinct) * limit
+        # And of fewer than REFERENCES the discriminants fit these too well.
+        limit = margin * max(1.0, (TAIL_TRACES if i < 2 else REFERENCES) / distinct) * limit
         gate.offset[i, group] = (limit**-0.5 * offset[group]).float()
         gate.gain[i, group] = (limit**-0.5 * gain[group]).float()
         gate.points[group, : len(points)] = limit**-0.5 * points.t()
@@ -118,6 +129,34 @@ def fit_novelty(traces: NDArray[np.float32], margin: float, parts: NDArray[np.in
         gate.norms[i, : len(points)] = points.square().sum(1) / limit - (margin * reach / limit - 1.0).clamp(min=0.0)
     gate.asleep = False
     return gate
+
+
+def _distorted(x: Tensor) -> list[Tensor]:
+    """What a sensor or a clock would make of traces (n, C, T): gain, offset, drift, speed, delay, fading gain, a step."""
+    samples = x.size(2)
+    t = torch.linspace(0.0, 1.0, samples)
+    size = x.std(2, unbiased=False).median(0).values[:, None]  # (C, 1)
+    scaled = [factor * x for factor in (0.6, 1.6, 1.0 - 0.4 * t, 1.0 + 0.4 * t)]
+    moved = [x + sign * each for each in (0.4 * size, 0.5 * size * t, 0.5 * size * (t >= 0.5)) for sign in (1.0, -1.0)]
+    # Beyond the ends of a trace is its mirror image: what stands still would give it away.
+    at, last = torch.arange(samples), samples - 1
+    places = [last - (last - p.abs()).abs() for p in (at / 1.08, at * 1.08, at - samples / 30, at + samples / 30)]
+    timed = [torch.lerp(x[..., p.floor().long()], x[..., p.ceil().long()], p.frac()) for p in places]
+    return scaled + moved + timed
+
+
+def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor) -> Tensor:
+    """(P, D): Fisher's discriminants between traces x (n, C, T), of features plain (n, P) float64, and these distorted."""
+    offset, gain = _standardising(plain)
+    z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
+    # Of few traces the covariance is not known: it is drawn to one.
+    known = torch.cov(z.T) + (plain.size(1) / len(plain)) ** 2 * torch.eye(plain.size(1), dtype=z.dtype)
+    some = slice(None, None, max(1, len(plain) // DISTORTED))
+    directions = []
+    for traces in _distorted(x[some]):
+        other = torch.addcmul(offset, gate.plain(traces).double().nan_to_num(), gain).clamp(-6.0, 6.0)
+        directions.append(torch.linalg.solve(known + 0.5 * torch.cov(other.T), (other - z[some]).mean(0)))
+    return (gain[:, None] * torch.stack(directions, 1)).float()
 
 
 def _standardising(features: Tensor) -> tuple[Tensor, Tensor]:

@@ -222,13 +222,14 @@ DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "ver
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """Squared distance to the nearest reference over its limit, in level and in texture: above 1 it is novel."""
+    """Squared distance to the nearest reference over its limit, in level, texture, distortion: above 1 it is novel."""
 
     level: float
     texture: float
+    distortion: float
 
     def __str__(self) -> str:
-        return f"in level {self.level:.2f} times the limit, in texture {self.texture:.2f} times the limit"
+        return f"in level {self.level:.2f} times the limit, texture {self.texture:.2f}, distortion {self.distortion:.2f}"
 
 
 @dataclass(frozen=True, slots=True)

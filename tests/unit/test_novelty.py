@@ -53,6 +53,7 @@ GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "hum": hum,
     "spike": spike,
     "offset": lambda x, _: x + np.float32(SD),
+    "drift": lambda x, _: x - np.linspace(0, SD, x.shape[2], dtype=np.float32),
     "late": lambda x, _: np.concatenate([np.repeat(x[..., :1], 270, 2), x[..., :-270]], 2),
     "reversed": lambda x, _: x[..., ::-1],
     "silent": lambda x, _: np.zeros_like(x),
@@ -81,7 +82,7 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
     for kind in ("noise", "sine", "silent"):
         some = GARBAGE[kind](HELD_OUT[:100], rng)
         gate = fit_novelty(np.concatenate([KNOWN, some[:50]]), 1.5)
-        assert share(gate, some[50:]) <= 0.1
+        assert share(gate, some[50:]) <= 0.15
         others = {other: share(gate, make(HELD_OUT[100:150], rng)) for other, make in GARBAGE.items() if other != kind}
         assert np.mean(list(others.values())) >= 0.75, (kind, others)
 
@@ -136,7 +137,7 @@ def test_shapes_depend_on_channels_and_samples_alone(channels: int, samples: int
         traces = np.random.default_rng(n).normal(size=(n, channels, samples)).astype(np.float32)
         gate = fit_novelty(traces, 1.5)
         assert {name: t.shape for name, t in gate.state_dict().items()} == fresh
-        assert gate.scores(torch.from_numpy(traces[0])).shape == (2,)
+        assert gate.scores(torch.from_numpy(traces[0])).shape == (3,)
 
 
 @pytest.mark.parametrize("n", [4, 8, 40])
