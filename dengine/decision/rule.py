@@ -44,13 +44,16 @@ the side that alarmed has done so, and after too many novel traces until these a
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from ..errors import StoreError
 from ..records import REASONS, Reason
 from .certificate import cusum
 from .intervals import INTERVALS, SORTING, normal_quantile
@@ -456,6 +459,18 @@ class RadiusNeighbours(nn.Module):
             return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
         return action, lower, upper, n_success, n_failure
+
+
+def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Copy arrays into a module's parameters and buffers by name; StoreError where these have other names or sizes."""
+    own = module.state_dict()  # shares its tensors with the module
+    if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in own.items()}:
+        raise StoreError(
+            f"Expected a model of this version of dengine, got one whose {type(module).__name__} has other sizes; its "
+            "labels are whole: learn from them anew, by `dengine train --data OLD.db --store NEW.db`."
+        )
+    for name, value in arrays.items():
+        own[name].copy_(torch.from_numpy(np.array(value)))
 
 
 _SCRIPTING = threading.Lock()

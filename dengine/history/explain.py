@@ -23,7 +23,7 @@ from ..decision.intervals import SORTED, level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
-from ..decision.rule import NOBODY, DecisionRule
+from ..decision.rule import NOBODY, DecisionRule, restore
 from ..errors import StoreError, UnknownDecisionError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
@@ -98,7 +98,10 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
         return None
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
     gate.asleep = False
-    gate.load_state_dict(_buffers(stored, "novelty."))
+    try:
+        restore(gate, {name: value.numpy() for name, value in _buffers(stored, "novelty.").items()})
+    except StoreError:  # the gate of another version of dengine
+        return None
     with torch.inference_mode():
         return Novelty(*gate.scores(torch.from_numpy(then.trace)).tolist())
 

@@ -25,7 +25,7 @@ from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, script
+from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, restore, script
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
@@ -422,9 +422,8 @@ class ModelPrediction(EngineModel):
         self.gate = NoveltyGate(*self.trace_shape)
         self.gate.asleep = not part(state, "novelty.")
         for module, prefix in ((self.rule, "rule."), (self.gate, "novelty.")):
-            own = module.state_dict()  # shares its tensors with the module
-            for name, value in part(state, prefix).items():
-                own[name].copy_(torch.from_numpy(np.array(value)))
+            if arrays := part(state, prefix):
+                restore(module, arrays)
         self._predictor = None
         return self
 

@@ -24,8 +24,8 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..decision.rule import script
-from ..errors import SettingError, StoreError, expect
+from ..decision.rule import restore, script
+from ..errors import SettingError, expect
 from ..folds import content_fold
 from ..records import is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, part, seed_of
@@ -516,13 +516,7 @@ class FeatureReducer(Reducer):
         channels, samples, n_fits, n_seen, self.n_iter_ = (int(v) for v in state["counts"])
         self.trace_shape_, self.n_features_in_ = (channels, samples), channels * samples
         self._build(channels, samples)
-        given, own = part(state, "net."), self.net_.state_dict()
-        if {name: v.shape for name, v in given.items()} != {name: tuple(v.shape) for name, v in own.items()}:
-            raise StoreError(
-                "Expected a model of this version of dengine, got one whose encoder has other sizes; its labels are whole: "
-                "learn from them anew, by `dengine train --data OLD.db --store NEW.db`."
-            )
-        self.net_.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in given.items()})
+        restore(self.net_, part(state, "net."))
         held = (part(state, f"{name}.") for name in Tower._fields)
         self.towers_ = [
             Tower(*(torch.from_numpy(np.array(v)) for v in each))
