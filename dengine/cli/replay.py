@@ -289,7 +289,7 @@ PRICES = {
 
 @verb("dengine costs --data insertion --reducer pca --cycles 200 --repeats 2 --escape 120 --false-reject 30")
 @options.data_options()
-@options.gathered("each", dict, PRICES)
+@options.gathered("paid", dict, PRICES)
 @click.option("--cost-unit", default="s", show_default=True, help="Of these costs, for people: s, EUR, ...")
 @options.recipe_options
 @options.gathered("lists", options.given, LISTS)
@@ -298,7 +298,7 @@ PRICES = {
 @options.out_option
 def costs(
     choice: RecipeChoice,
-    each: dict[str, float],
+    paid: dict[str, float],
     cost_unit: str,
     lists: Mapping[str, Any],
     source: DataChoice,
@@ -308,8 +308,8 @@ def costs(
     """Say which alpha and LB pay.
 
     What a part of your recordings costs under each, where everything is verified, and, with --stops all or audits, where
-    parts pass by these costs (--guarantee cost). All costs are in one unit, as
-    seconds of production or money. Ctrl-C shows the curve of the shuffles that every policy has finished.
+    parts pass by these costs (--guarantee cost). All costs are in one unit, as seconds of production or money. Ctrl-C shows
+    the curve of the shuffles that every policy has finished.
     """
     _must_be_listed(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of, priced_tasks
@@ -317,7 +317,7 @@ def costs(
     from ..experiments.metrics import Costs
     from ..experiments.tables import figures
 
-    priced, tried = Costs(**each), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
+    priced, tried = Costs(**paid), {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
     tasks = priced_tasks(choice.contender(), priced, **tried, seeds=stream.seeds, cycles=stream.cycles)
     finished = _played(source.load(), tasks, stream)
     seeds = [each.seed for each in finished.replays]

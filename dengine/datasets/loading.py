@@ -53,10 +53,9 @@ def load_dataset(
 
     source : the name of a bundled set; a folder of CSV files, one an insertion, or of tables or archives of one form, which
         are one set; a wide table, a row an insertion, or a long one, a row a sample, as .csv, .parquet or a DataFrame; one
-        long recording as .mcap, or a rosbag2 folder of them; an
-        .npz file with X (n, T) or (n, C, T), times the number `scale` where one is stored, and y (n,), or with arrays that
-        `channel` and `label` name; the SQLite file of a store, for the labelled traces in it; a `Dataset`; a pair (X, y),
-        where X may be a list of traces of any length.
+        long recording as .mcap, or a rosbag2 folder of them; an .npz file with X (n, T) or (n, C, T), times the number
+        `scale` where one is stored, and y (n,), or with arrays that `channel` and `label` name; the SQLite file of a store,
+        for the labelled traces in it; a `Dataset`; a pair (X, y), where X may be a list of traces of any length.
     samples : of each trace, the first so many; with `fit="resample"` the points that the whole is put on.
     part : the name of the array, or column, of parts' numbers, texts or whole numbers; for a folder a column of `labels`.
         Where there is no `part`, every trace is a part of its own. In a long table it tells which rows are one insertion.

@@ -52,7 +52,8 @@ class NoveltyGate(nn.Module):
         segments = max(1, min(SEGMENTS, WIDEST // channels, samples // 2))
         self.stride = samples // segments
         self.length = samples - (segments - 1) * self.stride  # overlapping a little: no sample is left out
-        n_plain, n_features = 4 * channels * segments, 4 * channels * segments + DISTORTIONS  # P, P + D
+        n_plain = 4 * channels * segments  # P
+        n_features = n_plain + DISTORTIONS
         self.register_buffer("quiet", torch.ones(channels, segments))
         self.register_buffer("distortions", torch.zeros(n_plain, DISTORTIONS))
         # A row for the level, one for the texture and one for distortions, zero in the others' features.

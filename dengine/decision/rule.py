@@ -461,6 +461,11 @@ class RadiusNeighbours(nn.Module):
         return action, lower, upper, n_success, n_failure
 
 
+def part(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a state whose names begin so, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+
+
 def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Copy arrays into a module's parameters and buffers by name; StoreError where these have other names or sizes."""
     own = module.state_dict()  # shares its tensors with the module

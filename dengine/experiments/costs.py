@@ -16,13 +16,14 @@ are a clean test.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import asdict, astuple, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..decision.policy import Policy
-from ..errors import expect, percent
+from ..errors import SettingError, expect, percent
 from .grid import Folder, Task, grid_tasks, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
 from .replay import Contender, Replay
@@ -174,11 +175,10 @@ def priced_tasks(
     cycles: int | None = None,
 ) -> list[Task]:
     """Every alpha and lower bound; then dengine's guarantee of costs, where it takes them and outcomes are heard of."""
-    one, prices = Contender.load(who), (costs.check, costs.escape, costs.false_reject)
-    policy, tasks = one.recipe.policy, grid_tasks([who], alphas, lower_bounds, seeds=seeds, cycles=cycles)
-    heard = policy.stops == "all" or policy.audited_share > 0.0
-    if one.rival is None and heard and 2.0 * costs.check < min(prices[1:]):
-        tasks += grid_tasks([one.with_policy(guarantee="cost", prices=prices)], seeds=seeds, cycles=cycles)
+    one, tasks = Contender.load(who), grid_tasks([who], alphas, lower_bounds, seeds=seeds, cycles=cycles)
+    if one.rival is None:
+        with suppress(SettingError):  # of costs that are no prices, or of outcomes that nobody hears of
+            tasks += grid_tasks([one.with_policy(guarantee="cost", prices=astuple(costs))], seeds=seeds, cycles=cycles)
     return tasks
 
 

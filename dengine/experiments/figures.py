@@ -294,15 +294,17 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     figure = blank(9.0, 7.2, title or f"{curve.dataset}, {curve.recipe}: {what}\n{how}")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     asked = [row for row in curve.rows if row.policy.guarantee != "cost"]
+    priced = [row for row in curve.rows if row.policy.guarantee == "cost"]
     bounds = sorted({row.policy.lower_bound for row in asked})
     groups = {
         f"alpha {row.policy.alpha:g}": [each for each in asked if each.policy.alpha == row.policy.alpha] for row in asked
     }
-    groups |= {"by cost": [row for row in curve.rows if row not in asked]} if len(asked) < len(curve.rows) else {}
+    if priced:
+        groups["by cost"] = priced
     top.axhline(curve.baseline, label="verify everything", **LIMIT)
     for i, (label, rows) in enumerate(groups.items()):
         # The alphas' whiskers side by side.
-        places = [bounds.index(row.policy.lower_bound) if row in asked else len(bounds) for row in rows]
+        places = [len(bounds) if rows is priced else bounds.index(row.policy.lower_bound) for row in rows]
         x = np.array(places) + 0.08 * (i - (len(groups) - 1) / 2)
         cost, lower, upper = np.array([(row.cost, row.lower, row.upper) for row in rows]).T
         look: Look = {"color": RECIPES[i % len(RECIPES)], "marker": "osD^vP"[i % 6], "markersize": 6}
@@ -319,7 +321,7 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     finish(top, wide, ylim=(lowest, highest), ylabel=f"cost a part [{unit}]")
     highest = max(10.0, 110 * max(row.certain for row in curve.rows))
     finish(bottom, wide, ylim=(0, highest), ylabel="decided without a check\n[% of parts]")
-    ticks = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * ("by cost" in groups)
+    ticks = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(priced)
     bottom.set_xticks(range(len(ticks)), ticks)
     bottom.set_xlabel("LB [% of accepted parts that are to be good]")
     return figure

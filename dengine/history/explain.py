@@ -23,7 +23,7 @@ from ..decision.intervals import SORTED, level_of
 from ..decision.novelty import NoveltyGate
 from ..decision.policy import RULES, Policy
 from ..decision.references import RadiusIndex
-from ..decision.rule import NOBODY, DecisionRule, restore
+from ..decision.rule import NOBODY, DecisionRule, part, restore
 from ..errors import StoreError, UnknownDecisionError
 from ..folds import COIN_BITS, audit_salt, content_hash, fold_of, toss
 from ..recipe import Recipe
@@ -99,7 +99,7 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
     gate = NoveltyGate(*(int(n) for n in stored.state["trace_shape"]))
     gate.asleep = False
     try:
-        restore(gate, {name: value.numpy() for name, value in _buffers(stored, "novelty.").items()})
+        restore(gate, part(stored.state, "novelty."))
     except StoreError:  # the gate of another version of dengine
         return None
     with torch.inference_mode():
@@ -107,7 +107,7 @@ def _novelty(stored: ModelVersion, then: StoredDecision | None) -> Novelty | Non
 
 
 def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Levels | None:
-    if (policy.guarantee, policy.stops) == ("local", "some") and not _buffers(stored, "rule."):
+    if (policy.guarantee, policy.stops) == ("local", "some") and not part(stored.state, "rule."):
         return policy.lower_bound, policy.lower_bound  # the paper's rule learns nothing
     rule = _rule(stored, told, policy)
     return None if rule is None or rule.evidence is None else (float(rule.evidence.open[0]), float(rule.evidence.open[1]))
@@ -116,10 +116,11 @@ def _levels(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> Leve
 def _rule(stored: ModelVersion, told: list[PastLabel], policy: Policy) -> DecisionRule | None:
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         return None  # nothing is imported because a store says so; an engine that runs here has imported it
-    rule, kept = policy.rule(), _buffers(stored, "rule.")
-    if {name: value.shape for name, value in rule.state_dict().items()} != {name: v.shape for name, v in kept.items()}:
-        return None  # the rule was another one, handed in with its model, or had missed something
-    rule.load_state_dict(kept)
+    rule = policy.rule()
+    try:
+        restore(rule, part(stored.state, "rule."))
+    except StoreError:  # the rule was another one, handed in with its model, or had missed something
+        return None
     for label in told:
         if not label.quarantined:
             rule.observe(label.silent, label.novel)
@@ -133,11 +134,6 @@ def rule_now(store: SqlStore, policy: Policy) -> DecisionRule | None:
     if stored is None or "untold" in stored.state:  # it missed something: an engine that is opened tells it all anew
         return None
     return _rule(stored, store.past_labels(stored.last_seq), policy)
-
-
-def _buffers(stored: ModelVersion, prefix: str) -> dict[str, torch.Tensor]:
-    found = {name: value for name, value in stored.state.items() if name.startswith(prefix)}
-    return {name.removeprefix(prefix): torch.from_numpy(np.array(value)) for name, value in found.items()}
 
 
 # The envelope: a picture for people, not a test. One sample in twenty of an ordinary success lies outside, by its making.

@@ -25,13 +25,13 @@ from ..decision.classifier import WilsonRadiusClassifier
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
-from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, restore, script
+from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, part, restore, script
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
 from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
 from ..reducers import make_reducer, reducer_of
-from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, part, space_scale
+from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
 from ..traces import TraceGate, as_traces
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 

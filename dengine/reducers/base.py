@@ -243,11 +243,6 @@ def seed_of(random_state: Any) -> int | None:
     raise SettingError(f"Expected random_state None, an integer or a RandomState, got {random_state!r}.")
 
 
-def part(state: Mapping[str, NDArray[Any]], prefix: str) -> State:
-    """The arrays of a state whose names begin so, by the rest of their names."""
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-
-
 def uses_labels(transformer: Any) -> bool:
     """Whether `fit` uses labels: scikit-learn's `target_tags.required`. A transformer without the tag is given none."""
     return bool(get_tags(transformer).target_tags.required)

@@ -24,11 +24,11 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # torch's own name for it
 
-from ..decision.rule import restore, script
+from ..decision.rule import part, restore, script
 from ..errors import SettingError, expect
 from ..folds import content_fold
 from ..records import is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, part, seed_of
+from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, one_class_outside, own_places, seed_of
 
 CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 TAPS = 9  # of MiniRocket's kernels; 84 = 9 choose 3 ways to place its three 2s among -1s
