@@ -82,7 +82,7 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are() -> None:
     for kind in ("noise", "sine", "silent"):
         some = GARBAGE[kind](HELD_OUT[:100], rng)
         gate = fit_novelty(np.concatenate([KNOWN, some[:50]]), 1.5)
-        assert share(gate, some[50:]) <= 0.2
+        assert share(gate, some[50:]) <= (0.2 if kind == "noise" else 0.1)
         others = {other: share(gate, make(HELD_OUT[100:150], rng)) for other, make in GARBAGE.items() if other != kind}
         assert np.mean(list(others.values())) >= 0.75, (kind, others)
 
