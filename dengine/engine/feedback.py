@@ -180,7 +180,8 @@ class Feedback:
 
     def journal_cleared(self) -> None:
         """The same for what is in the journal: of a product's news one may be that very label."""
-        self.outbox.drain()
+        if not self.outbox.numbered:
+            self.outbox.drain()
         self.arrive()
 
     def _learn(self, known: StoredDecision, success: bool, source: Source) -> NewLabel:

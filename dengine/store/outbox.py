@@ -376,13 +376,24 @@ class Outbox:
         """Whether the store has all that was told."""
         return self._drained == self._appended
 
+    @property
+    def numbered(self) -> bool:
+        """Whether the store has every label that was told."""
+        return not self._labels
+
+    def hurry(self) -> None:
+        """Have the store take all that was told so far, without waiting for it."""
+        with self._changed:
+            self._to_sync = self._to_drain = self._appended
+            self._changed.notify_all()
+
     def drain(self) -> None:
         """Return when the store has all that was told so far. StoreError where it is away, or takes too long."""
         with self._changed:
             if self.drained:
                 return
-            self._to_sync = self._to_drain = place = self._appended
-            self._changed.notify_all()
+            place = self._appended
+            self.hurry()
             if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
                 self._away = f"no answer from the store within {self.limit:g} s."
             if self._drained < place:
