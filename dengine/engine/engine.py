@@ -327,20 +327,40 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 except StoreError as error:
                     return self._unrecorded(id_, number, error)
             self._versions.collect()
-            x = self._as_trace(trace)
-            self._feedback.settle()
-            unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
-            known = self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_)
-            known = self._outbox.decided(known)
+            known = self._decided(trace, number, id_, late)
             try:
                 if id_ is not None:
                     self._outbox.secure()
             except NotTakenError:
                 # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
                 if known.decision.action is not Action.VERIFY:
-                    known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
+                    verified = self._maker.decide(known.trace, number, None, self.version, Reason.NO_STORE, id_)
+                    known = self._outbox.amend(verified)
             self._feedback.decided(known)
         return known.decision
+
+    def decide_at_once(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
+        """As `decide`, in any thread while no other uses the engine; None, and nothing was done, where that might wait.
+
+        It waits for neither store nor disk, runs no code of the user's, and leaves a version on its way in where it is.
+        """
+        with self._outbox.unless_held() as free:
+            known, model = self.trace is not None and not self._unseen, self._versions.newest
+            own = model.keeps_references and not self.recipe.own_classes
+            if not (free and known and own and self._feedback.settled and not self._settings.waiting):
+                return None
+            self._outbox.check()
+            with self._alone:
+                torch.set_num_threads(1)  # each thread has its own
+                made = self._decided(trace, as_part(part))
+                self._feedback.decided(made)
+        return made.decision
+
+    def _decided(self, trace: ArrayLike, part: str | None, id_: str | None = None, late: bool = False) -> StoredDecision:
+        x = self._as_trace(trace)
+        self._feedback.settle()
+        unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
+        return self._outbox.decided(self._maker.decide(x, part, self._versions.answering, self.version, unasked, id_))
 
     def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
         """VERIFY for an id that may have a decision, which cannot be looked up: nothing of it is recorded."""

@@ -58,6 +58,11 @@ class Feedback:
     def _stops_all(self) -> bool:
         return self.settings.now.recipe.policy.stops == "all"
 
+    @property
+    def settled(self) -> bool:
+        """Whether the rule was told what happened, and nothing else."""
+        return not (self._untrue or self._taken_back)
+
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
         self._mode = self.versions.newest.safe_mode
@@ -151,7 +156,7 @@ class Feedback:
         """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
         for id_, seq in self.outbox.arrived():
             self.versions.keep(id_, seq)
-        if (self._untrue or self._taken_back) and self.outbox.drained and not self.outbox.fault:
+        if not self.settled and self.outbox.drained and not self.outbox.fault:
             if self._waiting:  # else the rule would forget them
                 self.store_waiting()
             else:

@@ -109,6 +109,7 @@ class CellService:
         self.late = self.busy = 0  # answers since it began
         self.observers: list[Callable[[Answer | Told | RetrainReport], object]] = []  # told of each, in whatever thread
         self._jobs: queue.Queue[Job | None] = queue.Queue(most)
+        self._using = threading.Lock()  # the engine, by its thread, or by the loop for what waits for nothing
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
         self._closing = self._listening_ended = False
         self._beat = time.monotonic()
@@ -124,7 +125,10 @@ class CellService:
         request : the caller's id, once for every trace; asked again, the answer is the same, also after a restart.
         TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
         """
-        begin, id_ = time.monotonic(), uuid.uuid4().hex if request is None else as_id(request)
+        begin = time.monotonic()
+        if request is None and (at_once := self._at_once(trace, part)) is not None:
+            return self._heard(Answer(at_once, time.monotonic() - begin))
+        id_ = uuid.uuid4().hex if request is None else as_id(request)
         # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
 
         def work(engine: DataEngine, late: bool) -> Decision:
@@ -140,6 +144,18 @@ class CellService:
             decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
             self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
+
+    def _at_once(self, trace: ArrayLike, part: str | int | None) -> Decision | None:
+        """Decide in the loop, where nobody is in line and nothing has to be waited for; None elsewhere."""
+        if self._closing or self.waiting or not self._using.acquire(blocking=False):
+            return None
+        try:
+            decision = self.engine.decide_at_once(trace, part)
+        finally:
+            self._using.release()
+        if decision is not None:
+            self._tell()
+        return decision
 
     async def report(self, decision_id: str, success: float, author: str = "") -> Told:
         """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
@@ -272,9 +288,11 @@ class CellService:
         opened.set_result(engine)
         with engine:
             while (job := self._next(engine)) is not None:
-                job.run(engine)
+                with self._using:
+                    job.run(engine)
                 if not job.looks:
                     self._tell()
+            self._using.acquire()  # for good
 
     def _next(self, engine: DataEngine) -> Job | None:
         """The next one in line; while nobody asks, the engine does what it has to do: a new version is swapped in."""
@@ -286,7 +304,9 @@ class CellService:
             except queue.Empty:
                 pass
             try:
-                if (report := engine.settle(brief=True)) is not None:
+                with self._using:
+                    report = engine.settle(brief=True)
+                if report is not None:
                     self._heard(report)
                     self._tell()
             except Exception:  # whatever it is, the next request is answered

@@ -13,9 +13,9 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from hashlib import blake2b
 from itertools import islice
@@ -215,6 +215,16 @@ class Outbox:
             raise StoreError("Expected an open engine, got one after close(); open it again.")
         if self._reading:
             raise StoreError("Expected an engine that owns its cell, got one that was opened for reading; open it without.")
+
+    @contextmanager
+    def unless_held(self) -> Iterator[bool]:
+        """Whether it can be told something without waiting for its threads, which wait until the block ends."""
+        held = self._changed.acquire(blocking=False)
+        try:
+            yield held
+        finally:
+            if held:
+                self._changed.release()
 
     # What the engine tells
 
