@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
 log = logging.getLogger("dengine")
-STEP = 0.001  # seconds of learning at once: some labels
+STEP = 0.0005  # seconds of learning at once: a label or two
 NEWS_SECONDS = 1.0  # between two questions for news of a product
 MOST = 200  # labels taken in at once: each is embedded, some tenths of a millisecond
 ROUNDS = 5  # of them before a retrain: after a long absence it need not know all

@@ -38,7 +38,7 @@ T = TypeVar("T")
 CLOSING = "The server is closing: verify the part, and ask again when it is back."
 DEADLINE = 0.5  # seconds in line, after which who asked verifies
 MOST = 32  # requests in line
-SOON = 0.002  # seconds after an answer, in which a report or another part often comes
+SOON = 0.0005  # seconds after an answer, in which whoever waits in line is heard first
 IDLE = 0.05  # seconds between two looks at what the engine has to do while nobody asks
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("dengine")
 T = TypeVar("T")
 PATIENT = 1e9  # seconds: nobody waits so long
-LINGER = 0.05  # seconds that a decision waits for company before it is written, and before the store takes it
+LINGER, DRAIN = 0.05, 0.25  # seconds that a decision waits for company before it is written, and before the store takes it
 BEAT = 1.0  # seconds between two tries of what failed
 CHECK = 0.1  # seconds that opening waits for SQLite's own check; of a larger store, that is done while the cell runs
 LATE = 1.0  # seconds of lag that are a fault of the store
@@ -516,7 +516,7 @@ class Outbox:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._jobs or self._drained < self._synced or self._closed)
-                self._changed.wait_for(lambda: self._jobs or self._to_drain > self._drained or self._closed, LINGER)
+                self._changed.wait_for(lambda: self._jobs or self._to_drain > self._drained or self._closed, DRAIN)
                 job = self._jobs.popleft() if self._jobs else None
             try:
                 while self._drained < self._synced:

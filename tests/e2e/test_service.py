@@ -2,6 +2,7 @@
 
 import asyncio
 import shutil
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from dengine import DataEngine, Dataset, Reason
 from dengine.errors import TraceError
 from dengine.serve.service import CellService
+from tests.support.driving import Counting, evidence
 from tests.support.serving import RECIPE, WAIT, a_service, held
 
 
@@ -58,3 +60,41 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> No
     with ThreadPoolExecutor(1) as pool, closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool))) as made:
         made.deadline = WAIT
         asyncio.run(cell(made))
+
+
+def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream: Dataset) -> None:
+    looked = threading.Event()
+
+    class Slow(Counting):
+        def decide(self, X):
+            looked.wait(WAIT)
+            return super().decide(X)
+
+    async def cell(service: CellService) -> None:
+        for i in range(30):
+            await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
+        await service.ask(lambda engine: engine.retrain())
+        asked = asyncio.create_task(service.decide(stream.X[30]))
+        asyncio.get_running_loop().call_later(0.05, looked.set)
+        assert (await asked).decision.reason is not Reason.MODEL_ERROR
+        assert looked.is_set()
+
+    with closing(CellService(lambda: DataEngine(model=Slow()), deadline=WAIT)) as made:
+        asyncio.run(cell(made))
+
+
+def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_that_is_held(stream: Dataset) -> None:
+    async def cell(service: CellService) -> None:
+        for i in range(40):
+            await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
+        at_once, thread = await service.decide(stream.X[41]), await service.decide(stream.X[41], "in-the-thread")
+        assert evidence(at_once.decision) == evidence(thread.decision)
+        assert at_once.decision.model_version == 1
+        service.deadline = 0.05
+        with held(service):
+            late = asyncio.create_task(service.decide(stream.X[42]))
+            await asyncio.sleep(0.2)
+        assert (await late).decision.reason is Reason.LATE
+
+    with a_service() as service:
+        asyncio.run(cell(service))
