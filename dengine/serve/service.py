@@ -126,8 +126,14 @@ class CellService:
         TraceError, ReportError as `DataEngine.decide`; BusyError where too many wait.
         """
         begin = time.monotonic()
-        if request is None and (at_once := self._at_once(trace, part)) is not None:
-            return self._heard(Answer(at_once, time.monotonic() - begin))
+        if request is None and not (self.waiting or self._closing) and self._using.acquire(blocking=False):
+            try:
+                at_once = self.engine.decide_at_once(trace, part)
+            finally:
+                self._using.release()
+            if at_once is not None:
+                self._tell()
+                return self._heard(Answer(at_once, time.monotonic() - begin))
         id_ = uuid.uuid4().hex if request is None else as_id(request)
         # Under an id of its own it has to be on the disk before the answer; a caller that has none cannot ask again.
 
@@ -144,18 +150,6 @@ class CellService:
             decision = await asyncio.to_thread(self.engine.decide_late, trace, part, decision_id=id_)
             self.late += 1
         return self._heard(Answer(decision, time.monotonic() - begin))
-
-    def _at_once(self, trace: ArrayLike, part: str | int | None) -> Decision | None:
-        """Decide in the loop, where nobody is in line and nothing has to be waited for; None elsewhere."""
-        if self._closing or self.waiting or not self._using.acquire(blocking=False):
-            return None
-        try:
-            decision = self.engine.decide_at_once(trace, part)
-        finally:
-            self._using.release()
-        if decision is not None:
-            self._tell()
-        return decision
 
     async def report(self, decision_id: str, success: float, author: str = "") -> Told:
         """Report what became of a decision; the label is on the disk when this returns. The same label twice is no error.
