@@ -35,6 +35,7 @@ log = logging.getLogger("dengine")
 T = TypeVar("T")
 PATIENT = 1e9  # seconds: nobody waits so long
 LINGER, DRAIN = 0.05, 0.25  # seconds that a decision waits for company before it is written, and before the store takes it
+BRIEF = 0.001  # seconds that are no waiting
 BEAT = 1.0  # seconds between two tries of what failed
 CHECK = 0.1  # seconds that opening waits for SQLite's own check; of a larger store, that is done while the cell runs
 LATE = 1.0  # seconds of lag that are a fault of the store
@@ -219,7 +220,7 @@ class Outbox:
     @contextmanager
     def unless_held(self) -> Iterator[bool]:
         """Whether it can be told something without waiting for its threads, which wait until the block ends."""
-        held = self._changed.acquire(blocking=False)
+        held = self._changed.acquire(timeout=BRIEF)  # whoever looks what is new there, has it for an instant
         try:
             yield held
         finally:
@@ -282,8 +283,9 @@ class Outbox:
             self._was_taken(records, arrived)
         else:
             self._times += [time.monotonic()] * len(records)
+            if not self._unwritten:  # else whoever writes knows of some
+                self._changed.notify_all()
             self._unwritten += records
-            self._changed.notify_all()
 
     def _was_taken(self, records: Sequence[Record], arrived: Sequence[tuple[str, int]]) -> None:
         """The store has these, and gave their labels numbers."""
