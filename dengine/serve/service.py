@@ -1,5 +1,7 @@
 """One engine behind every interface: who asks waits in a queue, not for ever, for the one thread that owns it.
 
+A decision that needs no waiting, for a disk, a store or the line, is made in the loop: two threads less to wake.
+
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     answer = await service.decide(trace, "order-7")
 
