@@ -345,9 +345,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         It waits for neither store nor disk, runs no code of the user's, and leaves a version on its way in where it is.
         """
         with self._outbox.unless_held() as free:
-            known, model = self.trace is not None and not self._unseen, self._versions.newest
-            own = model.keeps_references and not self.recipe.own_classes
-            if not (free and known and own and self._feedback.settled and not self._settings.waiting):
+            own = self._versions.newest.keeps_references and not self.recipe.own_classes
+            if not (free and own) or self._unseen or self._settings.waiting or self._feedback.remedy:
                 return None
             self._outbox.check()
             with self._alone:

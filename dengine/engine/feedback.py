@@ -48,8 +48,7 @@ class Feedback:
         self._decisions = 0
         self._unobserved = 0
         self._mode = ""
-        self._untrue = False  # whether the rule was told what did not happen
-        self._taken_back = False  # whether a confirmation that was stored did not happen
+        self.remedy: Callable[[], None] | None = None  # where what the rule was told, or what is stored, did not happen
         self._novel, self._told_novel = 0.0, False  # share of the recent decisions, and whether that it is large was told
         versions.store_waiting = self.store_all
         versions.journal_cleared = self.journal_cleared
@@ -57,11 +56,6 @@ class Feedback:
     @property
     def _stops_all(self) -> bool:
         return self.settings.now.recipe.policy.stops == "all"
-
-    @property
-    def settled(self) -> bool:
-        """Whether the rule was told what happened, and nothing else."""
-        return not (self._untrue or self._taken_back)
 
     def resume(self) -> None:
         """Go on from the store: what was accepted and not reported."""
@@ -137,7 +131,7 @@ class Feedback:
             if (stands, now) != LATE_STOP:
                 raise already_reported(made.id, stands, now)
             self.store_waiting()
-            self._taken_back = True
+            self.remedy = self.versions.take_back
             self.outbox.labels([(known, NewLabel(made.id, False, source, self.versions.version, None))])
             return True
         untrue = self._waiting.pop(made.id, None) is not None
@@ -149,26 +143,27 @@ class Feedback:
         self._went_on.pop(made.id, None)
         self._owed.pop(made.id, None)
         overdue = self.versions.overdue.pop(made.id, None) is not None
-        self._untrue |= untrue or overdue
+        if untrue or overdue:
+            self.remedy = self.remedy or self.versions.tell_anew
         return untrue
 
     def arrive(self) -> None:
         """Do what had to wait for the store: labels that it has numbered train, and the rule is told the truth."""
         for id_, seq in self.outbox.arrived():
             self.versions.keep(id_, seq)
-        if not self.settled and self.outbox.drained and not self.outbox.fault:
+        if self.remedy and self.outbox.drained and not self.outbox.fault:
             if self._waiting:  # else the rule would forget them
                 self.store_waiting()
             else:
-                self._put_right()
+                self._put_right(self.remedy)
 
-    def _put_right(self) -> None:
+    def _put_right(self, remedy: Callable[[], None]) -> None:
         """Tell the rule the truth, and let references and the next retrain know of what was taken back."""
-        untrue, taken_back, self._untrue, self._taken_back = self._untrue, self._taken_back, False, False
+        self.remedy = None
         try:
-            self.versions.take_back() if taken_back else self.versions.tell_anew()
+            remedy()
         except StoreError:
-            self._untrue, self._taken_back = untrue, taken_back
+            self.remedy = remedy
             log.exception("the rule is told anew when the store is back")
 
     def store_waiting(self) -> None:
