@@ -308,12 +308,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         decision_id: str | None = None,
         late: bool = False,
+        swap: bool = True,
     ) -> Decision:
         """Decide on one trace, (T,), (channels, T), or a DataFrame whose rows are samples.
 
         part : the part's number, where one is known: a part that comes again has one vote, and none on itself.
         decision_id : of the caller's: the same id and trace have the same decision for ever, on the disk when this returns.
         late : whoever asked waits no more and verifies: that is the decision, so that its label can be reported.
+        swap : also bring in, by a step, a version that an executor has trained.
         Raises TraceError for a wrong shape, a first trace of less than 10 samples, and the id of another trace; ReportError
         for what is no id. Whatever else fails becomes VERIFY; an id that cannot be looked up too, and that is not recorded.
         """
@@ -326,16 +328,20 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                         return decided_before(known, trace, self.trace)
                 except StoreError as error:
                     return self._unrecorded(id_, number, error)
-            self._versions.collect()
-            known = self._decided(trace, number, id_, late)
+            if swap:
+                self._versions.collect()
+            x = self._as_trace(trace)
+            self._feedback.settle()
+            unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
+            known = self._maker.decide(x, number, self._versions.answering, self.version, unasked, id_)
+            known = self._outbox.decided(known)
             try:
                 if id_ is not None:
                     self._outbox.secure()
             except NotTakenError:
                 # A decision that lets a part go on unchecked has to outlive this process, or an id would have two answers.
                 if known.decision.action is not Action.VERIFY:
-                    verified = self._maker.decide(known.trace, number, None, self.version, Reason.NO_STORE, id_)
-                    known = self._outbox.amend(verified)
+                    known = self._outbox.amend(self._maker.decide(x, number, None, self.version, Reason.NO_STORE, id_))
             self._feedback.decided(known)
         return known.decision
 
@@ -348,18 +354,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             own = self._versions.newest.keeps_references and not self.recipe.own_classes
             if not (free and own) or self._unseen or self._settings.waiting or self._feedback.remedy:
                 return None
-            self._outbox.check()
-            with self._alone:
-                torch.set_num_threads(1)  # each thread has its own
-                made = self._decided(trace, as_part(part))
-                self._feedback.decided(made)
-        return made.decision
-
-    def _decided(self, trace: ArrayLike, part: str | None, id_: str | None = None, late: bool = False) -> StoredDecision:
-        x = self._as_trace(trace)
-        self._feedback.settle()
-        unasked = Reason.NO_STORE if self._outbox.away else Reason.LATE if late else None
-        return self._outbox.decided(self._maker.decide(x, part, self._versions.answering, self.version, unasked, id_))
+            torch.set_num_threads(1)  # each thread has its own
+            return self.decide(trace, part, swap=False)
 
     def _unrecorded(self, decision_id: str, part: str | None, error: StoreError) -> Decision:
         """VERIFY for an id that may have a decision, which cannot be looked up: nothing of it is recorded."""

@@ -180,7 +180,7 @@ class Feedback:
 
     def journal_cleared(self) -> None:
         """The same for what is in the journal: of a product's news one may be that very label."""
-        if not self.outbox.numbered:
+        if self.outbox.lacks_labels():
             self.outbox.drain()
         self.arrive()
 

@@ -405,11 +405,8 @@ class ModelVersions:
 
     def _can_wait(self, candidate: Candidate, to_the_end: bool) -> bool:
         """Whether labels are on their way into the store, and the cell need not wait for that."""
-        if to_the_end or self.outbox.numbered or candidate.patience <= 0:
-            return False
         candidate.patience -= 1
-        self.outbox.hurry()
-        return True
+        return not to_the_end and candidate.patience > 0 and self.outbox.lacks_labels()
 
     def _store(self, candidate: Candidate) -> Future[int]:
         model, state = candidate.model, None

@@ -1,7 +1,5 @@
 """One engine behind every interface: who asks waits in a queue, not for ever, for the one thread that owns it.
 
-A decision that needs no waiting, for a disk, a store or the line, is made in the loop: two threads less to wake.
-
     service = CellService(lambda: DataEngine.open_or_create("cell.db"), "cell.db")
     answer = await service.decide(trace, "order-7")
 
@@ -295,10 +293,8 @@ class CellService:
         patience = SOON  # right behind an answer, for the next part is farthest away then
         while True:
             self._beat = time.monotonic()
-            try:
+            with suppress(queue.Empty):
                 return self._jobs.get(timeout=patience)
-            except queue.Empty:
-                pass
             try:
                 with self._using:
                     report = engine.settle(brief=True)

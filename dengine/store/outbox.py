@@ -388,24 +388,21 @@ class Outbox:
         """Whether the store has all that was told."""
         return self._drained == self._appended
 
-    @property
-    def numbered(self) -> bool:
-        """Whether the store has every label that was told."""
-        return not self._labels
-
-    def hurry(self) -> None:
-        """Have the store take all that was told so far, without waiting for it."""
+    def lacks_labels(self) -> bool:
+        """Whether the store lacks labels that were told; then it takes what there is at once, and nobody waits for it."""
         with self._changed:
-            self._to_sync = self._to_drain = self._appended
-            self._changed.notify_all()
+            if self._labels:
+                self._to_sync = self._to_drain = self._appended
+                self._changed.notify_all()
+            return bool(self._labels)
 
     def drain(self) -> None:
         """Return when the store has all that was told so far. StoreError where it is away, or takes too long."""
         with self._changed:
             if self.drained:
                 return
-            place = self._appended
-            self.hurry()
+            self._to_sync = self._to_drain = place = self._appended
+            self._changed.notify_all()
             if not self._changed.wait_for(lambda: self._drained >= place or bool(self._blocked), self.limit):
                 self._away = f"no answer from the store within {self.limit:g} s."
             if self._drained < place:
