@@ -71,29 +71,6 @@ class Predictor(nn.Module):
         z: Tensor = self.encoder(x.unsqueeze(0))[0]
         return z / self.scale if self.scaled else z
 
-    @torch.jit.export
-    def add(self, point: Tensor, label: float, space: int, part: int) -> None:
-        """Make one labelled point (d,) of a part a reference of `space`."""
-        self.neighbours.ring.put(point, label, space, part)
-
-    @torch.jit.export
-    def n_references(self) -> int:
-        """References held."""
-        return self.neighbours.ring.size()
-
-    @torch.jit.export
-    def tell(
-        self, lower: float, upper: float, success: bool, silent: int, novel: bool, predicted: int, looked: float
-    ) -> None:
-        """Tell the rule what became of a part."""
-        self.neighbours.rule.observe(silent, novel)
-        self.neighbours.rule.tell(lower, upper, success, predicted, looked)
-
-    @torch.jit.export
-    def safe_mode(self) -> int:
-        """Position in `SAFE_MODE` of the rule."""
-        return int(self.neighbours.rule.safe_mode())
-
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """(C, T) one trace -> action, reason, lower, upper, n_success, n_failure, scaled embedding (K, d).
 
