@@ -49,10 +49,8 @@ def must_fit(size: float, what: object) -> None:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         most = min(MOST, memory // 2) if memory > 0 else MOST
     if size > most:
-        raise DataError(
-            f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; split it, or read it where there is "
-            "more memory."
-        )
+        do = "split it, or read it where there is more memory"
+        raise DataError(f"Expected at most {_size(most)} of arrays in {what}, got {_size(size)}; {do}.")
 
 
 @contextmanager

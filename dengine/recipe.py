@@ -117,10 +117,8 @@ class Recipe:
             return cls.from_toml(text, where=str(recipe))
         if OWN.fullmatch(str(recipe)) or str(recipe) in NAMED:
             return cls(str(recipe))
-        raise SettingError(
-            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer; "
-            f"{str(recipe)[:200]} is none."
-        )
+        wanted = f"a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer"
+        raise SettingError(f"Expected {wanted}; {str(recipe)[:200]} is none.")
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:

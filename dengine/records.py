@@ -290,10 +290,9 @@ def as_success(value: Any, of: str = "") -> bool:
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
-    raise ReportError(
-        f"Expected a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'} got "
-        f"{shortened(value)}; nothing was stored: turn it into one of these first, as in success=(answer == 'OK')."
-    )
+    wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'}"
+    do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
+    raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
 
 
 def as_labels(y: ArrayLike) -> NDArray[np.int64]:
@@ -309,10 +308,9 @@ def as_outcome(value: Any, of: str = "") -> Outcome:
     try:
         return Outcome(value)
     except (ValueError, TypeError) as error:
-        raise ReportError(
-            f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}; return "
-            "Outcome.UNKNOWN from proceed() where nothing is known."
-        ) from error
+        wanted = f"an Outcome, {', '.join(Outcome)},{of and f' of {of},'}"
+        do = "return Outcome.UNKNOWN from proceed() where nothing is known"
+        raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.") from error
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
@@ -331,11 +329,8 @@ def is_name(value: Any) -> bool:
 
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
-    if not is_name(value):
-        raise ReportError(
-            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
-            "report the `Decision.id` that `decide` returned."
-        )
+    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
+    expect(is_name(value), wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
     return str(value)
 
 

@@ -452,10 +452,9 @@ def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Copy arrays into a module's parameters and buffers by name; StoreError where these have other names or sizes."""
     own = module.state_dict()  # shares its tensors with the module
     if {name: value.shape for name, value in arrays.items()} != {name: tuple(v.shape) for name, v in own.items()}:
-        raise StoreError(
-            f"Expected a model of this version of dengine, got one whose {type(module).__name__} has other sizes; its "
-            "labels are whole: learn from them anew, by `dengine train --data OLD.db --store NEW.db`."
-        )
+        got = f"one whose {type(module).__name__} has other sizes; its labels are whole"
+        do = "learn from them anew, by `dengine train --data OLD.db --store NEW.db`"
+        raise StoreError(f"Expected a model of this version of dengine, got {got}: {do}.")
     for name, value in arrays.items():
         own[name].copy_(torch.from_numpy(np.array(value)))
 

@@ -296,9 +296,8 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     asked = [row for row in curve.rows if row.policy.guarantee != "cost"]
     priced = [row for row in curve.rows if row.policy.guarantee == "cost"]
     bounds = sorted({row.policy.lower_bound for row in asked})
-    groups = {
-        f"alpha {row.policy.alpha:g}": [each for each in asked if each.policy.alpha == row.policy.alpha] for row in asked
-    }
+    alphas = dict.fromkeys(row.policy.alpha for row in asked)
+    groups = {f"alpha {alpha:g}": [row for row in asked if row.policy.alpha == alpha] for alpha in alphas}
     if priced:
         groups["by cost"] = priced
     top.axhline(curve.baseline, label="verify everything", **LIMIT)

@@ -74,10 +74,9 @@ class KeptReplays:
         try:  # a transformer with all that it holds: arrays and functions too, which its description only names
             said = self._digest((self._of_data, _digest_of_source(), [_source_of(part) for part in parts], how))
         except (PicklingError, TypeError, AttributeError) as error:
-            raise SettingError(
-                f"Expected a reducer that can be told apart from others, to keep its replays; {who.name} holds what has no "
-                f"name in a module, as a lambda ({error}); define it in a module, or leave keep out."
-            ) from error
+            got = f"{who.name} holds what has no name in a module, as a lambda ({error})"
+            wanted = "a reducer that can be told apart from others, to keep its replays"
+            raise SettingError(f"Expected {wanted}; {got}: define it there, or leave keep out.") from error
         return self.folder / f"{said}.npz"
 
     def get(self, task: Task) -> Replay | None:

@@ -173,9 +173,7 @@ class Replay:
 
         known = {each.name: getattr(self, each.name) for each in fields(self)}
         one_a_cycle = (len(self),)  # a live run has no index of its parts
-        columns = {
-            name: value for name, value in known.items() if isinstance(value, np.ndarray) and value.shape == one_a_cycle
-        }
+        columns = {name: x for name, x in known.items() if isinstance(x, np.ndarray) and x.shape == one_a_cycle}
         columns |= {f"embedding_{d + 1}": self.position[:, d] for d in range(self.position.shape[1])}
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 

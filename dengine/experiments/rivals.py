@@ -473,9 +473,7 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
     require(name)
     allowed = [each.name for each in fields(RIVALS[name]) if each.kw_only]
     if unknown := sorted(set(params) - set(allowed)):
-        raise SettingError(
-            f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(allowed) or 'none'}."
-        )
+        raise SettingError(f"Rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(allowed) or 'none'}.")
     return RIVALS[name](policy, seed, **params)
 
 

@@ -174,9 +174,7 @@ def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
     try:
         module = torch.jit.load(io.BytesIO(content), map_location="cpu").eval()  # type: ignore[no-untyped-call]
     except RuntimeError as error:
-        raise ExportError(
-            f"{target} has its checksum but is no loadable TorchScript: {str(error).splitlines()[0]}."
-        ) from error
+        raise ExportError(f"{path} has its sum but is no loadable TorchScript: {str(error).splitlines()[0]}.") from error
     try:
         # A copy runs the same compiled code, and this module must not learn of the golden trace.
         _check_golden(ExportedModel(copy.deepcopy(module), dict(metadata)), target)

@@ -233,13 +233,11 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     )
 
 
-def _judged(
-    known: int, wrong: int, tolerance: float, alpha: float = 0.05, n: int | None = None, by: str = "audits"
-) -> Judged:
+def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
-    return Judged(known if n is None else n, known, wrong, by, lower, upper, tolerance, _verdict(lower, upper, tolerance))
+    return Judged(known if n is None else n, known, wrong, by, lower, upper, most, _verdict(lower, upper, most))
 
 
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
@@ -337,9 +335,7 @@ def of_part(store: SqlStore, part: str) -> str:
         raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
     if len(found) > 1:
         ids = ", ".join(each.decision.id for each in reversed(found))
-        raise ReportConflictError(
-            f"Expected one decision of that part to report on, there are {len(found)}; name its id: {ids}."
-        )
+        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
     return found[0].decision.id
 
 

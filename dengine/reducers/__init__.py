@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 import numpy as np
 
-from ..errors import SettingError, expect, shortened
+from ..errors import SettingError, expect
 from ..recipe import NAMED, Recipe
 from ..records import find_class, is_number, is_whole
 
@@ -40,10 +40,7 @@ __all__ = [
 
 def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
-    if name not in _NAMED and ":" not in name:
-        raise SettingError(
-            f"Expected a reducer among {', '.join(_NAMED)}, or module:Class of your own, got {shortened(name)}."
-        )
+    expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
     found: type = __getattr__(_NAMED[name]) if name in _NAMED else find_class(name)
     if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
         raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")

@@ -226,9 +226,7 @@ def one_class_outside(fold: int, n: int, classes: int) -> SettingError:
     """What is said where clone or head `fold` would learn from n traces of fewer than two classes."""
     got = f"{n} traces of {classes} class; collect more labels before the first fit."
     if n == 0:
-        got = (
-            "0 traces: all share one fold, as they are the same to 1/65536 of their unit; look at the sensor, or the unit."
-        )
+        got = "0 traces: all share one fold, the same to 1/65536 of their unit; look at the sensor, or the unit."
     return SettingError(f"Expected both classes outside fold {fold}, got {got}")
 
 

@@ -111,14 +111,10 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
         raise SettingError(f"Expected {file} to be its owner's alone, others may use it ({mode:o}): chmod 600 {file}")
     lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
     tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
-    wrong = [
-        each for each in tokens if len(each.secret) < SHORTEST or not (each.secret.isascii() and each.secret.isprintable())
-    ]
-    if wrong or not tokens or len({each.secret for each in tokens}) < len(tokens):
-        raise SettingError(
-            f"Expected tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line; "
-            f"make one: (umask 077; openssl rand -hex 24 > {file})"
-        )
+    secrets = {each.secret for each in tokens if each.secret.isascii() and each.secret.isprintable()}
+    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < SHORTEST:
+        wanted = f"tokens of at least {SHORTEST} characters of ASCII in {file}, each once, one a line"
+        raise SettingError(f"Expected {wanted}; make one: (umask 077; openssl rand -hex 24 > {file})")
     if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
         raise SettingError(f"Expected viewer or operator behind each token of {file}, then a name; or the token alone.")
     return tokens

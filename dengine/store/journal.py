@@ -62,10 +62,8 @@ def from_bytes(blob: bytes) -> Record:
             return from_row(NewLabel, row, point=unpack(rest) if rest else None)
         return from_row(Event, row)
     except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(
-            f"Expected a record of a journal, got what cannot be read ({error}); "
-            "open the store with the dengine that wrote it."
-        ) from error
+        do = "open the store with the dengine that wrote it"
+        raise StoreError(f"Expected a record of a journal, got what cannot be read ({error}); {do}.") from error
 
 
 class Journal:
@@ -116,9 +114,7 @@ class Journal:
             self._put(framed, self.end)
             SYNC(self._fd)
         if not self._in_place():
-            raise LostJournalError(
-                f"The journal {self.path} was deleted, moved or replaced while it was open; leave it where it is."
-            )
+            raise LostJournalError(f"The journal {self.path} was deleted, moved or replaced while it was open; leave it.")
         self.end, self._digest = self.end + len(framed), digest
         return offsets
 
@@ -343,10 +339,8 @@ def _known(head: bytes) -> tuple[int, tuple[int, str] | None, str]:
 
 def forked(pid: int, name: str) -> StoreError:
     """Return the error for a fork of the process that opened what this names."""
-    return StoreError(
-        f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; "
-        "open it after the fork, in the process that uses it."
-    )
+    got, do = f"its fork {os.getpid()}", "open it after the fork, in the process that uses it"
+    return StoreError(f"Expected the process that opened {name}, {pid}, got {got}; {do}.")
 
 
 def owner() -> str:
@@ -356,7 +350,5 @@ def owner() -> str:
 
 def owned_by(holder: str, name: str) -> StoreError:
     """Return the error for a second engine on a cell."""
-    return StoreError(
-        f"Expected a cell that no other engine runs on, but {holder} owns {name}; "
-        "close that engine first, or give this one a cell_id of its own."
-    )
+    do = "close that engine first, or give this one a cell_id of its own"
+    return StoreError(f"Expected a cell that no other engine runs on, but {holder} owns {name}; {do}.")

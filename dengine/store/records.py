@@ -39,10 +39,9 @@ def _when(record: Any) -> datetime:
 
 def unknown_decision(decision_id: str) -> ReportError:
     """Return the error for a report on a decision that the store does not hold."""
-    return UnknownDecisionError(
-        f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's store does not hold; "
-        f"report the `Decision.id` that `decide` returned, to the same store and cell_id."
-    )
+    got = f"{shortened(decision_id)}, which this cell's store does not hold"
+    do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
+    return UnknownDecisionError(f"Expected the id of a stored decision, got {got}; {do}.")
 
 
 def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple[bool, Source]) -> ReportError:
@@ -50,18 +49,14 @@ def already_reported(decision_id: str, first: tuple[bool, Source], second: tuple
     said, says = (f"{'success' if success else 'failure'} from {source.value}" for success, source in (first, second))
     same = first[0] == second[0]
     advice = "nothing more needs reporting" if same else "if the first was wrong, look at how the part was checked"
-    return ReportConflictError(
-        f"Expected one report a decision, got a second on {decision_id!r}: {said} was reported first and stands, "
-        f"now came {says}; {advice}."
-    )
+    both = f"{said} was reported first and stands, now came {says}"
+    return ReportConflictError(f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}.")
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
     """Return the error for a correction of a decision that was never reported."""
-    return ReportError(
-        f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported yet; "
-        "there is nothing to correct: report its label."
-    )
+    got = f"{decision_id!r}, of which nothing was reported yet"
+    return ReportError(f"Expected a decision with a label, got {got}; there is nothing to correct: report its label.")
 
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -69,9 +64,7 @@ def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     try:
         return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
     except (TypeError, ValueError) as error:
-        raise StoreError(
-            f"Expected an event's data as JSON has it, got {data!r}: {error}; give numbers and text."
-        ) from error
+        raise StoreError(f"Expected event data as JSON has it, got {data!r}: {error}; give numbers and text.") from error
 
 
 def as_text(text: str) -> str:
@@ -314,10 +307,8 @@ def from_row(kind: Callable[..., T], row: Mapping[str, Any], **given: Any) -> T:
     try:
         return kind(**{name: _read(row[name], each) for name, each in wanted.items()}, **given)
     except (ValueError, TypeError) as error:
-        raise StoreError(
-            f"Expected a row of {getattr(kind, '__name__', kind)} as it was written, got another: {error}; "
-            "see `dengine verify`, and restore the store from a copy."
-        ) from error
+        name, do = getattr(kind, "__name__", kind), "see `dengine verify`, and restore the store from a copy"
+        raise StoreError(f"Expected a row of {name} as it was written, got another: {error}; {do}.") from error
 
 
 def _written(value: Any, kind: type) -> Any:

@@ -148,10 +148,8 @@ def check_schema(connection: sa.Connection, name: str) -> None:
         query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()  # the one query over all cells
         held = "schema " + (", ".join(sorted(connection.execute(query).scalars())) or "unknown")
     if held != f"schema {SCHEMA}":
-        raise StoreError(
-            f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; "
-            "open it with the dengine that wrote it, or name a new file or database."
-        )
+        do = "open it with the dengine that wrote it, or name a new file or database"
+        raise StoreError(f"Expected a dengine store of schema {SCHEMA}, found {held} in {name}; {do}.")
     for table in METADATA.tables.values():
         if missing := set(table.c.keys()) - found.get(table.name, set()):
             raise StoreError(f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it from a copy.")

@@ -53,10 +53,7 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     try:
         model = mujoco.MjModel.from_xml_string(fixture_xml(conditions, time_step_s))
     except ValueError as error:
-        got = f"a world that MuJoCo refuses ({error})"
-        raise SettingError(
-            f"Expected sizes, masses and springs above zero, got {got}; raise the one that is zero."
-        ) from error
+        raise SettingError(f"Expected sizes, masses and springs above zero, MuJoCo refuses these: {error}.") from error
     data = mujoco.MjData(model)
     force = _drive(mujoco, model, data, conditions, steps)
     if conditions.fault == "missed_grasp":
