@@ -105,8 +105,8 @@ class Recipe:
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
-            if not callable(getattr(recipe, "fit", None)) or isinstance(recipe, type):
-                raise SettingError(f"Expected a recipe, its name, or a scikit-learn transformer, got {recipe!r}.")
+            fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
+            expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
             # A reducer of ours keeps the radius of its own recipe: it means something else in each.
             base = RECIPES.get(type(recipe).__module__.removeprefix("dengine.reducers."), cls())
             return replace(base, reducer=recipe, params={})

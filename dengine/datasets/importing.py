@@ -34,13 +34,14 @@ from . import Dataset, load_dataset
 from .loading import TABLES
 
 if TYPE_CHECKING:
+    from ..store.opening import StoreLike
     from ..store.sql import SqlStore
 
 CHUNK = 500  # traces committed together
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
-def form_in(store: str | os.PathLike[str] | SqlStore, source: Any) -> dict[str, Any]:
+def form_in(store: StoreLike, source: Any) -> dict[str, Any]:
     """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
@@ -90,7 +91,7 @@ class ImportReport:
 
 
 def import_labelled(
-    store: str | os.PathLike[str] | SqlStore,
+    store: StoreLike,
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
@@ -125,7 +126,7 @@ def import_parts(
     parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
     spec: TraceSpec,
     policy: Policy,
-    on_traces: Callable[[int], None] | None,
+    on_traces: Callable[[int], None] | None = None,
 ) -> ImportReport:
     """Put parts, each with its decision, its trace (C, T) and its label, None where nothing was heard of it, into a store.
 

@@ -76,8 +76,7 @@ def named(pattern: str | None = None, words: Words = NONE) -> Labels:
         expression = None if pattern is None else re.compile(pattern)
     except re.error as error:
         raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
-    if expression is not None and expression.groups != 1:
-        raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
+    must(expression is None or expression.groups == 1, "one group in the label's pattern, as in '_(OK|NOK)_'", pattern)
 
     def find(name: str) -> Known:
         if expression is None:

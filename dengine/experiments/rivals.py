@@ -479,8 +479,7 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
 
 def require(name: str) -> None:
     """SettingError where there is no rival of this name, or the library that it is made with is missing."""
-    if name not in RIVALS:
-        raise SettingError(f"Expected a rival among {', '.join(RIVALS)}, got {name!r}.")
+    expect(name in RIVALS, f"a rival among {', '.join(RIVALS)}", name)
     needs = RIVALS[name].needs
     if needs and find_spec(needs) is None:
         raise SettingError(f'The rival {name} needs {needs}, which is missing; pip install "dengine[rivals]".')

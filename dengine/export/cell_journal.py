@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import os
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,7 +34,7 @@ from ..store.opening import opening
 from ..traces import as_trace
 
 if TYPE_CHECKING:
-    from ..store.sql import SqlStore
+    from ..store.opening import StoreLike
 
 log = logging.getLogger("dengine")
 FORM = 4
@@ -178,12 +178,7 @@ def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 
-def import_journal(
-    store: str | os.PathLike[str] | SqlStore,
-    path: str | os.PathLike[str],
-    on_traces: Callable[[int], None] | None = None,
-    any_model: bool = False,
-) -> ImportReport:
+def import_journal(store: StoreLike, path: str | os.PathLike[str], any_model: bool = False) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
     Rule and certificate count the parts as the engine's own. The report counts labels. Of a journal that lacks a line, what
@@ -206,7 +201,7 @@ def import_journal(
             do = "name the store that it came from, or say --any-model if it is right"
             raise DataError(f"Expected a journal of a model that was exported from this store, {of}; {do}.")
         parts = [(line.decision, line.trace, line.label) for line in _with_known_outcomes(journal, policy.stops)]
-        report = import_parts(opened, parts, spec, policy, on_traces)
+        report = import_parts(opened, parts, spec, policy)
     opened.close()
     return replace(report, cut=journal.cut, aside=journal.aside)
 

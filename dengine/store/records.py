@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
-from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, shortened
+from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, expect, shortened
 from ..files import read_archive
 from ..records import Decision, RetrainReport, Source
 
@@ -74,12 +74,11 @@ def as_text(text: str) -> str:
 
 def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
     """Copy a version's arrays; an accepted version needs them, and none may hold Python objects (a pickle)."""
-    if state is None and report.accepted:
-        raise StoreError(f"Expected the arrays of accepted version {report.version}, got None; pass its state.")
+    there = state is not None or not report.accepted
+    expect(there, f"the arrays of accepted version {report.version}", state, "pass its state", StoreError)
     copies = None if state is None else {name: np.array(values) for name, values in state.items()}
     for name, values in (copies or {}).items():
-        if values.dtype.hasobject:
-            raise StoreError(f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers or strings.")
+        expect(not values.dtype.hasobject, f"plain arrays as {name!r}", values.dtype, "store numbers or text", StoreError)
     return copies
 
 
