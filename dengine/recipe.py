@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from .decision.policy import Policy, check_radius
-from .errors import SettingError, expect, listed
+from .errors import SettingError, expect, instead, listed
 from .records import is_number, is_whole
 
 Params = Mapping[str, bool | int | float | str]
@@ -123,10 +123,8 @@ class Recipe:
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse `to_toml`'s form; SettingError names an unknown key or a value out of range."""
-        try:
+        with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):  # the former of huge integers, too
             table = tomllib.loads(text)
-        except (ValueError, RecursionError) as error:  # the former of an integer with thousands of digits, too
-            raise SettingError(f"{where} is not TOML: {error}.") from error
         _must_be_known(table, cls, where)
         reducer, policy = table.get("reducer", "conv"), table.pop("policy", {})
         expect(isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer)

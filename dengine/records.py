@@ -23,6 +23,7 @@ from .errors import (
     SettingError,
     StoreError,
     expect,
+    instead,
     shortened,
     without_password,
 )
@@ -115,10 +116,8 @@ class TraceSpec:
     columns: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        try:
+        with instead(SettingError, f"Expected the names of columns, got {shortened(self.columns)}", TypeError):
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
-        except TypeError as error:
-            raise SettingError(f"Expected the names of columns, got {shortened(self.columns)}.") from error
         object.__setattr__(self, "columns", columns)
         rated = is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")
         form = (self.samples, self.channels, self.rate_hz)
@@ -181,11 +180,9 @@ def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
     """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
     if "trace" not in known:
         return None
-    try:
+    said = f"Expected a trace's contract in the settings, got {shortened(known['trace'])}"
+    with instead(StoreError, said, ValueError, TypeError, RecursionError, do="restore the store"):
         return TraceSpec(**json.loads(known["trace"]))
-    except (ValueError, TypeError, RecursionError) as error:
-        got = shortened(known["trace"])
-        raise StoreError(f"Expected a trace's contract in the settings, got {got}: {error}; restore the store.") from error
 
 
 def in_html(record: Any) -> str:
@@ -305,12 +302,9 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
 
 def as_outcome(value: Any, of: str = "") -> Outcome:
     """What a cell's `proceed` returned, as an `Outcome`; ReportError for anything else, which would pass for silence."""
-    try:
+    said = f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}"
+    with instead(ReportError, said, ValueError, TypeError, do="return Outcome.UNKNOWN where nothing is known"):
         return Outcome(value)
-    except (ValueError, TypeError) as error:
-        wanted = f"an Outcome, {', '.join(Outcome)},{of and f' of {of},'}"
-        do = "return Outcome.UNKNOWN from proceed() where nothing is known"
-        raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.") from error
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
@@ -369,10 +363,9 @@ def _told(kind: type) -> tuple[tuple[str, bool], ...]:
 def find_class(where: str) -> type:
     """The class that `module:Class` names; SettingError where there is none."""
     module, _, name = where.partition(":")
-    try:
+    said = f"Expected module:Class that can be imported here, got {shortened(where)}"
+    with instead(SettingError, said, Exception):  # whatever a module of the user's raises while it is imported
         found = getattr(import_module(module), name)
-    except Exception as error:  # whatever a module of the user's raises while it is imported
-        raise SettingError(f"Expected module:Class that can be imported here, got {shortened(where)}: {error}.") from error
     if not isinstance(found, type):
         raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
     return found

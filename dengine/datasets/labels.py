@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from ..errors import DataError
+from ..errors import DataError, instead
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
 from .text import Timed, read_table
 
@@ -72,10 +72,8 @@ def named(pattern: str | None = None, words: Words = NONE) -> Labels:
     words : as of `label_of`.
     DataError for a pattern that is no regular expression with one group.
     """
-    try:
+    with instead(DataError, f"Expected a regular expression for the label, got {pattern!r}", re.error):
         expression = None if pattern is None else re.compile(pattern)
-    except re.error as error:
-        raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
     must(expression is None or expression.groups == 1, "one group in the label's pattern, as in '_(OK|NOK)_'", pattern)
 
     def find(name: str) -> Known:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from ..datasets.dataset import must
 from ..datasets.importing import ImportReport, import_parts
-from ..errors import DataError, StoreError
+from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceSpec, trace_in
 from ..store.opening import opening
@@ -132,10 +132,8 @@ def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
 
 
 def _words(said: bytes, where: str) -> list[str]:
-    try:
+    with instead(DataError, f"Expected UTF-8 in {where}, it is damaged, or no journal", UnicodeDecodeError):
         words = said.decode("utf-8").split(",")
-    except UnicodeDecodeError as error:
-        raise DataError(f"Expected UTF-8 in {where}, got other bytes: it is damaged, or no journal.") from error
     must(words[0] in ("part", "label"), f"a line that begins with part or label in {where}", words[0])
     return words
 
@@ -151,11 +149,9 @@ def _labelled(words: list[str], parts: Mapping[str, JournalLine], where: str) ->
 
 def _part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     id_, label, part, *decided = (*words[:10], *[""] * (10 - len(words)))
-    try:
+    with instead(DataError, f"The decision in {where} cannot be read", ValueError):
         action, predicted, reason = Action(decided[0]), Action(decided[1]), Reason(decided[2])
         bound = float(decided[3]), float(decided[4]), int(decided[5]), int(decided[6])
-    except ValueError as error:
-        raise DataError(f"The decision in {where} cannot be read: {error}.") from error
     held = 0.0 <= bound[0] <= bound[1] <= 1.0 and 0 <= min(bound[2:]) <= max(bound[2:]) < LARGEST_COUNT
     must(held, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
     rejected = action is Action.REJECT
@@ -170,11 +166,8 @@ def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]
     expected = spec.channels * spec.samples
     held = len(words) == expected or (spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0)
     must(held, f"{expected} samples in {where}", len(words), "it is damaged, or of another cell")
-    try:
-        with np.errstate(over="ignore"):
-            values = np.array([float(word) for word in words]).astype(np.float32)
-    except ValueError as error:
-        raise DataError(f"The samples in {where} are no row of numbers: {error}.") from error
+    with instead(DataError, f"The samples in {where} are no row of numbers", ValueError), np.errstate(over="ignore"):
+        values = np.array([float(word) for word in words]).astype(np.float32)
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from ..decision.rule import CERTAIN, UNCERTAIN, DecisionRule
-from ..errors import ExportError
+from ..errors import ExportError, instead
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
@@ -80,11 +80,10 @@ def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> On
     onnx = _package("onnx")
     target = Path(path)
     content = checked_bytes(target, key)
-    try:
+    said = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
+    with instead(ExportError, said, Exception):  # protobuf's own errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
-    except Exception as error:  # protobuf's own errors have no common base
-        raise ExportError(f"{target} is not a dengine export in ONNX: it holds no {METADATA}.") from error
     return OnnxModel(content, checked_schema(metadata, target))
 
 

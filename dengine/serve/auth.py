@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError
+from ..errors import SettingError, instead
 from .api import Refusal, problem
 
 log = logging.getLogger("dengine")
@@ -100,11 +100,8 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
 
     A line is a token; or that, `viewer` or `operator`, and the name of who has it.
     """
-    try:
-        with file.open("rb") as opened:
-            mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
-    except OSError as error:
-        raise SettingError(f"Cannot read the token's file {file}: {error.strerror}.") from error
+    with instead(SettingError, f"Cannot read the token's file {file}", OSError), file.open("rb") as opened:
+        mode, text = stat.S_IMODE(os.fstat(opened.fileno()).st_mode), opened.read(1 << 16)
     # systemd, from 254 on, hands a credential to the service's user by an ACL, which shows as a right of the group.
     credentials = os.environ.get("CREDENTIALS_DIRECTORY", "")
     if mode & (0o037 if credentials and file.absolute().parent == Path(credentials) else 0o077):

@@ -16,12 +16,12 @@ import urllib.parse
 import weakref
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
-from ..errors import StoreError
+from ..errors import StoreError, instead
 from ..records import Decision
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
@@ -51,7 +51,9 @@ def to_bytes(record: Record) -> bytes:
 
 def from_bytes(blob: bytes) -> Record:
     """Read what `to_bytes` wrote; StoreError for anything else."""
-    try:
+    do = "open the store with the dengine that wrote it"
+    kinds = (struct.error, ValueError, KeyError, TypeError, AttributeError)
+    with instead(StoreError, "Expected a record of a journal, got what cannot be read", *kinds, do=do):
         (length,) = LENGTH.unpack_from(blob)
         rest = blob[LENGTH.size + length :]
         kind, row = json.loads(blob[LENGTH.size : LENGTH.size + length])
@@ -61,9 +63,6 @@ def from_bytes(blob: bytes) -> Record:
         if kind == NewLabel.__name__:
             return from_row(NewLabel, row, point=unpack(rest) if rest else None)
         return from_row(Event, row)
-    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        do = "open the store with the dengine that wrote it"
-        raise StoreError(f"Expected a record of a journal, got what cannot be read ({error}); {do}.") from error
 
 
 class Journal:
@@ -263,13 +262,9 @@ def _digest(before: bytes, record: bytes) -> bytes:
     return blake2b(before + record, digest_size=16).digest()
 
 
-@contextmanager
-def _using(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        do = "free some space there, or make its folder writable"
-        raise StoreError(f"Could not use the journal {path}: {error}; {do}.") from error
+def _using(path: Path) -> AbstractContextManager[None]:
+    do = "free some space there, or make its folder writable"
+    return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
 def _locked(path: Path) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.certificate import Outcomes as Outcomes  # counted by every store
-from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, expect, shortened
+from ..errors import DataError, ReportConflictError, ReportError, StoreError, UnknownDecisionError, instead, shortened
 from ..files import read_archive
 from ..records import Decision, RetrainReport, Source
 
@@ -61,10 +61,8 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as it comes back from JSON; a StoreError for what JSON has not."""
-    try:
+    with instead(StoreError, "Expected an event's data as JSON has it", TypeError, ValueError, do="give numbers and text"):
         return None if data is None else dict(json.loads(json.dumps(dict(data), allow_nan=False)))
-    except (TypeError, ValueError) as error:
-        raise StoreError(f"Expected event data as JSON has it, got {data!r}: {error}; give numbers and text.") from error
 
 
 def as_text(text: str) -> str:
@@ -74,11 +72,12 @@ def as_text(text: str) -> str:
 
 def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> dict[str, NDArray[Any]] | None:
     """Copy a version's arrays; an accepted version needs them, and none may hold Python objects (a pickle)."""
-    there = state is not None or not report.accepted
-    expect(there, f"the arrays of accepted version {report.version}", state, "pass its state", StoreError)
+    if state is None and report.accepted:
+        raise StoreError(f"Expected the arrays of accepted version {report.version}, got None; pass its state.")
     copies = None if state is None else {name: np.array(values) for name, values in state.items()}
     for name, values in (copies or {}).items():
-        expect(not values.dtype.hasobject, f"plain arrays as {name!r}", values.dtype, "store numbers or text", StoreError)
+        if values.dtype.hasobject:
+            raise StoreError(f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers or strings.")
     return copies
 
 
@@ -372,10 +371,8 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
 
 def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
     """What `to_npz` wrote; a pickle in it is refused."""
-    try:
+    with instead(StoreError, "Expected a version of plain arrays", DataError, do=f"restore {name} from a copy"):
         return read_archive(blob, name=f"a version in {name}")[0]
-    except DataError as error:
-        raise StoreError(f"{error} It is no version of plain arrays: restore {name} from a copy.") from error
 
 
 class VersionError(StoreError):

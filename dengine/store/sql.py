@@ -21,7 +21,7 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, expect, listed, shortened
+from ..errors import StoreError, expect, instead, listed, shortened
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
@@ -409,10 +409,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if row.state is None or (row.state_sum is not None and state_sum(row.state) != row.state_sum):
             where = f"as it was stored in {self.database.name}, its bytes have changed"
             raise VersionError(f"Expected the state of version {row.version} {where}; restore the store from a copy.")
-        try:
+        with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self.database.name)
-        except StoreError as error:
-            raise VersionError(str(error)) from error
         if row.cell_id != self.cell_id:  # what a peer's parts taught its rule says nothing certain of this cell
             state = without_rule(state) | {"told_to": np.array(0)}
         return ModelVersion(row.version, row.last_seq, state)
