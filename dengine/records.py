@@ -1,7 +1,5 @@
 """Frozen records that travel between the layers, the values that they may hold, and their plain JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -11,7 +9,7 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -164,7 +162,7 @@ class Window:
         return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
 
     @classmethod
-    def parse(cls, text: str) -> Window:
+    def parse(cls, text: str) -> Self:
         """The window of a text; SettingError for one that is none."""
         words = [word.partition("=") for word in text.split(":")]
         try:

@@ -4,8 +4,6 @@ Words, in any case: true ok pass passed good success successful yes io gut 1; fa
 schlecht 0; and a word of the first kind after a not, as in `run_7_not_ok.csv`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter, defaultdict

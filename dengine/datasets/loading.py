@@ -1,7 +1,5 @@
 """One door for all that holds labelled traces, `load_dataset`; and what is read from arrays."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence

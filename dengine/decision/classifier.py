@@ -1,7 +1,5 @@
 """The radius-neighbour classifier with a confidence bound, as a scikit-learn estimator over embeddings."""
 
-from __future__ import annotations
-
 from typing import Any, Self
 
 import numpy as np

@@ -9,8 +9,6 @@ All take integer arrays of one shape and return `(lower, upper)`, float64 of tha
 with `0 <= lower <= n_success / n <= upper <= 1`. Without neighbours nothing is known: (0, 1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any

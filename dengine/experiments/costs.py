@@ -121,10 +121,8 @@ class CostCurve:
         if self.verdict == "pays":
             return said
         bad, worst = (percent(share, ".3g") for share in (row.bad.upper, self.costs.worst_accept))
-        return (
-            f"{said} Not certainly: of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}. "
-            "More recordings narrow that; in production audits and stops do."
-        )
+        but = f"of the accepted parts up to {bad} may be bad, and accepting pays up to {worst}"
+        return f"{said} Not certainly: {but}. More recordings narrow that; in production audits and stops do."
 
     def to_frame(self) -> pd.DataFrame:
         """A row a policy; shares from 0 to 1, costs in the user's unit."""

@@ -92,10 +92,8 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> Journal:
         said, _, sum_ = raw.rpartition(b",")
         crc = zlib.crc32(said, crc)
         if f"{crc:08x}".encode() != sum_:
-            aside = (
-                f"The checksum of {where} does not follow from the lines before it: it was changed, or one is missing, "
-                f"doubled or moved. It and what follows were set aside, {len(whole) - number + 1} lines."
-            )
+            why = f"The checksum of {where} does not follow from the lines before it: it was changed, or one is missing"
+            aside = f"{why}, doubled or moved. It and what follows were set aside, {len(whole) - number + 1} lines."
             break
         crcs.append(crc)
         kind, *words = _words(said, where)

@@ -8,8 +8,6 @@ carry: references that grow and rules that learn, so nothing is learned in the c
 votes of parts that came again, and a reference that is asked about itself counts itself.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -72,7 +70,7 @@ def export_onnx(
     return write_export(path, content, force, key, source)
 
 
-def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> OnnxModel:
+def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "OnnxModel":
     """Check the sum, load into onnxruntime on one thread, warm up; ExportError for what must not be used.
 
     key : the key's file that it was signed with; it is checked first. None: no signature is asked for.

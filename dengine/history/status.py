@@ -149,13 +149,11 @@ class Status:
         """What somebody should look at, the worst first; "" where there is nothing."""
         accepts, errors = self.newest.bad_accepts, self.newest.errors
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
+        broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
-            (
-                accepts.verdict == "broken",
-                f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows.",
-            ),
+            (accepts.verdict == "broken", broken),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (errors, f"The model failed on {errors} of the newest decisions."),
             (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),

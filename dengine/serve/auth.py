@@ -4,8 +4,6 @@ Whoever is on this machine may ask without a token, but for web pages of others:
 They are known by the name that they call the server by (`Host`), and by what the browser says of where they come from.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hmac

@@ -9,8 +9,6 @@ What is the world's fault (a full line, a recording that did not come, a store t
 False: a fault ends a robot's program. What is the caller's bug (a wrong type, another trace under a known id) is a fault.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import uuid

@@ -1,7 +1,5 @@
 """One process in front of one cell: the port, TLS, the engine, the signals, its log, and how it all ends in order."""
 
-from __future__ import annotations
-
 import json
 import logging
 import signal

@@ -31,16 +31,11 @@ KINDS: dict[type, Any] = {
 
 def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
     """Columns of a record's fields, of all or of these; key : the one that is of the primary key."""
+    known = {name: each for name, each in columns(record).items() if not names or name in names}
+    kinds = {name: sa.String if issubclass(kind, StrEnum) else KINDS[kind] for name, (kind, _) in known.items()}
     return [
-        sa.Column(
-            name,
-            sa.String if issubclass(kind, StrEnum) else KINDS[kind],
-            nullable=optional,
-            primary_key=name == key,
-            autoincrement=False,
-        )
-        for name, (kind, optional) in columns(record).items()
-        if not names or name in names
+        sa.Column(name, kinds[name], nullable=optional, primary_key=name == key, autoincrement=False)
+        for name, (_, optional) in known.items()
     ]
 
 

@@ -7,8 +7,6 @@ What a returned call promises, given a disk that keeps what it synced: all that 
 what it decides: that goes into a journal first, and from there, by `take`, into the database.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time
