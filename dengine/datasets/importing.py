@@ -6,8 +6,6 @@
 A trace is imported once: its id comes from its content. Traces that a cell recorded itself have other ids.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections import Counter
@@ -41,7 +39,7 @@ CHUNK = 500  # traces committed together
 RATE = 0.02  # as near as rates that are measured from timestamps come to each other
 
 
-def form_in(store: StoreLike, source: Any) -> dict[str, Any]:
+def form_in(store: "StoreLike", source: Any) -> dict[str, Any]:
     """The `samples` and `fit` that give recordings the form of those in a store; empty for a new store, or other sources.
 
     Files that are added change the median that lengths are padded to: all others would come out changed, and count again.
@@ -91,7 +89,7 @@ class ImportReport:
 
 
 def import_labelled(
-    store: StoreLike,
+    store: "StoreLike",
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
@@ -122,7 +120,7 @@ def import_labelled(
 
 
 def import_parts(
-    store: SqlStore,
+    store: "SqlStore",
     parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
     spec: TraceSpec,
     policy: Policy,

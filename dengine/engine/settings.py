@@ -1,7 +1,5 @@
 """What an engine is, apart from what it has learned: the settings that it was made with, and that its store keeps."""
 
-from __future__ import annotations
-
 import json
 import logging
 from collections.abc import Collection, Mapping
@@ -178,12 +176,12 @@ def must_allow(recipe: Recipe, store: str, allow_import: bool | Collection[str])
         raise ImportRefusedError(f"Expected leave to import {got}: {again}, or {allow}.")
 
 
-def peers_trace(store: SqlStore) -> TraceSpec | None:
+def peers_trace(store: "SqlStore") -> TraceSpec | None:
     """The contract of traces that a product's cells have agreed on; None where there is none, or no product."""
     return next(filter(None, map(trace_in, store.peers_settings().values())), None)
 
 
-def as_peers(asked: Mapping[str, Any], store: SqlStore, allow_import: bool | Collection[str]) -> dict[str, Any]:
+def as_peers(asked: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]) -> dict[str, Any]:
     """What a new engine is asked for; what was left open, as a peer has it if there is one, where `must_allow` lets it."""
     known = next(iter(store.peers_settings().values()), {})
     filled = dict(asked)

@@ -7,8 +7,6 @@ Finished replays are kept on disk under a hash of all that their decisions depen
 seed, dengine's own source, and the libraries that compute. Nothing is unpickled; an unreadable file is no replay.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -186,7 +184,7 @@ def run_grid(
     *,
     cycles: int | None = None,
     keep: Folder | None = None,
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """A row a replay (see `Replay.summary`), over recipes x intervals x alphas x lower_bounds x seeds from 0 on.
 
     recipes : a name, or a list of what `replay` takes, rivals too.  keep : folder by which an interrupted grid goes on.

@@ -12,8 +12,6 @@ was being written when the program was killed: it is left out, and `cut` says so
 DataError that names the line.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import zlib
@@ -169,7 +167,7 @@ def _trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 
-def import_journal(store: StoreLike, path: str | os.PathLike[str], any_model: bool = False) -> ImportReport:
+def import_journal(store: "StoreLike", path: str | os.PathLike[str], any_model: bool = False) -> ImportReport:
     """Put what a cell learned into the store of its engine, each part once, however often its journal is imported.
 
     Rule and certificate count the parts as the engine's own. The report counts labels. Of a journal that lacks a line, what

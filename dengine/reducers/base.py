@@ -10,8 +10,6 @@ Embeddings have K spaces: a label may be counted for a query only in a space tha
 references live in space k, which was fitted without fold k's labels. A reducer that uses no labels has one space.
 """
 
-from __future__ import annotations
-
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -124,7 +122,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """(n, C, T) -> (n, d), row i in space folds[i]."""
         return own_places(self.embed(X), folds)
 
-    def module(self) -> nn.Module | None:
+    def module(self) -> "nn.Module | None":
         """The embedding as a module that TorchScript compiles, (B, C, T) -> (B, K, d); None: it stays in Python."""
         return None
 
