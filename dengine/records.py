@@ -12,19 +12,8 @@ from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from .errors import (
-    DataError,
-    ReportConflictError,
-    ReportError,
-    SettingError,
-    StoreError,
-    expect,
-    instead,
-    shortened,
-    without_password,
-)
+from .errors import ReportConflictError, ReportError, SettingError, StoreError, expect, instead, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -288,14 +277,6 @@ def as_success(value: Any, of: str = "") -> bool:
     wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'}"
     do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
     raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
-
-
-def as_labels(y: ArrayLike) -> NDArray[np.int64]:
-    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
-    labels = np.asarray(y)
-    if not np.isin(labels, (0, 1)).all():
-        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
-    return labels.astype(np.int64)
 
 
 def as_outcome(value: Any, of: str = "") -> Outcome:

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from .errors import TraceError, expect, listed
+from .errors import DataError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .records import FITS, REASONS, Reason, TraceSpec, Window
 
@@ -56,6 +56,14 @@ def as_traces(X: ArrayLike, spec: TraceSpec | None = None) -> NDArray[np.float32
     if spec is not None:
         x = _as_agreed(x, spec)
     return np.ascontiguousarray(x)
+
+
+def as_labels(y: ArrayLike) -> NDArray[np.int64]:
+    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
+    labels = np.asarray(y)
+    if not np.isin(labels, (0, 1)).all():
+        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
+    return labels.astype(np.int64)
 
 
 def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:

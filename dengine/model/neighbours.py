@@ -29,10 +29,10 @@ from ..decision.rule import SAFE_MODE, DecisionRule, RadiusNeighbours, part, res
 from ..errors import ExportError
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, described
-from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_labels, as_success
+from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
 from ..reducers import make_reducer, reducer_of
 from ..reducers.base import FitReport, Floats, Ints, Reducer, State, StopRule, as_reducer, space_scale
-from ..traces import TraceGate, as_traces
+from ..traces import TraceGate, as_labels, as_traces
 from .base import Embedding, EngineModel, Exportable, Gate, Looked, Prediction
 
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
