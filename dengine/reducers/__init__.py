@@ -13,29 +13,18 @@ from ..recipe import NAMED, Recipe
 from ..records import find_class, is_number, is_whole
 
 if TYPE_CHECKING:
-    from .base import CrossFitted, Reducer
-    from .conv import ConvReducer
-    from .pca import PcaReducer
-    from .rocket import RocketReducer
-    from .umap import UmapReducer
+    from .base import CrossFitted as CrossFitted
+    from .base import Reducer as Reducer
+    from .conv import ConvReducer as ConvReducer
+    from .pca import PcaReducer as PcaReducer
+    from .rocket import RocketReducer as RocketReducer
+    from .umap import UmapReducer as UmapReducer
 
 # The lazy table: a module is imported where its class is asked for, since UMAP alone takes seconds.
 _NAMED = {name: f"{name.capitalize()}Reducer" for name in NAMED}
 _LAZY = {"base": ["Reducer", "CrossFitted"]} | {module: [name] for module, name in _NAMED.items()}
 
 MOST = 2**31 - 1  # of a parameter that is an integer
-
-__all__ = [
-    "REDUCERS",
-    "ConvReducer",
-    "CrossFitted",
-    "PcaReducer",
-    "Reducer",
-    "RocketReducer",
-    "UmapReducer",
-    "make_reducer",
-    "reducer_class",
-]
 
 
 def reducer_class(name: str) -> type:
