@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import instead
 from ..traces import is_time
 from .dataset import Fault, UnreadableError
 
@@ -45,8 +44,10 @@ def cells_of(text: str) -> dict[int, list[str]]:
         delimiter = each if n and 2 * times > len(lines) else delimiter
     if delimiter != ",":
         lines = {i: DECIMAL.sub(r"\1.\2", line) for i, line in lines.items()}
-    with instead(UnreadableError, "Expected separated values, got others", csv.Error):
+    try:
         rows = {i: next(csv.reader([line], delimiter=delimiter, skipinitialspace=True)) for i, line in lines.items()}
+    except csv.Error as error:
+        raise UnreadableError(f"Expected separated values, got others: {error}") from error
     return _from_header(list(rows), [[word.strip() for word in row] for row in rows.values()])
 
 
