@@ -107,7 +107,7 @@ class EngineSettings:
         elif reducer is not None and not isinstance(reducer, str):
             again = Recipe.from_toml(Recipe(reducer).to_toml())
             if (again.reducer, again.params) != (recipe.reducer, recipe.params):
-                raise SettingError(f"Expected the reducer of {name}, {recipe.name}, got {described(reducer)}; leave it out")
+                raise SettingError(f"Expected reducer {recipe.name} of {name}, got {described(reducer)}; leave it out.")
         must_allow(recipe, name, allow_import is True or {*(allow_import or ()), *classes_of(reducer)})
         inferred = "inferred" in known
         seed = known.get("seed", "0")
