@@ -99,7 +99,8 @@ class EngineSettings:
             raise SettingError(f"The engine of {name} has its own model, {recipe.name}; leave model=... out.")
         if model is not None or recipe.name.startswith(OBJECT):
             if model is None and (reducer is None or isinstance(reducer, str)):
-                raise SettingError(f"{recipe.reducer} of {name} has no name in TOML: hand it in again, reducer=...")
+                unnamed = f"{recipe.reducer}, has no name in TOML"
+                raise SettingError(f"The reducer of {name}, {unnamed}: hand it in again, reducer=...")
             given = described(reducer) if model is None else as_engine_model(model).description
             if made_with is not None and given != made_with:
                 raise SettingError(f"{name} was made with {made_with}, got {given}: its labels were counted by that one.")

@@ -471,9 +471,9 @@ def make_rival(name: str, policy: Policy, seed: int = 0, **params: Any) -> Rival
     SettingError for an unknown name, an unknown parameter, a value out of range, or a library that is missing.
     """
     require(name)
-    allowed = [each.name for each in fields(RIVALS[name]) if each.kw_only]
-    if unknown := sorted(set(params) - set(allowed)):
-        raise SettingError(f"Rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(allowed) or 'none'}.")
+    known = [each.name for each in fields(RIVALS[name]) if each.kw_only]
+    if unknown := sorted(set(params) - set(known)):
+        raise SettingError(f"The rival {name} has no parameter {', '.join(unknown)}; it has {', '.join(known) or 'none'}.")
     return RIVALS[name](policy, seed, **params)
 
 

@@ -397,7 +397,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         held = {row.version: row.retrain for row in reversed(self._read(self._accepted())) if row.kept}
         if version not in held:
             others = ", ".join(map(str, held)) or "none"
-            raise VersionError(f"Expected a version whose state is kept, got {version}; load one of these: {others}.")
+            raise VersionError(f"Expected a held version, got {version}, which is not kept; load one of these: {others}.")
         return self._loaded(held[version])
 
     def _loaded(self, retrain: int) -> ModelVersion:
