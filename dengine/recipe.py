@@ -80,8 +80,8 @@ class Recipe:
         for name, value in self.params.items():
             held = (value is None or isinstance(value, PLAIN)) and BARE.fullmatch(str(name)) is not None
             expect(held, "params of plain names and values", {name: value}, "hand an object in")
-        named = isinstance(self.reducer, str) or callable(getattr(self.reducer, "fit", None))
-        expect(named, "a reducer's name, or a scikit-learn transformer", self.reducer)
+        named = isinstance(self.reducer, str) or all(hasattr(self.reducer, each) for each in ("fit", "get_params"))
+        expect(named, "a reducer's name, or a scikit-learn transformer with fit and get_params", self.reducer)
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
         check_radius(self.radius)  # or every retrain would fail, one by one
 

@@ -160,7 +160,8 @@ class Window:
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
         except (TypeError, ValueError) as error:
             wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
-            raise SettingError(f"Expected {wanted}, got {shortened(text)}: {error}") from error
+            why = f": {error}" if isinstance(error, SettingError) else "."
+            raise SettingError(f"Expected {wanted}, got {shortened(text)}{why}") from error
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:

@@ -31,8 +31,8 @@ def reducer_class(name: str) -> type:
     """The class behind a name in `REDUCERS` or `module:Class`, imported when it is asked for."""
     expect(name in _NAMED or ":" in name, f"a reducer among {', '.join(_NAMED)}, or module:Class of your own", name)
     found: type = __getattr__(_NAMED[name]) if name in _NAMED else find_class(name)
-    if not (callable(getattr(found, "fit", None)) and callable(getattr(found, "transform", None))):
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has not both fit and transform.")
+    if missing := [each for each in ("fit", "transform", "get_params") if not callable(getattr(found, each, None))]:
+        raise SettingError(f"Expected a scikit-learn transformer as reducer, {name} has no {' and no '.join(missing)}.")
     return found
 
 

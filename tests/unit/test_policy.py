@@ -49,6 +49,7 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"audit_rate": -0.1}, "audit_rate"),
         ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
         ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
+        ({"windows": ["0.1:0.2:30"]}, r"behind it, got '0.1:0.2:30'\.$"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
