@@ -23,7 +23,7 @@ from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NUMBER, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
+from .text import NOTHING, Timed, cells_of, decoded, floats, is_bare, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -107,7 +107,8 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
-    headers = [tuple(name for name in _top(path)[0] if name and not is_time(name)) for path in paths]
+    tops = [_top(path)[0] for path in paths]
+    headers = [tuple(name for name in top if name and not is_time(name)) for top in tops if not is_bare(top)]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
     return _chosen(Counter(headers).most_common(1)[0][0], asked)
@@ -122,9 +123,6 @@ def read_tables(named: Mapping[str, Path], name: str, asked: Asked) -> Dataset:
             frame, faults = read_table(path, found.encodings) if path.suffix.lower() == ".csv" else _parquet(path)
         except UnreadableError as error:
             raise DataError(f"Cannot read {path}: {Fault(path.name, error.line, str(error))}.") from error
-        odd = [word for word in frame.columns if NUMBER.fullmatch(word) and not word.isdecimal()]
-        if path.suffix.lower() == ".csv" and 2 * len(odd) > len(frame.columns) > 2:
-            raise DataError(f"Expected a header in {path}, its first line is of numbers; call it FZ_0, FZ_1, ..., label.")
         if frame.empty:
             raise DataError(f"Expected rows that can be read in {path}, found none.")
         found.faults += [replace(fault, source=source) for fault in faults]
@@ -238,7 +236,7 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
         return recording_of(rows.sort_values(time, kind="stable"), places, asked.rate_hz is None, time)
 
     def find(part: str) -> labels.Known:
-        words = parts[part][label].dropna().unique().tolist()
+        words = [word for word in parts[part][label].unique().tolist() if str(word).strip().lower() not in NOTHING]
         if len(words) != 1:
             raise UnreadableError(f"Expected one label in column {label}, got {listed(words) or 'none'}")
         return labels.label_of(words[0], asked.words), None
@@ -271,12 +269,13 @@ def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
     time = next((name for name in frame.columns if is_time(name)), None)
     if time is None or max(map(len, _numbered(frame.columns).values()), default=0) > 2:
         return ""
-    rows = frame.bfill()  # a label may stand in a part's last row alone
+    rows = frame.mask(frame == "").bfill()  # a label may stand in a part's last row alone
     changes = {name: int((rows[name] != rows[name].shift()).sum()) for name in frame.columns if name != time}
     few = [name for name, n in changes.items() if 2 <= n <= len(frame) / 5]
     if not few:
         return ""
-    part, label = max(few, key=changes.__getitem__), min(few, key=changes.__getitem__)
+    part = max(few, key=changes.__getitem__)
+    label = min(few, key=lambda name: (name.lower() not in labels.LABEL_COLUMNS, changes[name]))
     told = f"label={label!r}" if label != part else f"labels={beside!r}, a file of parts and labels"
     told = f" and time={time!r}" if asked.labels is not None else f", time={time!r} and {told}"
     return f"the columns that tell which part it is, when, and the label, as in part={part!r}{told}"

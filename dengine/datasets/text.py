@@ -102,10 +102,18 @@ def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.Da
         header.pop()
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", 1)
+    if is_bare(header):
+        raise UnreadableError("Expected a header, its first line is of numbers; write one above, time,FZ or FZ_0,...,label", 1)
     n = len(header)
     whole = {i: row[:n] for i, row in rows.items() if len(row) >= n and not any(row[n:])}
     faults = [Fault(path.name, i, f"Expected {n} columns, got {len(row)}") for i, row in rows.items() if i not in whole]
     return pd.DataFrame(list(whole.values()), index=list(whole), columns=header, dtype=object), faults
+
+
+def is_bare(header: Sequence[str]) -> bool:
+    """Whether a first line is of data: of numbers, and not all of these whole, as columns may be called."""
+    found = [word for word in header if NUMBER.fullmatch(word)]
+    return 2 * len(found) > len(header) and not all(map(str.isdecimal, found))
 
 
 def floats(cells: pd.Series) -> tuple[NDArray[np.float64], list[int]]:

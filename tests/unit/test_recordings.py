@@ -366,6 +366,10 @@ REFUSED: dict[str, tuple[Callable[[Dataset, Path], Any], str]] = {
         lambda data, tmp: written(tmp / "bare.csv", lambda path: wide(data).to_csv(path, index=False, header=False)),
         "its first line is of numbers",
     ),
+    "recordings without a header": (
+        lambda data, tmp: write_folder(tmp / "bare", Dataset(data.X[:3], data.y[:3]), header=False).parent / "bare",
+        "found none of 3.*its first line is of numbers",
+    ),
     "one recording": (
         lambda data, tmp: write_csv(tmp / "one_True.csv", data.X[0]),
         "as in one recording; give a folder of such CSV files",
