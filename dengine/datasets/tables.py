@@ -261,7 +261,9 @@ def _row_a_sample(frame: pd.DataFrame, known: list[str], asked: Asked) -> pd.Dat
         raise DataError(f"Expected the channel to be named, as in channel={have[0]!r}; there are {told}.")
     picked = frame[frame[tags[0]].isin(asked.channels)]
     wide = picked.pivot(index=known, columns=tags[0], values=values[0])  # noqa: PD010 - pivot_table would average
-    return wide.reset_index().set_axis(range(1, len(wide) + 1))
+    came = {part: i for i, part in enumerate(picked[known[0]].unique())}  # a pivot sorts S10 before S9
+    wide = wide.reset_index().sort_values(known[0], key=lambda parts: parts.map(came), kind="stable")
+    return wide.set_axis(range(1, len(wide) + 1))
 
 
 def _long_columns(frame: pd.DataFrame, asked: Asked, beside: str) -> str:
