@@ -9,7 +9,7 @@ import click
 from ..errors import percent
 from . import options
 from .options import verb
-from .output import certificate_record, facts, heading, listed, rows_of, tell, when, written
+from .output import certificate_record, duration, facts, heading, listed, rows_of, tell, when, written
 
 if TYPE_CHECKING:
     from ..history.status import Judged, Span, Status
@@ -24,7 +24,8 @@ LAST = "The newest so many decisions, looked at apart."
 @verb("dengine status engine.db --last 500")
 @options.store_argument
 @click.option("--last", type=options.COUNT, default=500, show_default=True, help=LAST)
-def status(store: str, last: int) -> None:
+@options.check_option
+def status(store: str, last: int, check_seconds: float) -> None:
     """Say how an engine is doing, and what its store holds.
 
     STORE is the file or URL that the engine remembers in, as given to `dengine train` or `dengine run`. Where it holds
@@ -47,14 +48,15 @@ def status(store: str, last: int) -> None:
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
     record = {"store": store} | plain(found) | {"certificate": certificate_record(found.certificate)}
-    tell(record, *_tables(store, found))
+    tell(record, *_tables(store, found, check_seconds))
 
 
-def _tables(store: str, found: "Status") -> list[Any]:
+def _tables(store: str, found: "Status", check_seconds: float) -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
     spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
+    spans.append(["would have decided", *(_would_have(span, check_seconds) for span in both)])
     now = [("look at", found.alarm)] if found.alarm else []
     now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie

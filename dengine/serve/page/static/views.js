@@ -78,10 +78,10 @@ function badAccepts(doing) {
 }
 
 function wouldHave(doing) {
-  const { would_accept: accepts, would_reject: rejects, decisions } = doing.ever;
+  const { would_accept: accepts, would_reject: rejects, verified: checked } = doing.ever;
   const certain = accepts.n + rejects.n;
   return el("section", { class: "card tile wide", id: "would", "data-part": true }, el("h2", {}, "It would have decided"),
-    big(`${number(certain)} of ${number(decisions)} parts`),
+    big(`${number(certain)} of ${number(checked)} verified parts`),
     el("p", {}, `${number(accepts.n)} accepted, ${number(accepts.wrong)} of them bad; ${number(rejects.n)} rejected, ${number(rejects.wrong)} of them good; ${duration(certain * doing.check_seconds)} saved.`),
     judgedChart(accepts), small(`Bad among those it would have accepted: ${percent(accepts.lower, 1)} to ${percent(accepts.upper, 1)}; ${VERDICT[accepts.verdict].toLowerCase()} (${percent(accepts.tolerance, 1)}).`));
 }
@@ -267,7 +267,7 @@ const FILTERS = [["action", "Decision", ACTIONS, capital], ["reason", "Reason", 
 const TIMES = [["since", "From"], ["until", "Until"]];
 
 async function history(get, query) {
-  const asked = new URLSearchParams([...query].filter(([, value]) => value !== ""));
+  const asked = new URLSearchParams([...query].map(([name, value]) => [name, value.trim()]).filter(([, value]) => value !== ""));
   const wanted = new URLSearchParams(asked);
   for (const [name] of TIMES) if (asked.has(name)) wanted.set(name, new Date(asked.get(name)).getTime() / 1000);
   wanted.set("limit", 50);
