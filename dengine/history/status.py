@@ -18,7 +18,7 @@ from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, expect, shortened
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, trace_in
+from ..records import Action, Decision, Reason, TraceSpec, in_html, trace_in
 from ..store.records import SAFE_MODE_BEGAN, SAFE_MODE_ENDED, Event, Outcomes, StoredDecision, StoredVersion
 from ..store.views import HistoryFilter, Stretch, Tally
 
@@ -99,7 +99,7 @@ class Watch:
     novelty: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Status:
     """How an engine is doing; times in seconds since 1970.
 
@@ -143,6 +143,14 @@ class Status:
     store_fault: str = ""
     retraining: bool = False
     store_lag: float = 0.0
+
+    _repr_html_ = in_html
+
+    def __repr__(self) -> str:
+        n, mode = self.ever, "safe mode, " if self.safe_mode else "shadow mode, " if self.shadow else ""
+        escaped = f", {n.stops} accepted and bad" if n.stops else ""
+        what = f"{n.decisions} decisions, {n.verified} verified, {n.accepted} accepted, {n.rejected} rejected{escaped}"
+        return f"<Status of {self.cell}: {mode}version {self.version}, {what}>"
 
     @property
     def alarm(self) -> str:
@@ -326,10 +334,11 @@ def of_part(store: SqlStore, part: str) -> str:
 
     UnknownDecisionError where there is none, ReportConflictError where there are several.
     """
-    found = [each for each in store.decisions(HistoryFilter(part=part), 20) if each.decision.action is not Action.REJECT]
+    known = store.decisions(HistoryFilter(part=part), 20)
+    found = [each for each in known if each.decision.action is not Action.REJECT]
     found = found or [each for each in [store.get_decision(part, trace=False)] if each is not None]
     if not found:
-        got = f"{shortened(part)}, which is unknown"
+        got = f"{shortened(part)}, which {'went back to the bin' if known else 'is unknown'}"
         raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
     if len(found) > 1:
         ids = ", ".join(each.decision.id for each in reversed(found))

@@ -345,5 +345,5 @@ def owner() -> str:
 
 def owned_by(holder: str, name: str) -> StoreError:
     """Return the error for a second engine on a cell."""
-    do = "close that engine first, or give this one a cell_id of its own"
+    do = "close that engine first, ask its page or its HTTP where it is served, or give this one a cell_id of its own"
     return StoreError(f"Expected a cell that no other engine runs on, but {holder} owns {name}; {do}.")

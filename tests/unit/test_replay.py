@@ -95,7 +95,7 @@ def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(data: D
     decision = [cycle.decision for cycle in engine.run(ReplayCell(data), 80)][-1]
     frame = engine.history_frame(last=5)
     assert (frame["time"].dt.tz is not None, frame.index[-1], engine.status().ever.decisions) == (True, decision.id, 80)
-    for each in (engine, decision, data, played, engine.explain(decision.id)):
+    for each in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
         assert len(repr(each)) < 240
         assert each._repr_html_().startswith("<table>")
 
