@@ -103,7 +103,7 @@ def read_table(path: Path, encodings: Counter[str] | None = None) -> tuple[pd.Da
     if not header:
         raise UnreadableError("Expected a header, the first line names no column", 1)
     if is_bare(header):
-        raise UnreadableError("Expected a header, its first line is of numbers; write one above, time,FZ or FZ_0,...,label", 1)
+        raise UnreadableError("Expected a header, its first line is of numbers; write time,FZ above, or FZ_0,...,label", 1)
     n = len(header)
     whole = {i: row[:n] for i, row in rows.items() if len(row) >= n and not any(row[n:])}
     faults = [Fault(path.name, i, f"Expected {n} columns, got {len(row)}") for i, row in rows.items() if i not in whole]

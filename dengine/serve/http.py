@@ -218,11 +218,11 @@ class HttpApi:
         """Why a decision came out as it did, with its trace, the band of good parts, and some bad ones."""
         return await self.service.look(lambda store: _explained(store, id_))
 
-    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[int, Meta(ge=0, le=200)] = 0) -> Json:
+    async def course(self, hours: Hours = 0.0, start: Hours = 0.0, batch: Annotated[str, Meta(max_length=9)] = "") -> Json:
         """How decisions went from the first to the newest, in stretches, and the retrains and safe modes meanwhile.
 
         hours : of a shift, which is a stretch then, the newest of them; start : when one begins, in hours since 1970.
-        batch : likewise what parts' numbers begin with, so many characters.
+        batch : likewise what parts' numbers begin with: so many characters, or up to the last of these, "-/".
         """
         recipe, by = self.service.engine.recipe, {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
         by = by if hours or batch else {}

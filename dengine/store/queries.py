@@ -1,7 +1,7 @@
 """Whose rows a query is about, a cell's own or those of all cells of its product, and what several queries are made of."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import sqlalchemy as sa
@@ -142,10 +142,11 @@ def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     return sa.select(sa.func.max(every.c.number)).where(every.c.cell_id == cell_id).scalar_subquery()
 
 
-def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: int = 0) -> sa.Select[Any]:
+def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = "") -> sa.Select[Any]:
     """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`.
 
-    batch : by so many first characters of the parts' numbers instead; seconds : or by so many of time, from `start` on.
+    batch : by what the parts' numbers begin with instead, so many characters, or up to the last of these: "5", "-/".
+    seconds : or by so many of time, from `start` on.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
@@ -156,6 +157,8 @@ def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: floa
     which = (verified, novel, accepted, accepted & (SAID == 0))
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
-    name = sa.func.substr(every.c.part, 1, batch) if batch else sa.null()
+    others = reduce(lambda part, each: sa.func.replace(part, each, ""), batch, every.c.part)
+    begins = sa.func.substr(every.c.part, 1, int(batch)) if batch.isdecimal() else sa.func.rtrim(every.c.part, others)
+    name = begins if batch else sa.null()
     timed = sa.func.floor((every.c.time - start) / seconds) if seconds else every.c.number - every.c.number % length
     return query.add_columns(name).group_by(name if batch else timed).order_by(sa.func.max(every.c.number))

@@ -43,8 +43,6 @@ def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
     assert engine.store.settings()["recipe"] == expected.to_toml()
 
 
-
-
 class Halves:
     """Looks like a transformer, and cannot be copied as one."""
 

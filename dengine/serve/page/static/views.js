@@ -190,12 +190,12 @@ const ROWS = 20; // of the trend
 
 async function trend(get, asked, parts) {
   // Shift by shift, by day, by hour, or by batch: what a part's number begins with, up to its last dash, slash, dot or blank.
-  const batch = (parts.find((each) => each.part !== null)?.part.match(/^.*[-_/. ]/)?.[0] ?? "").length;
+  const batch = parts.some((each) => /[-_/. ]/.test(each.part ?? ""));
   const by = asked in HOURS || (asked === "batch" && batch) ? asked : "shift";
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
-  const { stretches } = await get(`course?${by === "batch" ? `batch=${batch}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
+  const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch ?? "no number" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(5, 16)), number(each.n),
     percent(1 - each.verified / each.n), percent(each.verified / each.n), number(each.accepted), number(each.bad)]);
   const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "The trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("It begins with the first part.")
