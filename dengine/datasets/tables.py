@@ -23,7 +23,7 @@ from ..files import reading
 from ..traces import is_time
 from . import labels
 from .dataset import Asked, Collected, Dataset, Fault, Recorded, UnreadableError, as_dataset
-from .text import NOTHING, Timed, cells_of, decoded, floats, is_bare, numbers, read_recording, read_table, recording_of
+from .text import NOTHING, Timed, cells_of, decoded, floats, numbers, read_recording, read_table, recording_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -107,8 +107,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 def _usual_channel(paths: Iterable[Path], asked: Asked) -> tuple[str, ...]:
     """The force, or the only channel that there is."""
-    tops = [_top(path)[0] for path in paths]
-    headers = [tuple(name for name in top if name and not is_time(name)) for top in tops if not is_bare(top)]
+    headers = [tuple(name for name in _top(path)[0] if name and not is_time(name)) for path in paths]
     if not any(headers) or FORCE.lower() in {name.lower() for header in headers for name in header}:
         return (FORCE,)
     return _chosen(Counter(headers).most_common(1)[0][0], asked)

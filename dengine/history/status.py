@@ -147,10 +147,8 @@ class Status:
     _repr_html_ = in_html
 
     def __repr__(self) -> str:
-        n, mode = self.ever, "safe mode, " if self.safe_mode else "shadow mode, " if self.shadow else ""
-        escaped = f", {n.stops} accepted and bad" if n.stops else ""
-        what = f"{n.decisions} decisions, {n.verified} verified, {n.accepted} accepted, {n.rejected} rejected{escaped}"
-        return f"<Status of {self.cell}: {mode}version {self.version}, {what}>"
+        n, at = self.ever, f"{self.cell}: version {self.version}, {self.ever.decisions} decisions"
+        return f"<Status of {at}, {n.verified} verified, {n.accepted} accepted, {n.stops} known bad, {n.rejected} rejected>"
 
     @property
     def alarm(self) -> str:
