@@ -47,16 +47,18 @@ def status(store: str, last: int, check_seconds: float) -> None:
         store = address(store, first.cell_id)
     with closing(open_store(store, must_exist=True)) as opened:
         found = status_of(opened, last, watching=True)
+    n, checked = found.ever.would_accept.n + found.ever.would_reject.n, found.ever.verified
+    saved = f"{duration(n * check_seconds)} of checks at {duration(check_seconds)}"
+    would = [f"It would have decided {n:,} of the {checked:,} parts that were verified: {saved}."] if n else []
     record = {"store": store} | plain(found) | {"certificate": certificate_record(found.certificate)}
-    tell(record, *_tables(store, found, check_seconds))
+    tell(record, *_tables(store, found), *would)
 
 
-def _tables(store: str, found: "Status", check_seconds: float) -> list[Any]:
+def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
     spans = [[TITLES.get(name, heading(name)), *(_of_span(name, span) for span in both)] for name in names]
-    spans.append(["would have decided", *(_would_have(span, check_seconds) for span in both)])
     now = [("look at", found.alarm)] if found.alarm else []
     now += [("cell", found.cell), *rows_of(found, "cell", *APART, *ELSEWHERE)]
     if found.model is None:  # of one that was handed in the recipe has no effect: to show it would be a lie

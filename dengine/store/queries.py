@@ -145,8 +145,7 @@ def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
 def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = "") -> sa.Select[Any]:
     """All decisions counted in stretches of one length, oldest first; the columns of `Stretch`.
 
-    batch : by what the parts' numbers begin with instead, so many characters, or up to the last of these: "5", "-/".
-    seconds : or by so many of time, from `start` on.
+    batch : by the beginnings of parts' numbers instead, "5" characters, or up to the last of "-/".  seconds : or of time.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason", "part"], number.label("number"))
