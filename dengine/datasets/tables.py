@@ -240,9 +240,8 @@ def _from_long(frame: pd.DataFrame, asked: Asked, found: Collected, source: str)
             raise UnreadableError(f"Expected one label in column {label}, got {listed(words) or 'none'}")
         return labels.label_of(words[0], asked.words), None
 
-    if asked.labels is None:
-        told = labels.Labels(find, "name the column of labels (label)")
-    else:
+    told = labels.Labels(find, "name the column of labels (label)")
+    if asked.labels is not None:
         told = labels.listed(asked.labels, "part", list(parts), asked.words)
     return as_dataset(labels.collect(parts, read, told, found), asked)
 

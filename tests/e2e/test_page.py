@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
+import numpy as np
 import pytest
 
 from dengine import Action, Dataset, Decision, Policy, load_exported
@@ -354,6 +355,15 @@ def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wron
     assert told[0][2] == "accepted parts failed more often than the tolerance"
     assert last in told[1][2]
     assert told[2][2] == "what was told anew keeps the tolerance"
+
+
+def test_what_is_said_of_several_channels_is_said_by_their_names(browser: Browser, tmp_path: Path, stream: Dataset) -> None:
+    file = tmp_path / "cell.db"
+    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+        played(service, Dataset(np.stack([stream.X, 0 * stream.X + stream.X[:1]], axis=1), stream.y), 40)
+        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
+        caption = page.locator("#trace figcaption").nth(1)
+        expect(caption).to_contain_text(re.compile(r"Channel 2 over .*of all channels lies outside the band"))
 
 
 @pytest.mark.slow

@@ -219,7 +219,7 @@ async function overview(get, query, doing) {
     doing.shadow && wouldHave(doing), badAccepts(doing), verified(doing), accepted(doing), pace(decisions), saved(doing),
     figure("novel", "Novel", big(percent(newest.novel_share, 1)), small(`Newest ${number(newest.decisions)} parts`), el("p", {}, `Audits: ${number(newest.audits)} · Outside a window: ${number(newest.outside)}`)),
     figure("drift", "Drift, on its way to an alarm", drift),
-    figure("model", "Model", big(`version ${doing.version}`), small(`${number(ever.retrains)} retrains, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
+    figure("model", "Model", big(`version ${doing.version}`), small(`Retrains: ${number(ever.retrains)}, ${number(Object.values(ever.dropped).reduce((a, b) => a + b, 0))} dropped`),
       report && el("p", {}, `newest at ${clock(report.time)}, ${number(report.report.seconds, 2)} s`),
       el("p", {}, `Labels until the next retrain: ${number(doing.new_labels)} of ${number(doing.recipe.retrain_every)}`),
       Object.entries(ever.dropped).map(([reason, n]) => small(`Dropped ${number(n)}: ${reason}`))),
