@@ -249,10 +249,8 @@ def _made(frame: pd.DataFrame, replays: Sequence[Replay], title: str) -> Iterato
         yield "curves.png", curves(_grouped(replays, lambda each: _row_name(each, frame)), title)
     for name, (one, *_) in _grouped(replays, lambda each: each.name).items():
         if not np.isnan(one.position).all():  # rivals embed nothing
-            yield (
-                _file_name(f"map_{name}"),
-                embedding_map(one, title=f"{name}, newest parts of one replay (seed {one.seed})"),
-            )
+            said = f"{name}, newest parts of one replay (seed {one.seed})"
+            yield _file_name(f"map_{name}"), embedding_map(one, title=said)
 
 
 def _file_name(title: str) -> str:

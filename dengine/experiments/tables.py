@@ -150,5 +150,4 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
         return "No retrain."
     worst, dropped = max(r.seconds for r in retrains), [r for r in retrains if not r.accepted]
     last = f"; {len(dropped)} dropped, the last for: {dropped[-1].reason.removeprefix('dropped: ')}" if dropped else ""
-    many = "" if len(retrains) == 1 else "s"
-    return f"{len(retrains)} retrain{many}, the worst in {worst:.3f} s{last}."
+    return f"{len(retrains)} retrain{'s' * (len(retrains) > 1)}, the worst in {worst:.3f} s{last}."
