@@ -156,8 +156,8 @@ def stretches_query(cell_id: str, length: int, seconds: float = 0.0, start: floa
     which = (verified, novel, accepted, accepted & (SAID == 0))
     counts: list[sa.ColumnElement[Any]] = [sa.func.sum(sa.case((each, 1), else_=0)) for each in which]
     query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts]).select_from(every.outerjoin(LABEL, of))
-    others = reduce(lambda part, each: sa.func.replace(part, each, ""), batch, every.c.part)
-    begins = sa.func.substr(every.c.part, 1, int(batch)) if batch.isdecimal() else sa.func.rtrim(every.c.part, others)
-    name = begins if batch else sa.null()
+    part: Any = every.c.part
+    others = reduce(lambda text, each: sa.func.replace(text, each, ""), batch, part)
+    name = sa.func.substr(part, 1, int(batch)) if batch.isdecimal() else sa.func.rtrim(part, others) if batch else sa.null()
     timed = sa.func.floor((every.c.time - start) / seconds) if seconds else every.c.number - every.c.number % length
     return query.add_columns(name).group_by(name if batch else timed).order_by(sa.func.max(every.c.number))
