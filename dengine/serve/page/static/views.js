@@ -295,13 +295,14 @@ async function history(get, query) {
 }
 
 function asCsv(decisions) {
-  const names = Object.keys(decisions[0]).filter((name) => name !== "embedding");
+  const names = Object.keys(decisions[0]).filter((name) => name !== "embedding" && name !== "trace");
+  const shown = (name, value) => (/time$/.test(name) && value !== null ? new Date(1000 * value).toISOString() : value);
   const text = (value) => {
     const plain = value === null || value === undefined ? "" : String(value);
     const safe = typeof value === "string" && /^[=+\-@\t\r]/.test(plain) ? `'${plain}` : plain; // a spreadsheet takes these for formulas
     return /[",\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
   };
-  const lines = decisions.map((each) => names.map((name) => text(each[name])).join(","));
+  const lines = decisions.map((each) => names.map((name) => text(shown(name, each[name]))).join(","));
   return new Blob([[names.join(","), ...lines, ""].join("\n")], { type: "text/csv" });
 }
 
