@@ -192,6 +192,7 @@ NAMED = [f"{file},{'nok' if i % 2 else 'ok'}" for i, file in enumerate(PATHS)]
 LISTS = {
     "a header": ["note,path,verdict", *(f'"a, b",{row}' for row in NAMED)],
     "no header": NAMED,
+    "names of its own": ["Prüfer,Seriennummer,Urteil", *(f"Kim,{row}" for row in NAMED)],
     "one known name": ["verdict,Datei", *(f"{'nok' if i % 2 else 'ok'},run_{i}" for i in range(6))],
 }
 
