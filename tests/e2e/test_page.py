@@ -273,8 +273,9 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
             expect(page.get_by_role("button", name="Verify everything")).to_be_disabled()
         with looking(browser, http_credentials={"username": "kim", "password": TOKEN}) as page:
             a_day(page, demo, part, tmp_path / "list.csv")
-            opened(page, demo, "part?id=nobody")
-            expect(page.locator("h1")).to_have_text("That cannot be shown")
+            for nothing in ("part?id=nobody", "history?action=nonsense"):
+                opened(page, demo, nothing)
+                expect(page.locator("h1")).to_have_text("That cannot be shown")
     with demo.store() as store:
         told = [(event.kind, event.author) for event in store.events(4)]
     assert told == [("report", "Kim"), ("shadow", "Kim"), ("shadow", "Kim"), ("policy", "Kim")]  # nobody typed a name
