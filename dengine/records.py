@@ -170,7 +170,7 @@ class Window:
         words = [word.partition("=") for word in text.split(":")]
         try:
             start, end, low, high = (word for word, _, _ in words[:4])
-            more: dict[str, Any] = {name: name == "reject" or int(value) for name, _, value in words[4:]}
+            more: dict[str, Any] = {name: (name, value) == ("reject", "") or int(value) for name, _, value in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
         except (TypeError, ValueError) as error:
             wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
@@ -201,7 +201,7 @@ class Decision:
     """What the engine decided on one trace, and on what evidence.
 
     id : the decision's key in the store.  action : what to do.  reason : why.
-    predicted : what the model alone would have done; differs from `action` in an audit only.
+    predicted : what the model alone would have done: not `action` in an audit, and VERIFY where a window rejects.
     lower, upper : bound on the success probability in the ball around the trace; under the pooled guarantee what sorts it:
         of conv and rocket the mean probability by their heads, twice, else an interval at alpha 0.5.
     n_success, n_failure : labels counted in that ball.
@@ -228,7 +228,7 @@ class Decision:
 
     def __repr__(self) -> str:
         bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {self.n_success} good, {self.n_failure} bad labels around it"
-        alone = "" if self.predicted is self.action else f", alone the model would {self.predicted.value}"
+        alone = f", alone the model would {self.predicted.value}" if self.audit else ""
         what = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
         return f"<Decision {what}, version {self.model_version}, id {self.id}>"
 

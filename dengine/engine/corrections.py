@@ -118,8 +118,8 @@ class Corrections:
         accepted before, and of which nothing was heard, stays unobserved.
         In the shadow mode, `Policy(shadow=True)`, each part that the model is certain of is an audit:
         `Decision.predicted` says what it would have done, and all is learned from as ever. It lasts over restarts.
-        Raises SettingError for what is no policy, and for anything but audit_rate, stops and shadow of a model that was
-        handed in.
+        Raises SettingError for what is no policy, for windows that the traces cannot hold, and, of a model that was handed
+        in, for anything but audit_rate, stops, label_within, windows and shadow.
         """
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
@@ -135,7 +135,7 @@ class Corrections:
         if idle:
             raise SettingError(
                 f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
-                "change only audit_rate, stops and windows."
+                "change only audit_rate, stops, label_within, windows and shadow."
             )
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.

@@ -49,6 +49,7 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"audit_rate": -0.1}, "audit_rate"),
         ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
         ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
+        ({"windows": ["0.1:0.2::1:reject=no"]}, "START:END:LOW:HIGH"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
@@ -60,7 +61,7 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
     "0.2:0.4:2:4": 0,  # its ends and its limits are within
     "0.2:0.4::3.9": 1,
     "0.2:0.4:2.1::reject": 2,
-    "0.31:0.39:0:": 1,  # no sample lies there
+    "5.1:5.9:0::along=0": 1,  # no sample lies there
     "-5:-3::5:along=1": 0,
     "-5:-3::4.9:along=1:reject": 2,
     "-7:-6:-6.5::channel=1:along=0": 1,
@@ -84,9 +85,12 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         assert (made.action, made.predicted, made.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
-        with pytest.raises(SettingError, match="within 1 x 100 samples"):
-            engine.set_policy(Policy(windows=("0.3:0.4:0:",)))
+        for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:"):  # beyond the last sample, and between two
+            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):
+                engine.set_policy(Policy(windows=(nowhere,)))
     with DataEngine.open(tmp_path / "cell.db") as engine:
         status = engine.status()
-        assert (status.newest.outside, status.certificate.rejected.n, status.certificate.accepted.n) == (2, 0, 0)
+        assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (2, 0, 1)
+        assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
         assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).said[0]
+        assert engine.status(last=3).alarm == "2 of the newest leave a window."
