@@ -172,9 +172,11 @@ class Window:
             start, end, low, high = (word for word, _, _ in words[:4])
             more: dict[str, Any] = {name: (name, value) == ("reject", "") or int(value) for name, _, value in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
+        except SettingError:
+            raise
         except (TypeError, ValueError) as error:
             wanted = "windows as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
-            raise SettingError(f"Expected {wanted}, got {shortened(text)}: {error}") from error
+            raise SettingError(f"Expected {wanted}, got {shortened(text)}.") from error
 
 
 def trace_in(known: Mapping[str, str]) -> TraceSpec | None:

@@ -8,7 +8,7 @@ again as a new one, and what was decided stays as it was decided.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from ..records import as_success
 from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
 from .feedback import Feedback
-from .settings import EvidenceWindow, SettingsInForce
+from .settings import EvidenceWindow, SettingsInForce, of_policy
 from .trainer import HUNG
 from .versions import ModelVersions
 
@@ -124,9 +124,7 @@ class Corrections:
         if not isinstance(policy, Policy):
             raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
         now, versions = self._settings.now, self._versions
-        was, wished = (
-            asdict(each) | {"windows": " ".join(map(str, each.windows)) or "none"} for each in (now.recipe.policy, policy)
-        )
+        was, wished = of_policy(now.recipe.policy), of_policy(policy)
         new = {name: value for name, value in wished.items() if value != was[name]}
         if not new:
             return self._unchanged("policy", "The policy is in force already")

@@ -152,10 +152,7 @@ class Status:
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
-            (
-                accepts.verdict == "broken",
-                f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows.",
-            ),
+            (accepts.verdict == "broken", f"More accepted parts are bad than the tolerated {accepts.tolerance:.1%}."),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),

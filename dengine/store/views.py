@@ -145,8 +145,7 @@ class Tally:
 class Stretch:
     """Consecutive decisions, or those of a batch.  n : of them.  last : time of the newest.  batch : its name.
 
-    verified, novel, outside : decided so.  accepted, rejected : by the model, without a check.
-    bad : of the accepted, known to be so.
+    verified, novel, outside : decided so.  accepted, rejected : by the model, without a check.  bad : accepted, known so.
     """
 
     n: int

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
 from dengine.traces import WindowGate
-from tests.support.exports import SAMPLES, trained
+from tests.support.exports import SAMPLES, recipe, trained
 
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
 
@@ -70,10 +70,10 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
 
 @pytest.mark.parametrize(("window", "said"), HELD.items())
 def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
-    x, recipe = torch.arange(6, dtype=torch.float32), Recipe(policy=Policy(windows=(window,)))
-    assert WindowGate(recipe.policy.windows, TraceSpec(6, rate_hz=10.0, channels=2))(torch.stack([x, -x])) == said
-    assert Recipe.from_toml(recipe.to_toml()) == recipe
-    assert str(*recipe.policy.windows) == window
+    x, held = torch.arange(6, dtype=torch.float32), recipe(windows=(window,))
+    assert WindowGate(held.policy.windows, TraceSpec(6, rate_hz=10.0, channels=2))(torch.stack([x, -x])) == said
+    assert Recipe.from_toml(held.to_toml()) == held
+    assert str(*held.policy.windows) == window
 
 
 def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(make_data, tmp_path: Path) -> None:
@@ -94,3 +94,5 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
         assert "leaves an operator's window, 0:0.1::" in engine.explain(made.id).said[0]
         assert engine.status(last=3).alarm == "2 of the newest leave a window."
+    with pytest.raises(SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"):
+        DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))

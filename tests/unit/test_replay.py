@@ -90,7 +90,7 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]].to_numpy(), played.position)
 
 
-def test_a_window_decides_in_the_place_of_the_model_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
+def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data: Dataset, played: Replay) -> None:
     highest = data.X.max(axis=1)
     window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
     log, wide = (replay(data, RECIPE.with_policy(windows=[each]), seed=1) for each in (window, "0:1:-1e9:"))
