@@ -83,6 +83,7 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
         made = engine.decide(x)
         assert (made.action, made.predicted, made.reason) == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE)
+        assert (made.propensity, "alone the model" in repr(made)) == (0.0, False)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
         for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:"):  # beyond the last sample, and between two
