@@ -210,7 +210,7 @@ class Decision:
     embedding : (K, d) nested tuples, scaled; None where no model embedded the trace.
     model_version : of the model that answered; 0 before the first retrain.
     audit : verified although the model was certain.
-    propensity : probability with which this decision is verified: of a certain one the audit rate, where a window rejects 0, else 1.
+    propensity : probability with which it is verified: of a certain one the audit rate, where a window rejects 0, else 1.
     part : the number of the part, where it was given.
     """
 
