@@ -140,7 +140,7 @@ class Window:
 
     start, end : in seconds from the first sample, both included; with `along` in that channel's unit.
     low, high : that the samples there must keep, in their unit, both included; one may be infinite.
-    channel : theirs, from 0.  along : the channel that says where the tool is; None: time.
+    channel : theirs, from 0, or its name among the traces' columns.  along : of where the tool is, likewise; None: time.
     reject : what leaves it, or has no sample in the stretch, is rejected; else verified.
     """
 
@@ -148,20 +148,22 @@ class Window:
     end: float
     low: float = -math.inf
     high: float = math.inf
-    channel: int = 0
-    along: int | None = None
+    channel: int | str = 0
+    along: int | str | None = None
     reject: bool = False
 
     def __post_init__(self) -> None:
         numbers = all(map(is_number, (self.start, self.end, self.low, self.high)))
         held = numbers and -math.inf < self.start <= self.end < math.inf and self.low <= self.high
         held = held and (self.low, self.high) != (-math.inf, math.inf) and isinstance(self.reject, bool)
-        held = held and all(is_whole(each, 0, MOST) for each in (self.channel, self.along or 0))
-        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on", self)
+        for each in (self.channel, 0 if self.along is None else self.along):
+            named = isinstance(each, str) and is_name(each) and not ({*" :="} & {*each} or each.isdecimal())  # in a text
+            held = held and (named or is_whole(each, 0, MOST))
+        expect(held, "a window with start <= end, low <= high, one of these finite, and channels from 0 on, or names", self)
 
     def __str__(self) -> str:
         said = [f"{repr(float(each)).removesuffix('.0')}" for each in (self.start, self.end, self.low, self.high)]
-        said += [f"channel={self.channel}"] * (self.channel > 0) + [f"along={self.along}"] * (self.along is not None)
+        said += [f"channel={self.channel}"] * (self.channel != 0) + [f"along={self.along}"] * (self.along is not None)
         return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
 
     @classmethod
@@ -170,7 +172,7 @@ class Window:
         words = [word.partition("=") for word in text.split(":")]
         try:
             start, end, low, high = (word for word, _, _ in words[:4])
-            more: dict[str, Any] = {name: (name, value) == ("reject", "") or int(value) for name, _, value in words[4:]}
+            more: dict[str, Any] = {name: int(each) if each.isdecimal() else each or True for name, _, each in words[4:]}
             return cls(float(start), float(end), float(low or "-inf"), float(high or "inf"), **more)
         except SettingError:
             raise

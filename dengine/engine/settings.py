@@ -224,9 +224,7 @@ def refuse_idle(reducer: Any, beside: Mapping[str, Any]) -> None:
 
 def flat(recipe: Recipe) -> dict[str, Any]:
     """Every setting of a recipe by its name, the policy's among them."""
-    plain = {f.name: getattr(recipe, f.name) for f in fields(recipe)}
-    policy: Policy = plain.pop("policy")
-    return plain | of_policy(policy)
+    return {f.name: getattr(recipe, f.name) for f in fields(recipe) if f.name != "policy"} | of_policy(recipe.policy)
 
 
 def of_policy(policy: Policy) -> dict[str, Any]:

@@ -49,7 +49,8 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(policy: Policy, n
         ({"audit_rate": -0.1}, "audit_rate"),
         ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
         ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
-        ({"windows": ["0.1:0.2::1:reject=no"]}, "START:END:LOW:HIGH"),
+        ({"windows": ["0.1:0.2::1:reject=no"]}, "a window with .*reject='no'"),
+        ({"windows": ["0.1:0.2:1::channel=F Z"]}, "or names"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(settings: dict[str, object], message: str) -> None:
@@ -65,13 +66,17 @@ HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of 
     "-5:-3::5:along=1": 0,
     "-5:-3::4.9:along=1:reject": 2,
     "-7:-6:-6.5::channel=1:along=0": 1,
+    "-5:-3::5:along=Z": 0,
+    "3:3:-3:-3:channel=Z:along=F:reject": 0,
+    "3:3:3:3:channel=Z:along=F:reject": 2,
 }
 
 
 @pytest.mark.parametrize(("window", "said"), HELD.items())
 def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits(window: str, said: int) -> None:
     x, held = torch.arange(6, dtype=torch.float32), recipe(windows=(window,))
-    assert WindowGate(held.policy.windows, TraceSpec(6, rate_hz=10.0, channels=2))(torch.stack([x, -x])) == said
+    spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
+    assert WindowGate(held.policy.windows, spec)(torch.stack([x, -x])) == said
     assert Recipe.from_toml(held.to_toml()) == held
     assert str(*held.policy.windows) == window
 
@@ -86,8 +91,8 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         assert (made.propensity, "alone the model" in repr(made)) == (0.0, False)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
-        for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:"):  # beyond the last sample, and between two
-            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):
+        for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
+            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):  # beyond the last, and between two
                 engine.set_policy(Policy(windows=(nowhere,)))
     with DataEngine.open(tmp_path / "cell.db") as engine:
         status = engine.status()
