@@ -154,7 +154,7 @@ class Status:
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (accepts.verdict == "broken", f"More accepted parts are bad than the tolerated {accepts.tolerance:.1%}."),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
-            (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest leave a window."),
+            (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
             (failing, f"No retrain was accepted yet, so nothing is decided; the last was {failing}."),
         )
