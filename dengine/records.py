@@ -1,7 +1,5 @@
 """Frozen records that travel between the layers, the values that they may hold, and their plain JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -11,21 +9,11 @@ from functools import cache
 from html import escape
 from importlib import import_module
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from .errors import (
-    DataError,
-    ReportConflictError,
-    ReportError,
-    SettingError,
-    StoreError,
-    expect,
-    shortened,
-    without_password,
-)
+from .errors import ReportConflictError, ReportError, SettingError, StoreError, expect, instead, shortened, without_password
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:
@@ -115,10 +103,8 @@ class TraceSpec:
     columns: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        try:
+        with instead(SettingError, f"Expected the names of columns, got {shortened(self.columns)}", TypeError):
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
-        except TypeError as error:
-            raise SettingError(f"Expected the names of columns, got {shortened(self.columns)}.") from error
         object.__setattr__(self, "columns", columns)
         rated = is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")
         form = (self.samples, self.channels, self.rate_hz)
@@ -167,7 +153,7 @@ class Window:
         return ":".join(["" if "inf" in each else each for each in said] + ["reject"] * self.reject)
 
     @classmethod
-    def parse(cls, text: str) -> Window:
+    def parse(cls, text: str) -> Self:
         """The window of a text; SettingError for one that is none."""
         words = [word.partition("=") for word in text.split(":")]
         try:
@@ -185,11 +171,9 @@ def trace_in(known: Mapping[str, str]) -> TraceSpec | None:
     """The traces' contract among a store's settings; None before the first trace. StoreError for what is none."""
     if "trace" not in known:
         return None
-    try:
+    said = f"Expected a trace's contract in the settings, got {shortened(known['trace'])}"
+    with instead(StoreError, said, ValueError, TypeError, RecursionError, do="restore the store"):
         return TraceSpec(**json.loads(known["trace"]))
-    except (ValueError, TypeError, RecursionError) as error:
-        got = shortened(known["trace"])
-        raise StoreError(f"Expected a trace's contract in the settings, got {got}: {error}; restore the store.") from error
 
 
 def in_html(record: Any) -> str:
@@ -294,29 +278,16 @@ def as_success(value: Any, of: str = "") -> bool:
     plain = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
-    raise ReportError(
-        f"Expected a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'} got "
-        f"{shortened(value)}; nothing was stored: turn it into one of these first, as in success=(answer == 'OK')."
-    )
-
-
-def as_labels(y: ArrayLike) -> NDArray[np.int64]:
-    """Labels (n,) as 1 (success) and 0 (failure); DataError where there is anything else among them."""
-    labels = np.asarray(y)
-    if not np.isin(labels, (0, 1)).all():
-        raise DataError("Expected labels 1 (success) and 0 (failure), got others; turn them into these before they count.")
-    return labels.astype(np.int64)
+    wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{of and f' of {of},'}"
+    do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
+    raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
 
 
 def as_outcome(value: Any, of: str = "") -> Outcome:
     """What a cell's `proceed` returned, as an `Outcome`; ReportError for anything else, which would pass for silence."""
-    try:
+    said = f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}"
+    with instead(ReportError, said, ValueError, TypeError, do="return Outcome.UNKNOWN where nothing is known"):
         return Outcome(value)
-    except (ValueError, TypeError) as error:
-        raise ReportError(
-            f"Expected an Outcome, {', '.join(Outcome)},{of and f' of {of},'} got {shortened(value)}; return "
-            "Outcome.UNKNOWN from proceed() where nothing is known."
-        ) from error
 
 
 def source_of(decision_id: str, action: Action, audit: bool, success: bool) -> Source:
@@ -335,11 +306,8 @@ def is_name(value: Any) -> bool:
 
 def as_id(value: Any) -> str:
     """A decision's id; ReportError for what is none."""
-    if not is_name(value):
-        raise ReportError(
-            f"Expected the id of a decision, a text of 1 to {LONGEST} characters that print, got {shortened(value)}; "
-            "report the `Decision.id` that `decide` returned."
-        )
+    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
+    expect(is_name(value), wanted, value, "report the `Decision.id` that `decide` returned", ReportError)
     return str(value)
 
 
@@ -378,10 +346,9 @@ def _told(kind: type) -> tuple[tuple[str, bool], ...]:
 def find_class(where: str) -> type:
     """The class that `module:Class` names; SettingError where there is none."""
     module, _, name = where.partition(":")
-    try:
+    said = f"Expected module:Class that can be imported here, got {shortened(where)}"
+    with instead(SettingError, said, Exception):  # whatever a module of the user's raises while it is imported
         found = getattr(import_module(module), name)
-    except Exception as error:  # whatever a module of the user's raises while it is imported
-        raise SettingError(f"Expected module:Class that can be imported here, got {shortened(where)}: {error}.") from error
     if not isinstance(found, type):
         raise SettingError(f"Expected module:Class, {shortened(where)} is a {type(found).__name__} and no class.")
     return found

@@ -172,8 +172,7 @@ def host_and_port(address: str) -> tuple[str, int]:
     from ..cells.ur.protocol import PORT
 
     host, _, port = address.partition(":")
-    if port and not port.isdecimal():
-        raise SettingError(f"Expected a host, or host:port, got {address!r}.")
+    expect(not port or port.isdecimal(), "a host, or host:port", address)
     return host, int(port) if port else PORT
 
 

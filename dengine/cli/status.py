@@ -1,7 +1,5 @@
 """`dengine status`: how an engine is doing by its store, what the store holds, and who shares it."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
@@ -52,7 +50,7 @@ def status(store: str, last: int) -> None:
     tell(record, *_tables(store, found))
 
 
-def _tables(store: str, found: Status) -> list[Any]:
+def _tables(store: str, found: "Status") -> list[Any]:
     """A column each for the newest decisions and for all; and what is of now."""
     columns, both = ("", f"last {found.newest.decisions:,}", "since birth"), (found.newest, found.ever)
     names = sorted((each.name for each in fields(found.ever)), key=lambda name: name != "stops")  # what is bad comes first
@@ -70,14 +68,14 @@ def _tables(store: str, found: Status) -> list[Any]:
     return [facts(f"{store}: overview", spans, columns), facts("What it is", now)]
 
 
-def _of_span(name: str, span: Span) -> str:
+def _of_span(name: str, span: "Span") -> str:
     value = getattr(span, name)
     if name in ("first", "last"):
         return when(value)
     return _held(value, span.stops if name == "bad_accepts" else 0) if hasattr(value, "verdict") else written(name, value)
 
 
-def _held(said: Judged, stops: int) -> str:
+def _held(said: "Judged", stops: int) -> str:
     """An interval of the share of wrong ones, held against what is tolerated; first the stops that no share tells."""
     first = f"{stops:,} stop{'s' * (stops > 1)}; " if stops and said.by != "every outcome" else ""
     if not said.known and said.verdict == "open":

@@ -4,8 +4,6 @@ Words, in any case: true ok pass passed good success successful yes io gut 1; fa
 schlecht 0; and a word of the first kind after a not, as in `run_7_not_ok.csv`.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter, defaultdict
@@ -14,7 +12,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from ..errors import DataError
+from ..errors import DataError, instead
 from .dataset import Collected, Fault, Recorded, UnknownWordError, UnreadableError, must
 from .text import Timed, read_table
 
@@ -72,12 +70,9 @@ def named(pattern: str | None = None, words: Words = NONE) -> Labels:
     words : as of `label_of`.
     DataError for a pattern that is no regular expression with one group.
     """
-    try:
+    with instead(DataError, f"Expected a regular expression for the label, got {pattern!r}", re.error):
         expression = None if pattern is None else re.compile(pattern)
-    except re.error as error:
-        raise DataError(f"Expected a regular expression for the label, got {pattern!r}: {error}.") from error
-    if expression is not None and expression.groups != 1:
-        raise DataError(f"Expected one group in the label's pattern, as in '_(OK|NOK)_', got {pattern!r}.")
+    must(expression is None or expression.groups == 1, "one group in the label's pattern, as in '_(OK|NOK)_'", pattern)
 
     def find(name: str) -> Known:
         if expression is None:

@@ -311,9 +311,8 @@ def _label_column(frame: pd.DataFrame, asked: Asked, found: Collected) -> str:
     several = {name for names in _numbered(frame.columns).values() if len(names) > 1 for _, name in names}
     left = [name for name in frame.columns if name not in several]
     if asked.time is None and len(left) == len(frame.columns) and any(is_time(name) for name in left):
-        raise DataError(
-            f"Expected a row an insertion, got {listed(left)}, as in one recording; give a folder of such CSV files."
-        )
+        do = "as in one recording; give a folder of such CSV files"
+        raise DataError(f"Expected a row an insertion, got {listed(left)}, {do}.")
     likely = min(left, key=lambda name: (frame[name].nunique() < 2, frame[name].nunique()), default="...")
     have = listed(left or frame.columns)
     raise DataError(f"Expected a column of labels, y or label, found {have}; name it: label={likely!r}.")

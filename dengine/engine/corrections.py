@@ -16,7 +16,7 @@ import numpy as np
 from ..decision.intervals import SORTED
 from ..decision.policy import Policy
 from ..decision.rule import SAFE_MODE
-from ..errors import ReportError, SettingError, listed
+from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
 from ..store.outbox import Outbox
 from ..store.records import Change, StoredDecision, nothing_to_correct, unknown_decision
@@ -121,8 +121,7 @@ class Corrections:
         Raises SettingError for what is no policy, for windows that the traces cannot hold, and, of a model that was handed
         in, for anything but audit_rate, stops, label_within, windows and shadow.
         """
-        if not isinstance(policy, Policy):
-            raise SettingError(f"Expected a Policy, got {policy!r}; for example Policy(alpha=0.05, lower_bound=0.95).")
+        expect(isinstance(policy, Policy), "a Policy", policy, "for example Policy(alpha=0.05, lower_bound=0.95)")
         now, versions = self._settings.now, self._versions
         was, wished = of_policy(now.recipe.policy), of_policy(policy)
         new = {name: value for name, value in wished.items() if value != was[name]}
@@ -131,10 +130,9 @@ class Corrections:
         own = now.model is not None  # a model that was handed in keeps its rule
         idle = sorted(set(new) - {"audit_rate", "stops", "shadow", "label_within", "windows"}) if own else []
         if idle:
-            raise SettingError(
-                f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would have no effect; "
-                "change only audit_rate, stops, label_within, windows and shadow."
-            )
+            said = f"so {', '.join(idle)} would have no effect"
+            do = "change only audit_rate, stops, label_within, windows and shadow"
+            raise SettingError(f"A model that was handed in decides by its own numbers, {said}; {do}.")
         self._make_ready()
         # An audit weighs as its propensity says, so that the pooled evidence is of one audit rate.
         asked = policy.guarantee in SORTED and policy.known_share != now.recipe.policy.known_share

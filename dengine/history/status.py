@@ -149,10 +149,11 @@ class Status:
         """What somebody should look at, the worst first; "" where there is nothing."""
         accepts, errors = self.newest.bad_accepts, self.newest.errors
         failing = "" if self.version or len(self.retrains) < FAILING else self.retrains[-1].report.reason
+        broken = f"More accepted parts are bad than the tolerance of {accepts.tolerance:.1%} allows."
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
-            (accepts.verdict == "broken", f"More accepted parts are bad than the tolerated {accepts.tolerance:.1%}."),
+            (accepts.verdict == "broken", broken),
             (2 * self.newest.novel > self.newest.decisions, f"{self.newest.novel} of the newest traces are novel."),
             (2 * self.newest.outside > self.newest.decisions, f"{self.newest.outside} of the newest parts leave a window."),
             (errors, f"The model failed on {errors} of the newest decisions."),
@@ -231,13 +232,11 @@ def _span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
     )
 
 
-def _judged(
-    known: int, wrong: int, tolerance: float, alpha: float = 0.05, n: int | None = None, by: str = "audits"
-) -> Judged:
+def _judged(known: int, wrong: int, most: float, alpha: float = 0.05, n: int | None = None, by: str = "audits") -> Judged:
     low, high = wilson_interval(known - wrong, wrong, alpha)
     lower, upper = 1.0 - high, 1.0 - low
     by = by if known else ""
-    return Judged(known if n is None else n, known, wrong, by, lower, upper, tolerance, _verdict(lower, upper, tolerance))
+    return Judged(known if n is None else n, known, wrong, by, lower, upper, most, _verdict(lower, upper, most))
 
 
 def _verdict(lower: float, upper: float, tolerance: float) -> str:
@@ -335,9 +334,7 @@ def of_part(store: SqlStore, part: str) -> str:
         raise UnknownDecisionError(f"Expected the number of a part that was decided on and not rejected, got {got}.")
     if len(found) > 1:
         ids = ", ".join(each.decision.id for each in reversed(found))
-        raise ReportConflictError(
-            f"Expected one decision of that part to report on, there are {len(found)}; name its id: {ids}."
-        )
+        raise ReportConflictError(f"Expected one decision of that part, there are {len(found)}; name its id: {ids}.")
     return found[0].decision.id
 
 

@@ -8,8 +8,6 @@ text that stay as they are (`VARIABLES`). The variables follow the store, at mos
 an alarm are events of the Server object as well.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hmac
 import logging

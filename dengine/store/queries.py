@@ -6,7 +6,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, expect
 from ..records import ACTIONS, Action, Reason
 from .records import FORGOTTEN
 from .schema import CORRECTION, DECISION, EVENT, LABEL, PRODUCT, PRODUCT_KEY, RESERVED, SETTING, TRACE, VERSION, hold
@@ -83,19 +83,13 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     held: str | None = connection.execute(query).scalar()
     if product is None or held == product:
         return held
-    if held is not None:
-        raise StoreError(
-            f"Expected product {held!r} of cell {cell_id!r}, got {product!r}; leave it out, or name another cell."
-        )
-    if not product.strip() or not product.isprintable():
-        raise StoreError(f"Expected a product's name of printable characters, got {product!r}.")
+    expect(held is None, f"product {held!r} of cell {cell_id!r}", product, "leave it out, or name another cell", StoreError)
+    named = bool(product.strip()) and product.isprintable()
+    expect(named, "a product's name of printable characters", product, error=StoreError)
     settings = connection.execute(sa.select(SETTING.c.key).where(mine, SETTING.c.key.not_in(RESERVED))).first()
     label = connection.execute(sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)).first()
-    if settings is not None or label is not None:
-        raise StoreError(
-            f"Expected a new cell for product {product!r}, got {cell_id!r}, which has worked without a product; "
-            "name a new cell, and bring its labels over by an import."
-        )
+    do = "it has worked without a product: name a new cell, and bring its labels over by an import"
+    expect(settings is None and label is None, f"a new cell for product {product!r}", cell_id, do, StoreError)
     hold(connection, PRODUCT, product)
     connection.execute(sa.insert(SETTING), {"cell_id": cell_id, "key": PRODUCT_KEY, "value": product})
     return product

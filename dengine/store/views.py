@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import SettingError, shortened
+from ..errors import SettingError, expect, shortened
 from ..records import Action, Reason, Source
 from .records import Outcomes
 
@@ -42,8 +42,7 @@ class HistoryFilter:
             except ValueError:
                 known = ", ".join(kind)
                 raise SettingError(f"Expected {name} to be one of {known}, got {shortened(value)}.") from None
-        if self.label is not None and self.label not in LABELS:
-            raise SettingError(f"Expected label to be one of {', '.join(LABELS)}, got {shortened(self.label)}.")
+        expect(self.label is None or self.label in LABELS, f"label to be one of {', '.join(LABELS)}", self.label)
 
 
 @dataclass(frozen=True, slots=True)
